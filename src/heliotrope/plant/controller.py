@@ -63,6 +63,7 @@ from heliotrope.plant.field.doubtful_positions import DoubtfulPositions
 from heliotrope.plant.field.drive_checks import DriveChecks
 from heliotrope.plant.field.firmware import Firmware
 from heliotrope.plant.field.identity import Identities
+from heliotrope.plant.field.ledger import Ledger
 from heliotrope.plant.field.lockouts import Lockouts
 from heliotrope.plant.field.locks import Locks
 from heliotrope.plant.field.second_plant import SecondPlant
@@ -130,7 +131,8 @@ class PlantController:
 
     Attributes
     ----------
-    design, settings, field, authority, wanted, counters, beliefs, doubtful, witnesses, drive_checks
+    design, settings, field, ledger, authority, wanted, counters, beliefs, doubtful, witnesses,
+    drive_checks
         See their classes.
     beams
         Mirrors and keep-out volumes; see `BeamCheck`.
@@ -180,6 +182,7 @@ class PlantController:
         self.clock, self._on_alarm = clock, on_alarm
         self.alarms, self.counters = deque[Alarm](maxlen=1000), Counters()
         self.field = FieldState(members, self.settings.stale)
+        self.ledger = Ledger(self.field)
         self.authority = Authority(clock, self.settings.authority, entropy)
         self.wanted = wanted or Wanted()
         self.beams = BeamCheck(design, self.field.names, volumes, eyes)
@@ -191,8 +194,10 @@ class PlantController:
         self.movements = Movements(design.receivers, self.beams.armature)
         resting = (name for name, each in self.beams.machines.items() if each.rests)
         self.stepping = Stepping(self.field, resting, points.held["ROUGH"])
-        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
-        self.locks = Locks(self.field, self._ways.ordered, lambda: clock.utc().timestamp())
+        self._ways = BeamWatch(
+            self.beams, self.field, self.ledger, points, self.sun_vector, self.beams.machines
+        )
+        self.locks = Locks(self.field, self.ledger, lambda: clock.utc().timestamp())
         self.locks.recall(points.held["LOCKED"], clock.monotonic())
         self.movements.recall(points.held["LENT"])
         self._agreement = self._compared(points)
@@ -425,11 +430,16 @@ class PlantController:
                 )
 
     def _sent(
-        self, name: str, values: tuple[float, ...], heliostats: tuple[str, ...], now: float
+        self,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: tuple[str, ...],
+        now: float,
+        again: bool,
     ) -> None:
         """Note what has been sent to heliostats."""
         self._agreement.sent(name, values, heliostats, now)
-        self._ways.ordered.sent(name, heliostats, now)
+        self.ledger.sent(name, heliostats, now, again=again)
 
     def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
         """Note what some heliostats of a ticket have acknowledged or done."""
@@ -437,9 +447,9 @@ class PlantController:
             self.drive_checks.ask(part)
         if stage is Stage.ACKNOWLEDGED:
             self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
-            self._ways.ordered.taken(ticket.name, part, now)
+            self.ledger.acknowledged(ticket.name, ticket.accepted_at, part, now)
         elif stage is Stage.REFUSED:
-            self._ways.ordered.refused(ticket.name, part, now)
+            self.ledger.refused(ticket.name, part, now)
         elif stage is Stage.DONE and ticket.name in KINDS:
             self._given.done(ticket, part)
             for name in self.wanted.missing.keys() & part:
@@ -567,10 +577,6 @@ class PlantController:
     def waits_to_stow(self, heliostat: str) -> bool:
         """Return whether a heliostat waits for its turn to go to stow."""
         return self._orders.to_stow(heliostat)
-
-    def ordered_off(self, seen: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which heliostats were ordered off by anybody, (N,); see `Ordered.off`."""
-        return self._ways.ordered.off(seen, self.now())
 
     def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
         for name in heliostats:

@@ -174,7 +174,7 @@ class Sentinel:
                 text = self.table.reasons(Act.DEFOCUS, name)
                 self._joining.drop(text, frozenset(members))
                 self.send_safe(_TABLE, act, members, text)
-                self._ways.ordered.follows_loss(members)
+                self._ways.ledger.follows_loss(members)
 
     def _obey_heliostats(self, now: float) -> None:
         """Send heliostats off, and send them again until their rows release.

@@ -1,10 +1,12 @@
-"""When heliostats were last ordered to move, and whether a report of theirs is from after that.
+"""The ledger: which orders each heliostat was sent and has acknowledged, by kind of order.
 
-A way is proven from where a heliostat was last reported. If another order has been sent since, it
-may have left that place, and is somewhere on a way that nobody has proven.
+A report says nothing of an order that the board had not taken yet when it made the report. A path
+is proven from where a heliostat was last reported: if another order has been sent since, it may
+have left that place, and is somewhere on a path that nobody has proven. Whoever asks whether a
+report counts, or which of two orders came later, asks here.
 
-A heliostat that leaves the receiver was lost, unless it was ordered off, by anybody: this is where
-`losses` asks for it.
+A heliostat that leaves the receiver was lost, unless it was ordered off, by anybody: `losses` asks
+here for that too.
 """
 
 from collections.abc import Sequence
@@ -14,105 +16,162 @@ import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states
-from heliotrope.plant import refusals
-from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.field.state import FieldState, Mask
 
+#: A kind of order: the names of its commands.
+Kind = frozenset[str]
 #: Orders after which a heliostat may be out again.
 _OUT = messages.MOTIONS | messages.RELEASES
+#: Orders that move. A new point moves only in some states: see `_POINTS`.
+MOVING = messages.MOTIONS | messages.SAFE | messages.POINTS
+#: Single orders.
+STOWING, LOCKING, TO_REST, STEPPING = (frozenset({n}) for n in ("STOW", "LOCK", "IDLE", "ROUGH"))
+#: The kinds that the ledger keeps.
+KINDS = (
+    MOVING, messages.SAFE, messages.JOINING, messages.STANDS, _OUT, STOWING, LOCKING, TO_REST,
+    STEPPING,
+)  # fmt: skip
 #: States in which a new point moves a heliostat.
 _POINTS = {"AIM": states.ON_AIM, "STANDBY": (states.IDLE,)}
-#: Orders that move.
-MOVING = messages.MOTIONS | messages.SAFE | messages.POINTS
-#: Orders that send heliostats to stow.
-STOWING = frozenset({"STOW"})
 #: From an order to a report that the board may have made before it took the order, s.
 _TAKEN_WITHIN = 1.0
-
 #: States in which a heliostat is off already: an order does not take it off.
 _GONE = (*states.LEAVING, states.STOWED)
 
 Rows = npt.NDArray[np.intp]
-Mask = npt.NDArray[np.bool_]
 
 
-class Ordered:
-    """The last orders that moved N heliostats.
+class _Column:
+    """The last order of one kind of N heliostats.
+
+    Attributes
+    ----------
+    number
+        Its number in the order of sending, 0 before the first, (N,); a repetition keeps it.
+    sent
+        When it was first sent, monotonic s, (N,).
+    acknowledged, accepted
+        When the last acknowledged order was acknowledged, and accepted by the plant, (N,).
+    shown
+        From when on a report shows it, (N,).
+    """
+
+    def __init__(self, count: int) -> None:
+        self.number = np.zeros(count, dtype=np.int64)
+        self.sent, self.acknowledged, self.accepted, self.shown = np.full((4, count), -np.inf)
+
+
+class Ledger:
+    """The last orders of each kind that N heliostats were sent and have acknowledged.
 
     Parameters
     ----------
     field
-        State of the field.
+        State of the field, with the time of each report.
     """
 
     def __init__(self, field: FieldState) -> None:
-        self._field = field
-        #: Times from which a report shows the last order of each kind, (N,).
-        kinds = (MOVING, messages.SAFE, messages.JOINING, STOWING)
-        self._shown = {kind: np.full(len(field), -np.inf) for kind in kinds}
-        #: When heliostats that were out were ordered off, and when out, monotonic s, (N,).
-        self._off_at, self._out_at = np.full(len(field), -np.inf), np.full(len(field), -np.inf)
+        self._field, self._number = field, 0
+        self._kinds = {kind: _Column(len(field)) for kind in KINDS}
+        #: When heliostats that were out were ordered off, monotonic s, (N,).
+        self._off_at = np.full(len(field), -np.inf)
         #: When they last refused a command, monotonic s, (N,).
         self._refused_at = np.full(len(field), -np.inf)
         #: Whether the order off was acknowledged, (N,).
         self._obeyed = np.zeros(len(field), dtype=np.bool_)
 
-    def sent(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note an order that has been sent."""
-        rows = self._rows(name, heliostats)
+    # -- what happens ----------------------------------------------------------------------
+
+    def sent(
+        self, name: str, heliostats: Sequence[str], now: float, *, again: bool = False
+    ) -> None:
+        """Note an order that has been sent, or repeated (``again``)."""
+        rows = self._rows(heliostats)
         if name in messages.SAFE:
             # One that is silent, off already, or has refused a command since it was last heard, may
             # have left before: then the order is no cause.
+            out_at = self._kinds[_OUT].sent
             gone = np.isin(self._field.rows["state"][rows], _GONE)
-            gone &= self._out_at[rows] + _TAKEN_WITHIN <= self._field.heard[rows]
+            gone &= out_at[rows] + _TAKEN_WITHIN <= self._field.heard[rows]
             gone |= self._refused_at[rows] > self._field.heard[rows]
-            gone |= ~self._field.live(now)[rows] | (self._off_at[rows] > self._out_at[rows])
+            gone |= ~self._field.live(now)[rows] | (self._off_at[rows] > out_at[rows])
             self._off_at[rows[~gone]], self._obeyed[rows[~gone]] = now, False
-        elif name in _OUT:
-            self._out_at[rows] = now
-        self._note(name, rows, now + _TAKEN_WITHIN)
+        self._number += 1
+        for kind, column in self._of(name):
+            mine = self._moved(kind, name, rows)
+            column.shown[mine] = np.maximum(column.shown[mine], now + _TAKEN_WITHIN)
+            if not again:
+                column.sent[mine], column.number[mine] = now, self._number
+
+    def acknowledged(
+        self, name: str, accepted_at: float, heliostats: Sequence[str], now: float
+    ) -> None:
+        """Note that an order has been acknowledged: it may have been long under way.
+
+        The plant accepted it at ``accepted_at``, monotonic s.
+        """
+        rows = self._rows(heliostats)
+        if name in messages.SAFE:
+            heard = rows[self._field.live(now)[rows]]
+            last = heard[self._off_at[heard] > self._kinds[_OUT].sent[heard]]
+            self._off_at[last], self._obeyed[last] = now, True
+        for kind, column in self._of(name):
+            mine = self._moved(kind, name, rows)
+            column.shown[mine] = np.maximum(column.shown[mine], now)
+            column.acknowledged[mine], column.accepted[mine] = now, accepted_at
 
     def refused(self, name: str, heliostats: Sequence[str], now: float) -> None:
         """Note that heliostats have refused a command: they may no longer be where they seem.
 
         A refusal that the reported state explains, such as of APPROACH in TRACKING, says nothing.
         """
-        rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
         state = self._field.rows["state"]
         leads_on = f" {name} " in states.TABLE
+        rows = self._rows(heliostats)
         odd = [r for r in rows if not leads_on or states.transition(int(state[r]), name)]
         self._refused_at[odd] = now
 
     def follows_loss(self, heliostats: Sequence[str]) -> None:
         """Note that heliostats were ordered off because something was lost: see `off`."""
-        self._off_at[self._rows("STOW", heliostats)] = -np.inf
+        self._off_at[self._rows(heliostats)] = -np.inf
 
-    def taken(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note that an order has been acknowledged: it may have been long under way."""
-        rows = self._rows(name, heliostats)
-        if name in messages.SAFE:
-            heard = rows[self._field.live(now)[rows]]
-            last = heard[self._off_at[heard] > self._out_at[heard]]
-            self._off_at[last], self._obeyed[last] = now, True
-        self._note(name, rows, now)
-
-    def _rows(self, name: str, heliostats: Sequence[str]) -> Rows:
-        if name not in MOVING | _OUT:
-            return np.array([], dtype=np.intp)
+    def _rows(self, heliostats: Sequence[str]) -> Rows:
         return np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
 
-    def _note(self, name: str, rows: Rows, shown: float) -> None:
-        if name in _POINTS:
-            rows = rows[np.isin(self._field.rows["state"][rows], _POINTS[name])]
-        for kind, times in self._shown.items():
-            if name in kind:
-                times[rows] = np.maximum(times[rows], shown)
+    def _of(self, name: str) -> list[tuple[Kind, _Column]]:
+        return [(kind, column) for kind, column in self._kinds.items() if name in kind]
 
-    def since(self, heliostat: str, kind: frozenset[str], at: float) -> bool:
-        """Return whether a heliostat was sent an order of a kind since a time, monotonic s.
+    def _moved(self, kind: Kind, name: str, rows: Rows) -> Rows:
+        """Return the rows (K,) for which an order is of a kind: some points move nothing."""
+        if kind is not MOVING or name not in _POINTS:
+            return rows
+        return rows[np.isin(self._field.rows["state"][rows], _POINTS[name])]
 
-        ``kind`` is `messages.SAFE` or `STOWING`.
+    # -- questions -------------------------------------------------------------------------
+
+    def reported(self, kind: Kind = MOVING) -> Mask:
+        """Return whose last report is from after their last order of a kind, (N,)."""
+        return np.asarray(self._field.heard >= self._kinds[kind].shown)
+
+    def sent_since(self, kind: Kind, at: float) -> Mask:
+        """Return which heliostats were first sent their last order of a kind since a time, (N,).
+
+        ``at`` is in monotonic s; a repetition does not count.
         """
-        return bool(self._shown[kind][self._field.index[heliostat]] > at)
+        return np.asarray(self._kinds[kind].sent >= at)
+
+    def later(self, kind: Kind, other: Kind) -> Mask:
+        """Return which heliostats were sent an order of a kind after all of another kind, (N,)."""
+        return np.asarray(self._kinds[kind].number > self._kinds[other].number)
+
+    def obeyed_since(self, kind: Kind, at: float, after: Kind) -> Mask:
+        """Return which heliostats have acknowledged an order of a kind since a time, (N,).
+
+        It counts only if it was accepted after the last order of the kind ``after`` was sent.
+        """
+        column = self._kinds[kind]
+        in_order = column.accepted > self._kinds[after].sent
+        return np.asarray(in_order & (column.acknowledged >= at))
 
     def off(self, seen: FloatArray, now: float) -> Mask:
         """Return which heliostats were ordered off, by anybody, (N,); to be asked at each check.
@@ -120,23 +179,10 @@ class Ordered:
         It is the last order that they were sent, or it was sent after they were last ``seen`` out,
         monotonic s, (N,). An order to one that was silent, or fell silent before it acknowledged
         it, or was off already, or had refused a command since it was last heard, does not count: it
-        may have left by itself. Nor does an order of the
-        safety table to a whole cluster, which is silent, or has lost the time.
+        may have left by itself. Nor does an order of the safety table to a whole cluster, which is
+        silent, or has lost the time.
         """
         self._off_at[~self._field.live(now) & ~self._obeyed] = -np.inf
         ordered = np.isfinite(self._off_at)
         later = self._off_at + _TAKEN_WITHIN > seen
-        return np.asarray(ordered & (later | (self._off_at > self._out_at)))
-
-    def unshown(self, rows: Rows, kind: frozenset[str] = MOVING) -> dict[str, str]:
-        """Return which heliostats (K,) have told nothing since an order, and why others wait.
-
-        ``kind`` is what counts: MOVING, `messages.SAFE` or `messages.JOINING`.
-        """
-        late = self._field.heard[rows] < self._shown[kind][rows]
-        return {self._field.names[row]: refusals.PLACE_UNKNOWN.text for row in rows[late]}
-
-    def silent(self, rows: Rows, now: float) -> dict[str, str]:
-        """Return which heliostats (K,) are not live, and why others wait."""
-        late = ~self._field.live(now)[rows]
-        return {self._field.names[row]: refusals.PLACE_UNKNOWN.text for row in rows[late]}
+        return np.asarray(ordered & (later | (self._off_at > self._kinds[_OUT].sent)))

@@ -79,7 +79,7 @@ class Losses:
         held = field.among((states.LOCKED,), now)
         lost = live & ~up & ~held & self._up
         lost |= ~self._seen & field.among(states.LEAVING, now)
-        lost &= wanted & ~self._plant.ordered_off(self._up_at)
+        lost &= wanted & ~self._plant.ledger.off(self._up_at, now)
         # A heliostat that is not heard, or is locked, keeps what was seen of it last.
         self._up = np.where(live & ~held, up, self._up)
         self._up_at[live & up] = field.heard[live & up]
