@@ -323,6 +323,7 @@ class PlantController:
         """Return what compares reports with the plant's own knowledge."""
         return Agreement(
             self.field,
+            self.ledger,
             points,
             self.beams,
             self.design.site,
@@ -438,7 +439,7 @@ class PlantController:
         again: bool,
     ) -> None:
         """Note what has been sent to heliostats."""
-        self._agreement.sent(name, values, heliostats, now)
+        self._agreement.sent(name, values, heliostats)
         self.ledger.sent(name, heliostats, now, again=again)
 
     def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
@@ -446,7 +447,6 @@ class PlantController:
         if stage is Stage.DONE and ticket.name == "DIAGNOSE":
             self.drive_checks.ask(part)
         if stage is Stage.ACKNOWLEDGED:
-            self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
             self.ledger.acknowledged(ticket.name, ticket.accepted_at, part, now)
         elif stage is Stage.REFUSED:
             self.ledger.refused(ticket.name, part, now)
