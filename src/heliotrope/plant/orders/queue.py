@@ -444,21 +444,20 @@ class PlantOrders:
             named = () if len(part) == len(end.members) else part
             end.post(Emergency(identity, act.name, named), None, self._told(identity), urgent=True)
 
-    def stow_in_turn(self, ticket: Ticket, heliostats: Sequence[str]) -> tuple[str, ...]:
-        """Send STOW to heliostats in portions; return those that have been sent it.
+    def stow_in_turn(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
+        """Send STOW to heliostats in portions.
 
         Orders that they were given before are repeated until it is their turn. An order by
         `emergency` meanwhile goes at once and takes the place of this one.
         """
         if not self._stowing.staggers(heliostats):
             self.emergency(ticket, Act.STOW, heliostats)
-            return tuple(heliostats)
+            return
         now = self._clock.monotonic()
         self._sent_at[ticket.identity] = now
         for other, names in self._stowing.put(ticket, heliostats).items():
             other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
         self._stow(self._stowing.due(now))
-        return tuple(name for name in heliostats if name not in self._stowing)
 
     def to_stow(self, heliostat: str) -> bool:
         """Whether a heliostat waits for its turn to go to stow: no motion is for it."""
