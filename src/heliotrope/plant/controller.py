@@ -193,7 +193,7 @@ class PlantController:
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
         resting = (name for name, each in self.beams.machines.items() if each.rests)
-        self.stepping = Stepping(self.field, resting, points.held["ROUGH"])
+        self.stepping = Stepping(self.field, self.ledger, resting, points.held["ROUGH"])
         self._ways = BeamWatch(
             self.beams, self.field, self.ledger, points, self.sun_vector, self.beams.machines
         )

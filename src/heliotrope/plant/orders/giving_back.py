@@ -172,7 +172,7 @@ class GivingBack:
         """Order heliostats to step finely for a visit, or roughly again."""
         token = self._authority.token
         for rough, due in self._stepping.due(now, token).items():
-            self._stepping.sent(due, now)
+            self._stepping.tried(due, now)
             asked = Asked("ROUGH", tuple(due))
             blocked = self._guards.reasons(asked, NOT_NOW, BEAM_REFUSED)
             names = tuple(name for name in due if name not in blocked)
