@@ -73,16 +73,17 @@ from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.orders.audit import Audit
 from heliotrope.plant.orders.authority import Authority, Grant, Person, Role
 from heliotrope.plant.orders.commands import Commands
+from heliotrope.plant.orders.dispatch import JoinDispatcher
 from heliotrope.plant.orders.giving_back import GivingBack
 from heliotrope.plant.orders.guards import Asked, Guards
-from heliotrope.plant.orders.joining import JoinDispatcher, JoinQueue
+from heliotrope.plant.orders.joining import JoinQueue
 from heliotrope.plant.orders.movements import Movements
 from heliotrope.plant.orders.parameters import ParameterSync, Tables, change_of_beam
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.stepping import Stepping
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.orders.unacknowledged import Unacknowledged
-from heliotrope.plant.refusals import BEAM_REFUSED, OUT_OF_SERVICE
+from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
 from heliotrope.sun import fast_vector
@@ -144,8 +145,9 @@ class PlantController:
         Locks of persons; EMERGENCY, DEFOCUS and STOW pass them.
     aims, standbys
         Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
-    commands, sentinel
-        What gives persons' commands; the safety table with the emergencies that stand.
+    commands, guards, sentinel
+        What gives persons' commands, and what stops them whatever the paths are; the safety table
+        with the emergencies that stand.
     movements, locks, stepping
         Aims that visits have moved, heliostats that they have locked, and fine steps that they
         need; the plant gives back what they leave.
@@ -231,7 +233,7 @@ class PlantController:
         )
         self.sentinel = self._guarded(table, record)
         self._given = Unacknowledged(self.field, points)
-        self._guards = self._guarding()
+        self.guards = self._guarding()
         self.commands = self._directed()
         self._joiner = self._dispatching()
         self._giving_back = self._returning()
@@ -338,7 +340,7 @@ class PlantController:
             self.field,
             self._orders,
             self._joining,
-            self._guards,
+            self.guards,
             self._given,
             self._ways,
             self.design,
@@ -358,7 +360,7 @@ class PlantController:
             self._orders,
             self._ways,
             self.settings.join_life,
-            self._guards.in_turn,
+            self.guards,
             self.commands.examine,
         )
 
@@ -368,7 +370,7 @@ class PlantController:
             self.field,
             self.authority,
             self._orders,
-            self._guards,
+            self.guards,
             self.commands,
             self.movements,
             self.locks,
@@ -571,7 +573,7 @@ class PlantController:
         """Return why a heliostat that is LOCKED is so, since when and until when, in words."""
         mandate = self.authority.visited().get(heliostat)
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
-        held = self._guards.held("UNLOCK", (heliostat,))
+        held = self.guards.reasons(Asked("UNLOCK", (heliostat,)), NOT_NOW)
         return self.locks.reason(heliostat, visit, held.get(heliostat, ""))
 
     def waits_to_stow(self, heliostat: str) -> bool:
@@ -865,33 +867,13 @@ class PlantController:
         """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
         return self._ways.misled(heliostat, point)
 
-    def held(self, heliostats: Sequence[str]) -> Mapping[str, str]:
-        """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
-        return self._guards.held("APPROACH", heliostats)
-
-    def blocked(
-        self, name: str, heliostats: Sequence[str], aims: FloatArray | None = None
-    ) -> dict[str, str]:
-        """Return the heliostats that may not be given a command now, whatever their paths are.
-
-        Parameters
-        ----------
-        name
-            The command.
-        heliostats
-            Names (K).
-        aims
-            Points that they get before they join them, ENU, m, (K, 3); None: no new ones.
-        """
-        return self._guards.reasons(Asked(name, tuple(heliostats), aims))
-
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
 
     def _unwritable(self, heliostat: str) -> str | None:
         """Return why nothing may be written to a heliostat, None if it may."""
         asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
-        return self._guards.reasons(asked, *kinds).get(heliostat)
+        return self.guards.reasons(asked, *kinds).get(heliostat)
 
     def _resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         """Return why a heliostat may not rest at the stow position in items, "" if it may."""

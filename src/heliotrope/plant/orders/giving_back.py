@@ -75,7 +75,7 @@ class GivingBack:
     def _ordered(self, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
         """Give an order to heliostats that were left locked; return those that need no other."""
         if what == "STOW":
-            held = self._guards.held(what, names)
+            held = self._guards.reasons(Asked(what, names), NOT_NOW)
             free = tuple(name for name in names if name not in held)
             if left := tuple(n for n in free if n not in self._locks.under_way(free)):
                 self._stow(left)
@@ -111,7 +111,8 @@ class GivingBack:
 
         def send(again: bool) -> None:
             if again:
-                ticket.block(self._guards.held(what, ticket.waiting(able)))
+                left = Asked(what, ticket.waiting(able))
+                ticket.block(self._guards.reasons(left, NOT_NOW))
             self._orders.command(ticket, what, values, ticket.waiting(able), token)
 
         self._orders.when_recorded(ticket, send)
