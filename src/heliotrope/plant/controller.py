@@ -843,10 +843,10 @@ class PlantController:
         self._agreement.believe(row, armature, drives)
         self._give_up(self._identities.learn(row, armature))
 
-    def _give_up(self, heliostats: Mapping[str, str]) -> None:
+    def _give_up(self, heliostats: tuple[str, ...]) -> None:
         """Let heliostats that are not what they seem wait no longer to join."""
         if heliostats:
-            self._joining.drop(next(iter(heliostats.values())), frozenset(heliostats))
+            self._joining.drop(self._identities.strange[heliostats[0]], frozenset(heliostats))
 
     def _tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
         """Return the tables of a heliostat's mechanism now, and once items are stored."""
