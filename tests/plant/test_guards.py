@@ -41,15 +41,15 @@ def plant(**parts: Any) -> Guards:
     return Guards(**(free | parts))
 
 
-def alarms(barred: dict[str, dict[str, str]], cluster: str = "", night: str = "") -> Any:
+def alarms(blocked: dict[str, dict[str, str]], cluster: str = "", night: str = "") -> Any:
     """A sentinel whose rows keep heliostats from their aims, or hold a cluster."""
 
     def of(condition: str = "") -> dict[str, str]:
-        some = barred.values() if not condition else [barred.get(condition, {})]
+        some = blocked.values() if not condition else [blocked.get(condition, {})]
         return {name: text for each in some for name, text in each.items()}
 
     return SimpleNamespace(
-        table=SimpleNamespace(barred=of),
+        table=SimpleNamespace(blocked=of),
         refusal=lambda clusters: f"{cluster} holds" if cluster in clusters else "",
         night=night,
     )

@@ -163,7 +163,7 @@ def _alarm(condition: str = "", among: tuple[int, ...] = tuple(range(len(states.
     """Stop heliostats in some states that a row of the safety table, or any, keeps away."""
 
     def check(plant: Guards, asked: Asked) -> Iterable[str | None]:
-        found = plant.sentinel.table.barred(condition)
+        found = plant.sentinel.table.blocked(condition)
         state, place = plant.field.rows["state"], plant.field.place
         found = {name: text for name, text in found.items() if state[place(name)] in among}
         return map(found.get, asked.heliostats) if found else ()
