@@ -171,10 +171,9 @@ def test_an_order_that_was_long_under_way_counts_from_its_acknowledgement(tmp_pa
         ticket = plant.command(ENGINEER, token, "TRACK", ("P5A",))
         await bench.until(lambda: ticket.stage("P5A") is Stage.DONE, 10.0)
         taken = plant.now()
-        refused = plant._ways.ordered.unshown(np.array([row]))
-        assert refused == {"P5A": refusals.PLACE_UNKNOWN.text}
+        assert not plant.ledger.reported()[row]
         await bench.until(lambda: bool(plant.field.heard[row] > taken), 5.0)
-        assert not plant._ways.ordered.unshown(np.array([row]))
+        assert plant.ledger.reported()[row]
 
     play(tmp_path, scene)
 
@@ -936,7 +935,7 @@ def test_a_diagnosis_passes_a_nudge_of_each_axis_both_ways() -> None:
             return counts
 
     field: Any = Standing(design.names)
-    watch = BeamWatch(check, field, field, field, {})
+    watch = BeamWatch(check, field, field, field, field, {})
     path = watch._by_counts("DIAGNOSE", (), rows)
     begin = Drive(check.drives.table[rows]).angles(counts)
     nudges = [(0, 0), (1, 0), (-1, 0), (0, 0), (0, 1), (0, -1)]
@@ -955,10 +954,10 @@ def test_an_approach_leaves_stow_as_long_as_its_other_axis_stands_there(azimuth:
     begin[2, 1 - azimuth] -= 5000.0  # and now the other axis has
     end = begin + 40_000.0
     state = np.array([states.APPROACHING] * 3 + [states.STOWING])
-    watch = BeamWatch(check, known, known, known, dict.fromkeys(design.names, machine))
+    watch = BeamWatch(check, known, known, known, known, dict.fromkeys(design.names, machine))
     assert list(watch._leaves_stow(rows, state, begin, end)) == [True, True, False, False]
     # Where the place of stow is not known, a long way tells it.
-    watch = BeamWatch(check, known, known, known, {})
+    watch = BeamWatch(check, known, known, known, known, {})
     near = np.where(np.arange(4)[:, None] == 2, begin + 10.0, begin + 900_000.0)
     assert list(watch._leaves_stow(rows, state, begin, near)) == [True, True, False, False]
 

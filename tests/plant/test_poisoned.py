@@ -100,7 +100,7 @@ def test_new_parameters_go_back_where_no_way_to_their_photograph_is_free(
     (result,) = results
     assert result.outcome is CalibrationOutcome.NOT_VERIFIED, result.text
     assert (
-        "no free way to their photograph: the beam enters walkway; the old parameters are"
+        "no free path to their photograph: the beam enters walkway; the old parameters are"
         in result.text
     )
 

@@ -20,7 +20,8 @@ from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSet
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.orders.authority import RefusedError
-from heliotrope.plant.refusals import NoFreePath
+from heliotrope.plant.orders.guards import Asked
+from heliotrope.plant.refusals import NOT_NOW, NoFreePath
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
@@ -106,7 +107,9 @@ def test_a_cluster_that_may_not_move_keeps_no_other_at_stow(tmp_path: Path) -> N
         for _ in range(15):
             plant.authority.keep(ENGINEER, token)
             await bench.wait(1.0)
-        assert plant.held(plant.field.names).keys() == set(bad.names)
+        assert plant.guards.reasons(Asked("APPROACH", plant.field.names), NOT_NOW).keys() == set(
+            bad.names
+        )
         log = Logbook(bench.clock)
         raising = Raising(plant, log, ENGINEER, most=99, patience=60.0, clearance=0.0, wanted=True)
         await raising.step(token, frozenset, np.zeros(len(plant.field), dtype=np.bool_))

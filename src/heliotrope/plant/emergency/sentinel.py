@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from heliotrope.lcu import messages, states
 from heliotrope.lcu import names as meanings
-from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
@@ -119,7 +119,6 @@ class Sentinel:
         self._drive_checks = drive_checks
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
-        self._sent_off: dict[str, float] = {}
         #: Orders to single heliostats while their rows hold: number, and time of the next.
         self._tries: dict[str, tuple[int, float]] = {}
         self._repeated_at = -math.inf
@@ -174,7 +173,7 @@ class Sentinel:
                 text = self.table.reasons(Act.DEFOCUS, name)
                 self._joining.drop(text, frozenset(members))
                 self.send_safe(_TABLE, act, members, text)
-                self._ways.ordered.follows_loss(members)
+                self._ways.ledger.follows_loss(members)
 
     def _obey_heliostats(self, now: float) -> None:
         """Send heliostats off, and send them again until their rows release.
@@ -182,15 +181,14 @@ class Sentinel:
         A heliostat that has just been sent off has the time to show it, unless DEFOCUS has turned
         it already: its beam stays where it may not be until it is stowed.
         """
-        self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
         wanted = {**self.table.off(), **self._identities.off(now)}
         self._tries = {name: tried for name, tried in self._tries.items() if name in wanted}
-        order = self.order if self.on else None
+        just_sent = self._ways.ledger.sent_since(messages.SAFE, now - OFF_SHOWS)
         sent: dict[Act, dict[str, str]] = {}
         for name, (act, text) in wanted.items():
             tries, due = self._tries.get(name, (0, -math.inf))
-            whole = order is not None and now - order.at < OFF_SHOWS
-            if now < due or ((whole or name in self._sent_off) and not self._ways.turned(name)):
+            waits = just_sent[self._field.index[name]] and not self._ways.turned(name)
+            if now < due or waits:
                 continue
             self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
             best = self._ways.way_out(name, again=tries > 0)
@@ -330,10 +328,9 @@ class Sentinel:
             (*giver, act.name), (), heliostats, note, late=True, fault=giver is _TABLE
         )
         if in_turn and act is Act.STOW and not self.on:
-            heliostats = self._orders.stow_in_turn(ticket, heliostats)
+            self._orders.stow_in_turn(ticket, heliostats)
         else:
             self._orders.emergency(ticket, act, heliostats)
-        self._sent_off.update(dict.fromkeys(heliostats, self._clock.monotonic()))
         return ticket
 
     def greet(self, cluster: str) -> None:

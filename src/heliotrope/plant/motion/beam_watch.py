@@ -17,13 +17,20 @@ from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant.field.aims import BeamCheck
 from heliotrope.plant.field.assigned import BEFORE, KINDS, Points
-from heliotrope.plant.field.ordered import Ordered
+from heliotrope.plant.field.ledger import MOVING, Kind, Ledger
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.motion.defocusing import way_out
 from heliotrope.plant.motion.paths import Paths
 from heliotrope.plant.motion.stray_beams import TURNS, StrayBeams
 from heliotrope.plant.orders.parameters import Tables
-from heliotrope.plant.refusals import BEAM_REFUSED, SOON, STILL_MOVING, NoFreePath, RefusedError
+from heliotrope.plant.refusals import (
+    BEAM_REFUSED,
+    PLACE_UNKNOWN,
+    SOON,
+    STILL_MOVING,
+    NoFreePath,
+    RefusedError,
+)
 from heliotrope.safety import Act, Reading
 
 Rows = npt.NDArray[np.intp]
@@ -79,8 +86,8 @@ class BeamWatch:
     ----------
     check
         Mirrors and keep-out volumes.
-    field
-        State of the field, with the positions of the axes.
+    field, ledger
+        State of the field, with the positions of the axes; what was ordered.
     points
         Assigned aims and standby points.
     sun
@@ -94,21 +101,21 @@ class BeamWatch:
         As given.
     unsent
         Watch over beams on a receiver that were not sent there.
-    ordered
-        The last orders that moved heliostats, to be noted by others.
+    ledger
+        The last orders of each heliostat.
     """
 
     def __init__(
         self,
         check: BeamCheck,
         field: FieldState,
+        ledger: Ledger,
         points: Points,
         sun: Callable[[float], FloatArray],
         machines: Mapping[str, Machine],
     ) -> None:
         self._check, self._field, self.points, self._sun = check, field, points, sun
-        self.ordered = Ordered(field)
-        self._machines = machines
+        self.ledger, self._machines = ledger, machines
         self._ways = Paths(check, machines)
         self.stray = StrayBeams(check, field, points, sun, machines)
         #: Tables that unverified ones have replaced, by row.
@@ -149,9 +156,9 @@ class BeamWatch:
         if not self._check.volumes:
             return {}
         if name == "AIM":  # those that track join it, and are examined then
-            return self.ordered.unshown(rows, messages.JOINING)
+            return self._unplaced(rows, messages.JOINING)
         state = self._field.rows["state"][rows]
-        found = self.ordered.unshown(rows[np.isin(state, _TO_STANDBY)])
+        found = self._unplaced(rows[np.isin(state, _TO_STANDBY)])
         return found | self._unsettled(rows[state == states.IDLE])
 
     def _starts(
@@ -195,7 +202,7 @@ class BeamWatch:
             wrong = self._back_to_standby(rows[mine], now)
         else:
             path = self._by_counts(name, values, rows)
-            wrong = self._check.moving(rows, path, self._sun(0.0)) | self.ordered.unshown(rows)
+            wrong = self._check.moving(rows, path, self._sun(0.0)) | self._unplaced(rows)
         wrong = _paths(wrong)
         if wrong and len(wrong) == len(heliostats):
             raise BeamError(name, wrong)
@@ -203,7 +210,7 @@ class BeamWatch:
 
     def _from_stow(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats have no free way from stow to standby, and why."""
-        early = self.ordered.unshown(rows, messages.SAFE)
+        early = self._unplaced(rows, messages.SAFE)
         rows, wrong = self._resting(rows)
         if not self._check.volumes:
             wrong = {}  # a way to a point that is not known here is not proven
@@ -220,7 +227,7 @@ class BeamWatch:
         A way is proven from where a heliostat stands. One that moves is no longer there, and does
         not turn at once.
         """
-        early = self._unsettled(rows) | self.ordered.silent(rows, now)
+        early = self._unsettled(rows) | self._unplaced(rows, now=now)
         rows, wrong = self._resting(rows)
         light = self._sun(0.0)
         for some, standbys in self.points.possible("STANDBY", rows):
@@ -232,7 +239,20 @@ class BeamWatch:
     def _unsettled(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats move, or have told nothing since they were ordered to."""
         found = {self._field.names[row]: STILL_MOVING.text for row in rows[self._moving(rows)]}
-        return found | self.ordered.unshown(rows)
+        return found | self._unplaced(rows)
+
+    def _unplaced(
+        self, rows: Rows, kind: Kind = MOVING, now: float | None = None
+    ) -> dict[str, str]:
+        """Return the heliostats (K,) without a report from after an order of a kind.
+
+        With ``now`` (monotonic s) those that are not live are among them. Others wait for them.
+        """
+        placed = self.ledger.reported(kind)
+        if now is not None:
+            placed &= self._field.live(now)
+        late = rows[~placed[rows]]
+        return {self._field.names[row]: PLACE_UNKNOWN.text for row in late}
 
     def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
         """Return the heliostats whose standby points are known, and why the others do not go."""
@@ -355,7 +375,7 @@ class BeamWatch:
         }
         if not unknown.all():
             light = self._sun(0.0)
-            found |= self.ordered.unshown(rows, messages.SAFE) | self.ordered.silent(rows, now)
+            found |= self._unplaced(rows, messages.SAFE, now)
             possible = self.points.possible("AIM", rows[~unknown])
             for known, places in [(rows, aims)] if new else possible:
                 found |= self._by_earlier(known, places)

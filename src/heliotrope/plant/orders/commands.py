@@ -223,7 +223,8 @@ class Commands:
         if mandate is not None:
             wrong = mandate.refused(heliostats)
         else:
-            wrong = self._guards.doubtful.verifying(heliostats) if name in TO_AIMS else {}
+            verifying = self._guards.doubtful.verifying(heliostats) if name in TO_AIMS else ()
+            wrong = dict.fromkeys(verifying, refusals.NOT_VERIFIED.text)
             if name in wire.JOINING and len(wrong) < len(heliostats):
                 blocked, wrong = {**blocked, **wrong}, {}
         if wrong:
@@ -360,8 +361,7 @@ class Commands:
         """
         names, rows, wanted, out = self._pointed("AIM", points)
         tracking, aims = self._field.among((states.TRACKING,), self._now())[rows], self._aims(rows)
-        if wrong := self._movements.refused(names, rows, aims, wanted, tracking):
-            raise BeamError("AIM", wrong)
+        self._movements.check(names, rows, aims, wanted, tracking)
         self.prove_points("AIM", names, wanted)
 
         def store(some: tuple[str, ...], places: FloatArray) -> Storing:
@@ -369,8 +369,8 @@ class Commands:
 
         def check(some: tuple[str, ...]) -> None:
             rows, on = self._places(some), np.ones(len(some), dtype=np.bool_)
-            if wrong := self._movements.refused(some, rows, self._aims(rows), new.of(some), on):
-                raise BeamError("AIM", wrong)  # aimed elsewhere while the record was written
+            # One may have been aimed elsewhere while the record was written.
+            self._movements.check(some, rows, self._aims(rows), new.of(some), on)
 
         def note(some: tuple[str, ...], places: FloatArray) -> None:
             del places
