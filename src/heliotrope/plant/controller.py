@@ -68,7 +68,9 @@ from heliotrope.plant.field.locks import Locks
 from heliotrope.plant.field.second_plant import SecondPlant
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.field.witnesses import Witnesses
-from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.motion.paths import Paths
+from heliotrope.plant.motion.proofs import BeamError, PathProofs
+from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.audit import Audit
 from heliotrope.plant.orders.authority import Authority, Grant, Person, Role
 from heliotrope.plant.orders.commands import Commands
@@ -191,8 +193,9 @@ class PlantController:
         self.movements = Movements(design.receivers, self.beams.armature)
         resting = (name for name, each in self.beams.machines.items() if each.rests)
         self.stepping = Stepping(self.field, resting, points.held["ROUGH"])
-        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
-        self.locks = Locks(self.field, self._ways.ordered, lambda: clock.utc().timestamp())
+        self._proofs = PathProofs(Paths(self.beams), self.field, points, self.sun_vector)
+        self._watch = BeamWatch(self._proofs)
+        self.locks = Locks(self.field, self._proofs.ordered, lambda: clock.utc().timestamp())
         self.locks.recall(points.held["LOCKED"], clock.monotonic())
         self.movements.recall(points.held["LENT"])
         self._agreement = self._compared(points)
@@ -273,7 +276,7 @@ class PlantController:
             self.field,
             self.authority,
             self._orders,
-            self._ways,
+            self._watch,
             self._agreement,
             self.sun_vector,
         )
@@ -289,7 +292,7 @@ class PlantController:
             self.field,
             self._orders,
             self._joining,
-            self._ways,
+            self._watch,
             self.beams.drives,
             self.settings.repeat,
             self._identities,
@@ -334,7 +337,7 @@ class PlantController:
             self._joining,
             self._guards,
             self._given,
-            self._ways,
+            self._proofs,
             self.design,
             self.wanted,
             self.settings.join_wait,
@@ -350,7 +353,7 @@ class PlantController:
             self.now,
             self._joining,
             self._orders,
-            self._ways,
+            self._proofs,
             self.settings.join_life,
             self._guards.in_turn,
             self.commands.examine,
@@ -386,7 +389,7 @@ class PlantController:
                 await end.link.close()
             for task in tasks:
                 task.cancel()
-        if work := self._ways.points.settling():
+        if work := self._proofs.points.settling():
             self._orders.owe(work)
         await self._orders.end(self.now())
 
@@ -429,7 +432,7 @@ class PlantController:
     ) -> None:
         """Note what has been sent to heliostats."""
         self._agreement.sent(name, values, heliostats, now)
-        self._ways.ordered.sent(name, heliostats, now)
+        self._proofs.ordered.sent(name, heliostats, now)
 
     def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
         """Note what some heliostats of a ticket have acknowledged or done."""
@@ -437,9 +440,9 @@ class PlantController:
             self.drive_checks.ask(part)
         if stage is Stage.ACKNOWLEDGED:
             self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
-            self._ways.ordered.taken(ticket.name, part, now)
+            self._proofs.ordered.taken(ticket.name, part, now)
         elif stage is Stage.REFUSED:
-            self._ways.ordered.refused(ticket.name, part, now)
+            self._proofs.ordered.refused(ticket.name, part, now)
         elif stage is Stage.DONE and ticket.name in KINDS:
             self._given.done(ticket, part)
             for name in self.wanted.missing.keys() & part:
@@ -488,7 +491,7 @@ class PlantController:
             self._slow_at = now
             self.witnesses.beat()
             self._firmware.beat(now)
-            points, held = self._ways.points, self._held()
+            points, held = self._proofs.points, self._held()
             for work in (points.settling(), points.released(held, now)):
                 if work is not None:
                     self._orders.owe(work)
@@ -520,7 +523,7 @@ class PlantController:
     @property
     def standby_unknown(self) -> npt.NDArray[np.bool_]:
         """Which heliostats may have any standby point, (N,); see `Points.unknown`."""
-        return self._ways.points.unknown("STANDBY")
+        return self._proofs.points.unknown("STANDBY")
 
     @property
     def waiting(self) -> int:
@@ -570,7 +573,7 @@ class PlantController:
 
     def ordered_off(self, seen: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which heliostats were ordered off by anybody, (N,); see `Ordered.off`."""
-        return self._ways.ordered.off(seen, self.now())
+        return self._proofs.ordered.off(seen, self.now())
 
     def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
         for name in heliostats:
@@ -852,12 +855,12 @@ class PlantController:
 
         It may not join the receiver, and its ways are proven with both.
         """
-        with self.doubtful.unverified(heliostat), self._ways.unverified(heliostat):
+        with self.doubtful.unverified(heliostat), self._proofs.unverified(heliostat):
             yield
 
     def misled(self, heliostat: str, point: FloatArray) -> str:
         """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
-        return self._ways.misled(heliostat, point)
+        return self._proofs.misled(heliostat, point)
 
     def held(self, heliostats: Sequence[str]) -> Mapping[str, str]:
         """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
@@ -880,7 +883,7 @@ class PlantController:
         return self._guards.reasons(Asked(name, tuple(heliostats), aims))
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
-        return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+        return self._proofs.rewriting(heliostat, *self._tables(heliostat, items)[1])
 
     def _unwritable(self, heliostat: str) -> str | None:
         """Return why nothing may be written to a heliostat, None if it may."""

@@ -11,7 +11,7 @@ from functools import partial
 
 from heliotrope.lcu import messages
 from heliotrope.links.messages import Stage
-from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.motion.proofs import BeamError, PathProofs
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.tickets import Ticket
@@ -140,7 +140,7 @@ class JoinDispatcher:
     ----------
     now
         Returns the monotonic time, s.
-    queue, orders, beams
+    queue, orders, proofs
         Of the plant.
     life
         Life of a command whose turn has come, s.
@@ -155,13 +155,13 @@ class JoinDispatcher:
         now: Callable[[], float],
         queue: JoinQueue,
         orders: PlantOrders,
-        beams: BeamWatch,
+        proofs: PathProofs,
         life: float,
         blocked: Callable[[str, tuple[float, ...], tuple[str, ...]], dict[str, str]],
         examine: Examine,
     ) -> None:
         self._now, self._queue, self._orders = now, queue, orders
-        self._beams, self._life = beams, life
+        self._proofs, self._life = proofs, life
         self._blocked, self._examine = blocked, examine
 
     def beat(self, now: float, lost: Lost, *, held: bool) -> None:
@@ -191,7 +191,7 @@ class JoinDispatcher:
     def _wrong(self, job: JoiningJob, part: tuple[str, ...]) -> dict[str, str]:
         """Return which heliostats whose turn has come may not go, and why."""
         if job.name not in messages.SLICED:
-            wrong = self._beams.joining(job.name, job.values, part, self._now())
+            wrong = self._proofs.joining(job.name, job.values, part, self._now())
             return wrong | self._blocked(job.name, job.values, part)
         try:
             return self._examine(job.name, job.values, part)[1]
