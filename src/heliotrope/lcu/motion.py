@@ -295,8 +295,7 @@ class Motion:
         one, two = self._offset = self.config.defocus
         if not self.known or self.sun.since_ms > RECENT_MS:
             return None
-        near, unreachable, kind = self._near, self.unreachable, self.kind
-        found: list[float] | None = None
+        near, unreachable, kind, found = self._near, self.unreachable, self.kind, None
         way = self._path[: max(0, self._place)] if kind == APPROACH else []
         at_standby = self.ready and self._target is self.config.standby
         if kind == STANDBY or (kind == HOLD and at_standby):
@@ -309,7 +308,7 @@ class Motion:
             if max(first, second) > FAR:
                 break
             # The next pose overwrites this one, even where the beam cannot follow.
-            found, self._target, self._offset = pose.angles[:], point, (0.0, 0.0)
+            found, self._target, self._offset = list(pose.angles), point, (0.0, 0.0)
             if first >= one or second >= two or point[2] <= way[0][2]:
                 break
         tracks = kind in (TRACK, SEARCH)
