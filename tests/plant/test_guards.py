@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from heliotrope.lcu import messages, states
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.guards import Asked, Guards
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE, RefusedError
 

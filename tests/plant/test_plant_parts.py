@@ -38,7 +38,7 @@ from heliotrope.plant.field.aims import BeamCheck, spread
 from heliotrope.plant.field.ledger import LOCKING, STOWING, TO_REST, Ledger
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.io.links_file import PlantLinks
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry

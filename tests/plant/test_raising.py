@@ -14,7 +14,7 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.losses import Losses
@@ -196,7 +196,7 @@ def test_a_refusal_that_is_no_matter_of_the_path_raises_no_alarm_of_it(
         reasons = ("a reason that was not there before", NoFreePath("enters mast"))
         for reason, named in zip(reasons, (False, True), strict=True):
             with monkeypatch.context() as patch:
-                patch.setattr(plant._ways, "clear", refusing({NAME: reason}))
+                patch.setattr(plant._proofs, "clear", refusing({NAME: reason}))
                 await raising.step(token, frozenset, np.zeros(len(plant.field), dtype=np.bool_))
             assert bool(raising.why_not(NAME)) is named
             assert any(row.condition == "beam_blocked" for row in log.alarms()) is named

@@ -69,7 +69,9 @@ from heliotrope.plant.field.locks import Locks
 from heliotrope.plant.field.second_plant import SecondPlant
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.field.witnesses import Witnesses
-from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.motion.paths import Paths
+from heliotrope.plant.motion.proofs import BeamError, PathProofs
+from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.audit import Audit
 from heliotrope.plant.orders.authority import Authority, Grant, Person, Role
 from heliotrope.plant.orders.commands import Commands
@@ -196,9 +198,10 @@ class PlantController:
         self.movements = Movements(design.receivers, self.beams.armature)
         resting = (name for name, each in self.beams.machines.items() if each.rests)
         self.stepping = Stepping(self.field, self.ledger, resting, points.held["ROUGH"])
-        self._ways = BeamWatch(
-            self.beams, self.field, self.ledger, points, self.sun_vector, self.beams.machines
+        self._proofs = PathProofs(
+            Paths(self.beams), self.field, self.ledger, points, self.sun_vector
         )
+        self._watch = BeamWatch(self._proofs)
         self.locks = Locks(self.field, self.ledger, lambda: clock.utc().timestamp())
         self.locks.recall(points.held["LOCKED"], clock.monotonic())
         self.movements.recall(points.held["LENT"])
@@ -280,7 +283,7 @@ class PlantController:
             self.field,
             self.authority,
             self._orders,
-            self._ways,
+            self._watch,
             self._agreement,
             self.sun_vector,
         )
@@ -296,7 +299,7 @@ class PlantController:
             self.field,
             self._orders,
             self._joining,
-            self._ways,
+            self._watch,
             self.beams.drives,
             self.settings.repeat,
             self._identities,
@@ -342,7 +345,7 @@ class PlantController:
             self._joining,
             self.guards,
             self._given,
-            self._ways,
+            self._proofs,
             self.design,
             self.wanted,
             self.settings.join_wait,
@@ -358,7 +361,7 @@ class PlantController:
             self.now,
             self._joining,
             self._orders,
-            self._ways,
+            self._proofs,
             self.settings.join_life,
             self.guards,
             self.commands.examine,
@@ -394,7 +397,7 @@ class PlantController:
                 await end.link.close()
             for task in tasks:
                 task.cancel()
-        if work := self._ways.points.settling():
+        if work := self._proofs.points.settling():
             self._orders.owe(work)
         await self._orders.end(self.now())
 
@@ -500,7 +503,7 @@ class PlantController:
             self._slow_at = now
             self.witnesses.beat()
             self._firmware.beat(now)
-            points, held = self._ways.points, self._held()
+            points, held = self._proofs.points, self._held()
             for work in (points.settling(), points.released(held, now)):
                 if work is not None:
                     self._orders.owe(work)
@@ -532,7 +535,7 @@ class PlantController:
     @property
     def standby_unknown(self) -> npt.NDArray[np.bool_]:
         """Which heliostats may have any standby point, (N,); see `Points.unknown`."""
-        return self._ways.points.unknown("STANDBY")
+        return self._proofs.points.unknown("STANDBY")
 
     @property
     def waiting(self) -> int:
@@ -860,15 +863,15 @@ class PlantController:
 
         It may not join the receiver, and its ways are proven with both.
         """
-        with self.doubtful.unverified(heliostat), self._ways.unverified(heliostat):
+        with self.doubtful.unverified(heliostat), self._proofs.unverified(heliostat):
             yield
 
     def misled(self, heliostat: str, point: FloatArray) -> str:
         """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
-        return self._ways.misled(heliostat, point)
+        return self._proofs.misled(heliostat, point)
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
-        return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+        return self._proofs.rewriting(heliostat, *self._tables(heliostat, items)[1])
 
     def _unwritable(self, heliostat: str) -> str | None:
         """Return why nothing may be written to a heliostat, None if it may."""

@@ -11,7 +11,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.field.agreement import Agreement
 from heliotrope.plant.field.state import FieldState
-from heliotrope.plant.motion.beam_watch import BeamWatch
+from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.authority import Authority
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.safety import (

@@ -15,7 +15,7 @@ from heliotrope.links.messages import Stage
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.authority import Person
 from heliotrope.plant.orders.guards import Asked
 from heliotrope.safety import Alarm, alarms

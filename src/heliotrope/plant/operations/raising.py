@@ -13,7 +13,7 @@ from heliotrope.lcu import states
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.orders.authority import Person
 from heliotrope.plant.orders.guards import Asked

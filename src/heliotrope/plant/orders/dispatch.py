@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from heliotrope.lcu import messages
-from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.motion.proofs import BeamError, PathProofs
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.orders.guards import Asked, Guards
 from heliotrope.plant.orders.joining import JoiningJob, JoinQueue, Lost
@@ -22,7 +22,7 @@ Examine = Callable[
 
 
 class JoinDispatcher:
-    """The sending of heliostats whose turn has come, if the way of their beams is clear now.
+    """The sending of heliostats whose turn has come, if the path of their beams is clear now.
 
     The sun has moved since the aim was accepted, and the heliostat may point anywhere. So the sweep
     from its present direction to its aim is proven at the moment it begins.
@@ -31,7 +31,7 @@ class JoinDispatcher:
     ----------
     now
         Returns the monotonic time, s.
-    queue, orders, beams
+    queue, orders, proofs
         Of the plant.
     life
         Life of a command whose turn has come, s.
@@ -46,13 +46,13 @@ class JoinDispatcher:
         now: Callable[[], float],
         queue: JoinQueue,
         orders: PlantOrders,
-        beams: BeamWatch,
+        proofs: PathProofs,
         life: float,
         guards: Guards,
         examine: Examine,
     ) -> None:
         self._now, self._queue, self._orders = now, queue, orders
-        self._beams, self._life = beams, life
+        self._proofs, self._life = proofs, life
         self._guards, self._examine = guards, examine
 
     def beat(self, now: float, lost: Lost, *, held: bool) -> None:
@@ -81,7 +81,7 @@ class JoinDispatcher:
             else:
                 # AIM brings a new aim; every other command leads to those that they have.
                 points = np.tile(job.values, (len(part), 1)) if job.name == "AIM" else None
-                blocked = self._beams.joining(job.name, job.values, part, self._now())
+                blocked = self._proofs.joining(job.name, job.values, part, self._now())
                 blocked |= self._guards.reasons(Asked(job.name, part, points), BEAM_REFUSED)
         except BeamError as error:
             blocked = error.refusals

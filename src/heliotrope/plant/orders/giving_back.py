@@ -15,7 +15,7 @@ from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.field.locks import Locks
 from heliotrope.plant.field.state import FieldState
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.audit import AuditError
 from heliotrope.plant.orders.authority import Authority, RefusedError
 from heliotrope.plant.orders.commands import Commands, NewPoints

@@ -3,7 +3,7 @@
 A row names the refusal, the commands that it stops, and the check that gives each heliostat's
 reason. The table is evaluated when a command is accepted, when its record is written, and when its
 turn comes; of several reasons, the first row's is given. Where the beams may go is proven after
-that: see `BeamWatch`.
+that: see `PathProofs`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -21,7 +21,7 @@ from heliotrope.plant.field.lockouts import Lockouts
 from heliotrope.plant.field.second_plant import SecondPlant
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.field.witnesses import Witnesses
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.authority import Authority
 from heliotrope.plant.orders.parameters import ParameterSync
 from heliotrope.plant.orders.queue import PlantOrders

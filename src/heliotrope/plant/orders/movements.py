@@ -18,7 +18,7 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
 from heliotrope.plant.field.assigned import Held, Places
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.tickets import Ticket
 
 #: Longest distance of a beam from its aim, rad: below that at which `pointing_disagrees` trips.
