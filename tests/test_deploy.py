@@ -108,7 +108,7 @@ def test_alarms_are_raised_from_the_table_only() -> None:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
                 continue
-            place = {"Alarm": 0, "AlarmRow": 1, "Action": 3}.get(node.func.id, 99)
+            place = {"Alarm": 0, "AlarmRow": 0, "Action": 3}.get(node.func.id, 99)
             if len(node.args) > place and isinstance(node.args[place], ast.Constant):
                 found.append(f"{path}:{node.lineno}")
     assert not found

@@ -5,16 +5,16 @@ from itertools import pairwise
 
 import pytest
 
-from heliotrope.cluster._discovery import Discovery, Here, heard
+from heliotrope.cluster._discovery import Discovery, HereAnswer, heard
 from heliotrope.cluster._nodes import Nodes
 from heliotrope.cluster.config import ClusterConfig, Member
 from heliotrope.lcu import messages, wire
 from support.clusters import SITE
 
-ONE, TWO = Here(5001, 3, 7), Here(5002, 3, 8)
+ONE, TWO = HereAnswer(5001, 3, 7), HereAnswer(5002, 3, 8)
 
 
-def answer(here: Here, sequence: int = 9, name: str = "HERE") -> bytes:
+def answer(here: HereAnswer, sequence: int = 9, name: str = "HERE") -> bytes:
     """The frame of an answer to a question of a sequence."""
     body = wire.pack(name, here.serial, here.firmware, here.address)
     to, number = wire.CLUSTER_ADDRESS, messages.NUMBER_OF[name]

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from heliotrope.cluster._runs import GONE, PATIENCE, Runs
+from heliotrope.cluster._runs import GONE, PATIENCE, PlantRuns
 from heliotrope.links.messages import Lease, Stage, decode, encode
 from support.clusters import Field, run
 
@@ -10,7 +10,7 @@ OTHER = 0x1234
 
 
 def test_a_run_waits_until_the_lease_of_the_other_has_ended() -> None:
-    runs = Runs()
+    runs = PlantRuns()
     assert runs.admits("first", 0.0)
     runs.took("first", 0.0, 3.0)
     assert not runs.admits("second", 2.9)
@@ -20,49 +20,49 @@ def test_a_run_waits_until_the_lease_of_the_other_has_ended() -> None:
     assert runs.admits("second", 3.0 + PATIENCE)
     runs.took("second", 3.0 + PATIENCE, 6.0 + PATIENCE)
     assert runs.holder == "second"
-    assert runs.barred == ()
+    assert runs.blocked == ()
 
 
 def test_a_plant_that_was_silent_for_a_while_keeps_its_cluster() -> None:
-    runs = Runs()
+    runs = PlantRuns()
     runs.took("first", 0.0, 3.0)
     assert not runs.admits("second", 2.0)
     assert not runs.admits("second", 8.0)
     assert runs.admits("first", 9.0)
     runs.took("first", 9.0, 12.0)
-    assert runs.barred == ("second",)
+    assert runs.blocked == ("second",)
 
 
 def test_a_run_that_asked_while_another_renewed_is_barred_for_good() -> None:
-    runs = Runs()
+    runs = PlantRuns()
     runs.took("first", 0.0, 3.0)
     assert not runs.admits("second", 0.5)
-    assert runs.barred == ()
+    assert runs.blocked == ()
     runs.took("first", 1.0, 4.0)
-    assert runs.barred == ("second",)
+    assert runs.blocked == ("second",)
     assert not runs.admits("second", 500.0)
-    assert runs.rivals(500.0) == ("second",)
-    assert runs.rivals(500.0 + GONE) == ()
+    assert runs.second_plants(500.0) == ("second",)
+    assert runs.second_plants(500.0 + GONE) == ()
     # The first one only froze; and a restart gives the second plant another name.
     assert runs.admits("first", 500.0)
     assert runs.admits("third", 500.0)
 
 
 def test_who_returns_to_a_cluster_that_has_changed_hands_is_barred() -> None:
-    runs = Runs()
+    runs = PlantRuns()
     runs.took("first", 0.0, 3.0)
     runs.took("second", 4.0, 7.0)
     assert not runs.admits("first", 4.5)
     runs.took("second", 5.0, 8.0)
-    assert runs.barred == ("first",)
+    assert runs.blocked == ("first",)
 
 
 def test_a_plant_without_a_name_waits_too_and_is_never_barred() -> None:
-    runs = Runs()
+    runs = PlantRuns()
     runs.took("first", 0.0, 3.0)
     assert not runs.admits("", 1.0)
     runs.took("first", 1.0, 4.0)
-    assert runs.barred == ()
+    assert runs.blocked == ()
     assert not runs.admits("", 2.0)
     over = 4.0 + PATIENCE
     assert runs.admits("", over)
@@ -71,12 +71,12 @@ def test_a_plant_without_a_name_waits_too_and_is_never_barred() -> None:
 
 
 def test_few_barred_runs_are_remembered() -> None:
-    runs = Runs()
+    runs = PlantRuns()
     runs.took("first", 0.0, 3.0)
     for i in range(20):
         assert not runs.admits(f"{i}", 1.0)
         runs.took("first", 1.0, 4.0)
-    assert runs.barred == tuple(f"{i}" for i in range(4, 20))
+    assert runs.blocked == tuple(f"{i}" for i in range(4, 20))
 
 
 def test_an_older_plant_gives_no_name_and_an_older_cluster_ignores_one() -> None:

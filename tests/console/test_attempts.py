@@ -8,7 +8,7 @@ import httpx
 import pytest
 from starlette.requests import HTTPConnection
 
-from heliotrope.console._attempts import AN_HOUR, SPAN, Attempts
+from heliotrope.console._attempts import AN_HOUR, SPAN, SignInFailures
 from heliotrope.console.headers import address_of
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
@@ -32,12 +32,14 @@ def clock() -> Clock:
     return Clock()
 
 
-def fail(attempts: Attempts, name: str, address: str, times: int) -> None:
+def fail(attempts: SignInFailures, name: str, address: str, times: int) -> None:
     for _ in range(times):
         attempts.begin(name, address)
 
 
-def guess(attempts: Attempts, clock: Clock, pick: Callable[[int], tuple[str, str]]) -> list[float]:
+def guess(
+    attempts: SignInFailures, clock: Clock, pick: Callable[[int], tuple[str, str]]
+) -> list[float]:
     """Guess wrongly as fast as allowed for five hours; return the times."""
     times: list[float] = []
     end = clock.now + 5.0 * SPAN
@@ -52,14 +54,14 @@ def guess(attempts: Attempts, clock: Clock, pick: Callable[[int], tuple[str, str
 
 
 def test_no_hour_has_more_than_twelve_guesses(clock: Clock) -> None:
-    times = guess(Attempts(clock), clock, lambda _: ("ada", HOME))
+    times = guess(SignInFailures(clock), clock, lambda _: ("ada", HOME))
     assert len(times) > AN_HOUR
     for begin in times:
         assert sum(begin <= at < begin + SPAN for at in times) <= AN_HOUR
 
 
 def test_delays_grow_slowly(clock: Clock) -> None:
-    attempts = Attempts(clock)
+    attempts = SignInFailures(clock)
     fail(attempts, "ada", HOME, 4)
     assert attempts.wait("ada", HOME) == 0.0
     waits = []
@@ -74,7 +76,7 @@ def test_delays_grow_slowly(clock: Clock) -> None:
 
 def test_others_at_the_same_address_go_on(clock: Clock) -> None:
     """Hole 7: five wrong passwords of one person locked everybody behind one address."""
-    attempts = Attempts(clock)
+    attempts = SignInFailures(clock)
     fail(attempts, "ada", HOME, AN_HOUR)
     assert attempts.wait("ada", HOME) > 0.0
     assert attempts.wait("grace", HOME) == 0.0
@@ -83,7 +85,7 @@ def test_others_at_the_same_address_go_on(clock: Clock) -> None:
 
 def test_an_own_sign_in_clears_nothing_of_others(clock: Clock) -> None:
     """Hole 7: a guesser's own good sign-in cleared the counter."""
-    attempts = Attempts(clock)
+    attempts = SignInFailures(clock)
     fail(attempts, "ada", HOME, AN_HOUR)
     fail(attempts, "grace", HOME, 30)
     before = attempts.wait("ada", HOME), attempts.wait("stranger", HOME)
@@ -94,7 +96,7 @@ def test_an_own_sign_in_clears_nothing_of_others(clock: Clock) -> None:
 
 
 def test_a_good_sign_in_clears_its_own_failures(clock: Clock) -> None:
-    attempts = Attempts(clock)
+    attempts = SignInFailures(clock)
     fail(attempts, "ada", HOME, 40)
     assert attempts.wait("grace", HOME) > 0.0
     attempts.good("ada", HOME)
@@ -103,7 +105,7 @@ def test_a_good_sign_in_clears_its_own_failures(clock: Clock) -> None:
 
 
 def test_a_name_is_guessed_slowly_from_many_addresses(clock: Clock) -> None:
-    attempts = Attempts(clock)
+    attempts = SignInFailures(clock)
     attempts.good("ada", HOME)
     times = guess(attempts, clock, lambda k: ("ada", f"198.51.100.{k % 250}"))
     assert len(times) <= 5 * SPAN / 30.0 + 30
@@ -113,19 +115,19 @@ def test_a_name_is_guessed_slowly_from_many_addresses(clock: Clock) -> None:
 
 
 def test_many_names_are_guessed_slowly_from_one_address(clock: Clock) -> None:
-    times = guess(Attempts(clock), clock, lambda k: (f"name {k}", HOME))
+    times = guess(SignInFailures(clock), clock, lambda k: (f"name {k}", HOME))
     assert len(times) <= 5 * SPAN / 10.0 + 30
 
 
 def test_a_proxy_is_not_one_caller(clock: Clock) -> None:
-    attempts = Attempts(clock, (PROXY,))
+    attempts = SignInFailures(clock, (PROXY,))
     for k in range(100):
         attempts.begin(f"name {k}", PROXY)
     assert attempts.wait("ada", PROXY) == 0.0
 
 
 def test_a_flood_of_names_does_not_forget_the_guessed_one(clock: Clock) -> None:
-    attempts = Attempts(clock, largest=50)
+    attempts = SignInFailures(clock, largest=50)
     fail(attempts, "ada", HOME, 8)
     for k in range(40):
         attempts.begin(f"name {k}", f"198.51.100.{k}")
@@ -160,7 +162,7 @@ def test_a_proxy_needs_an_address() -> None:
         with pytest.raises(InputError, match="IP address that the console sees"):
             ConsoleSettings(proxies=(text,))
     given = ConsoleSettings(proxies=(PROXY, "::1"))
-    assert ConsoleSettings.of(given.given) == given
+    assert ConsoleSettings.of(given.values) == given
 
 
 def test_a_colleague_signs_in_while_one_is_locked_out(console: LiveConsole) -> None:

@@ -164,4 +164,4 @@ def test_it_needs_the_address_of_the_proxy(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="addresses of --proxy only"):
         ConsoleSettings(people_by_proxy=file)
     given = ConsoleSettings(people_by_proxy=file, proxies=("::1",))
-    assert ConsoleSettings.of(given.given) == given
+    assert ConsoleSettings.of(given.values) == given

@@ -200,7 +200,7 @@ def test_repeated_lines_are_counted() -> None:
     assert last.getMessage() == "no connection (why) (15 more like this were left out)"
     for number in range(1000):
         repeated.filter(line(number=number))
-    assert len(repeated._seen) <= 500
+    assert len(repeated._counts) <= 500
 
 
 def test_time_that_the_server_lost_is_nobodys_fault(

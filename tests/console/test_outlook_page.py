@@ -139,7 +139,7 @@ def test_the_curve_is_in_the_answer_of_the_api_and_in_the_store(
     assert told["field"][0]["at"] <= first["made"]
 
     def kept() -> bool:
-        return first["made"] in [entry.at for entry in field.keeper.outlooks(0.0)]
+        return first["made"] in [outlook.made for outlook in field.keeper.outlooks(0.0)]
 
     field.until(kept)
 

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from heliotrope.console.lines import Lines
+from heliotrope.console.listeners import Listeners
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.urgent import EmergencyWay
 from heliotrope.errors import HeliotropeError, InputError
@@ -121,12 +121,12 @@ def test_its_port() -> None:
     """The next one; another if that is taken, unless it was asked for. The page's is given back."""
     with socket.create_server(("127.0.0.1", 0)) as line:
         taken = line.getsockname()[1]
-        lines = Lines(ConsoleSettings(port=0, emergency_port=taken))
+        lines = Listeners(ConsoleSettings(port=0, emergency_port=taken))
         with pytest.raises(InputError, match="choose another with --emergency-port"):
             lines.open()
         with pytest.raises(InputError, match="choose another with --port"):
-            Lines(ConsoleSettings(port=taken)).open()
-    lines = Lines(ConsoleSettings(port=0))
+            Listeners(ConsoleSettings(port=taken)).open()
+    lines = Listeners(ConsoleSettings(port=0))
     assert [one.getsockname()[1] for one in lines.open()] == [
         lines.settings.port,
         lines.settings.emergency_port,
@@ -139,7 +139,7 @@ def test_its_port_where_the_next_one_is_taken() -> None:
     for _ in range(100):
         with socket.create_server(("127.0.0.1", 0)) as line:
             taken = line.getsockname()[1]
-            lines = Lines(ConsoleSettings(port=taken - 1))
+            lines = Listeners(ConsoleSettings(port=taken - 1))
             try:
                 lines.open()
             except InputError:
@@ -151,7 +151,7 @@ def test_its_port_where_the_next_one_is_taken() -> None:
         pytest.fail("no two free ports side by side")
     with pytest.raises(InputError, match="port 70000"):
         ConsoleSettings(emergency_port=70_000)
-    assert ConsoleSettings.of(lines.settings.given) == lines.settings
+    assert ConsoleSettings.of(lines.settings.values) == lines.settings
 
 
 class Plant:

@@ -29,7 +29,7 @@ from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors
 from heliotrope.plant.operations.coded_visits import JointVisits
 from heliotrope.plant.operations.pictures import Pictures
-from heliotrope.plant.operations.views import PictureRow, Planned
+from heliotrope.plant.operations.views import PictureRow
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.settings import PlantSettings
@@ -37,6 +37,7 @@ from heliotrope.plant.visits import CycleResult, JointCycle
 from heliotrope.plant.visits.joint_layout import arranged, errors_on
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.target_light import Exposed
+from heliotrope.store.records import PlannedVisit
 from support.joint_scene import Scene, joint, spoil
 from support.live import LiveOptions, LivePlant
 from support.visit_scene import BIASES, ENGINEER, START, believe
@@ -431,10 +432,10 @@ def joint_visits(
     return made, told, np.ones(6, dtype=np.bool_)
 
 
-def follow(target: str, ready: np.ndarray, beside: bool) -> Planned | None:
+def follow(target: str, ready: np.ndarray, beside: bool) -> PlannedVisit | None:
     del beside
     row = int(np.argmax(ready))
-    return Planned("ABCDEF"[row], target, 0.0, 1e-3, "") if ready[row] else None
+    return PlannedVisit("ABCDEF"[row], target, 0.0, 1e-3, "") if ready[row] else None
 
 
 def test_joint_visits_leave_every_second_visit_to_those_without_a_calibration() -> None:
@@ -553,7 +554,7 @@ def test_two_targets_share_the_new_heliostats() -> None:
     made._plant.design.targets = ("left", "right")
     asked: list[int] = []
 
-    def following(target: str, left: np.ndarray, beside: bool) -> Planned | None:
+    def following(target: str, left: np.ndarray, beside: bool) -> PlannedVisit | None:
         asked.append(int(left.sum()))
         return follow(target, left, beside)
 

@@ -249,8 +249,8 @@ def test_what_no_longer_fits_the_plant_file_is_named_and_left(tmp_path: Path) ->
     (entry,) = night.keeper.learnings()
     text = entry.document.replace('"tilt_east"', '"tilt_of_old"')
     for version, document in ((2, text), (3, "{}")):
-        night.keeper.record_learning(replace(entry, version=version, document=document))
-    night.keeper.record_learning(replace(entry, group="gone"))
+        night.keeper.record(replace(entry, version=version, document=document))
+    night.keeper.record(replace(entry, group="gone"))
     night.close()
     again = Night(tmp_path)
     (view,) = again.learning.views()

@@ -23,7 +23,7 @@ from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.foresight import Foresight
 from heliotrope.plant.operations.keeping import Keeping
-from heliotrope.plant.operations.outlook import FieldPoint, Outlook, day_of, end_of_day
+from heliotrope.plant.operations.solar_day import day_of, end_of_day
 from heliotrope.plant.schedule.choice import Assignment
 from heliotrope.plant.schedule.prospect import FieldProspect, ReceiverVisitTime, terms_of
 from heliotrope.plant.schedule.scheduler import (
@@ -36,7 +36,7 @@ from heliotrope.plant.schedule.scheduler import (
 from heliotrope.plant.schedule.settings import Settings
 from heliotrope.plant.workers import at_once
 from heliotrope.store.keeper import Keeper
-from heliotrope.store.records import OutlookEntry
+from heliotrope.store.records import FieldPoint, Outlook
 
 PLANT = malan_plant(10)
 #: Its visits are those of one heliostat.
@@ -322,7 +322,7 @@ def test_a_kept_prediction_is_read_back_exactly() -> None:
     points = (FieldPoint(1.0, 2e-3 / 3.0, 1e-2 / 7.0), FieldPoint(2.0, 1e-4, 2e-4))
     for reached in (None, 1.75e9 + 1.0 / 3.0):
         made = Outlook(1.75e9, 7, 3.5e-4, reached, points, "90 % …")
-        read = Outlook.of(OutlookEntry(made.made, made.document()))
+        read = Outlook.of(made.made, made.document)
         assert read == made
 
 

@@ -452,8 +452,8 @@ class _Kept:
 
     problem = ""
 
-    def record_visit(self, visit: object) -> None:
-        del visit
+    def record(self, fact: object) -> None:
+        del fact
 
 
 @pytest.mark.parametrize(

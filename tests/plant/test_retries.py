@@ -21,11 +21,12 @@ from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import FRESH, PLACES, Calibrating
 from heliotrope.plant.operations.raising import RAISING
-from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.orders.authority import RefusedError, TakenOutError
 from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.visits import CycleResult
 from heliotrope.safety import Act, Alarm
+from heliotrope.store.records import PlannedVisit
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME = "P1A"
@@ -39,10 +40,10 @@ class InOrder:
         self.names, self.attempts, self.reason = names, Attempts(VISITS), ""
         self.entries: list[CalibrationEntry] = []
 
-    def next(self, target: str, ready: np.ndarray, beside: bool = False) -> Planned | None:
+    def next(self, target: str, ready: np.ndarray, beside: bool = False) -> PlannedVisit | None:
         del beside
         row = int(np.argmax(ready))
-        return Planned(self.names[row], target, 0.0, 1e-3) if ready[row] else None
+        return PlannedVisit(self.names[row], target, 0.0, 1e-3) if ready[row] else None
 
     def done(self, entry: CalibrationEntry) -> None:
         self.entries.append(entry)

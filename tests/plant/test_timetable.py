@@ -116,7 +116,7 @@ def test_a_kept_timetable_of_other_heliostats_gives_way_to_the_file(tmp_path: Pa
     filed = TimetableEntry("file", design().names[:1], "", ("11:00Z",))
     keeper = Keeper(tmp_path)
     document = '[{"name": "old", "heliostats": ["gone"], "every_s": 3600.0}]'
-    keeper.record_timetable(TimetableRecord(1.0, "olga", document))
+    keeper.record(TimetableRecord(1.0, "olga", document))
     keeper.writer.confirmed().result(10.0)
 
     async def main(clock: VirtualClock) -> None:

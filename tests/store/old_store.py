@@ -15,7 +15,7 @@ from sqlalchemy import text
 from heliotrope.calibration.fit.estimator import FitOutcome
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration, Provenance
 from heliotrope.calibration.sightings import Sightings, sightings
-from heliotrope.safety import Severity
+from heliotrope.safety import Alarm, Severity
 from heliotrope.store import audit, tables
 from heliotrope.store.database import Database
 from heliotrope.store.keeper import Keeper
@@ -118,16 +118,16 @@ def fill(keeper: Keeper) -> None:
     for calibration in CALIBRATIONS:
         keeper.record_calibration(calibration)
     for visit in VISITS:
-        keeper.record_visit(visit)
+        keeper.record(visit)
     keeper.record_plan(PLAN[::-1])
     for campaign in CAMPAIGNS:
-        keeper.record_campaign(campaign)
+        keeper.record(campaign)
     for event in EVENTS:
         keeper.record_event(event)
-    keeper.record_alarm("wind", "mast", "warning", "12 m/s", 1.0, active=True)
-    keeper.record_alarm("wind", "mast", "warning", "", 2.5, active=False)
+    keeper.record_alarm(Alarm("wind", "mast", Severity.WARNING, "12 m/s"), 1.0)
+    keeper.record_alarm(Alarm("wind", "mast", Severity.WARNING, "", active=False), 2.5)
     keeper.record_acknowledgement("wind", "mast", "anna", 3.0)
-    keeper.record_alarm("rain", "", Severity.ALARM, "rain", 4.0, active=True)
+    keeper.record_alarm(Alarm("rain", "", Severity.ALARM, "rain"), 4.0)
     holds = [Lockout(Kind.HELIOSTAT, name, "anna", "broken", 5.0, 50.0) for name in NAMES]
     keeper.hold(holds)
     keeper.unhold(holds[:1], "ben", 6.0)

@@ -16,6 +16,7 @@ from sqlalchemy import select, text
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import FormatError
+from heliotrope.safety import Alarm, Severity
 from heliotrope.store import backup as backups
 from heliotrope.store import tables
 from heliotrope.store.audit import begin, change_points, points
@@ -26,11 +27,12 @@ from heliotrope.store.records import (
     AuditEntry,
     CampaignEntry,
     Event,
+    FieldPoint,
     FlightEntry,
     Kind,
     LearningEntry,
     Lockout,
-    OutlookEntry,
+    Outlook,
     PlannedVisit,
     StoreError,
     TimetableRecord,
@@ -60,15 +62,15 @@ def fill(keeper: Keeper, seen: Sightings, key_file: Path) -> None:
             version=1,
         )
     )
-    keeper.record_visit(VisitEntry("A", "west", 1.0, 2.0, CalibrationOutcome.CALIBRATED))
+    keeper.record(VisitEntry("A", "west", 1.0, 2.0, CalibrationOutcome.CALIBRATED))
     keeper.record_plan([PlannedVisit("B", "west", 3.0)])
-    keeper.record_campaign(CampaignEntry("spring", 1.0))
-    keeper.record_flight(FlightEntry("C1-1", 1.0, "anna", "{}"))
-    keeper.record_learning(LearningEntry("field", 1, 1.0, "anna", 3, 10, 0.5, "{}"))
-    keeper.record_outlook(OutlookEntry(1.0, "{}"))
-    keeper.record_timetable(TimetableRecord(1.0, "anna", "[]"))
+    keeper.record(CampaignEntry("spring", 1.0))
+    keeper.record(FlightEntry("C1-1", 1.0, "anna", "{}"))
+    keeper.record(LearningEntry("field", 1, 1.0, "anna", 3, 10, 0.5, "{}"))
+    keeper.record(Outlook(1.0, 2, 3e-4, None, (FieldPoint(1.0, 1e-3, 2e-3),), "not today"))
+    keeper.record(TimetableRecord(1.0, "anna", "[]"))
     keeper.record_event(Event(1.0, "test", "hello", values={"x": float("nan")}))
-    keeper.record_alarm("wind", "", "alarm", "too much", 1.0, active=True)
+    keeper.record_alarm(Alarm("wind", "", Severity.ALARM, "too much"), 1.0)
     keeper.hold([Lockout(Kind.HELIOSTAT, "B", "anna", "broken", 5.0)])
     keeper.writer.do(lambda c: begin(c, AuditEntry("p-1", "anna", "operator", "AIM", "t", (1.0,))))
     keeper.writer.do(lambda c: change_points(c, {"AIM": {"A": (1.0, 2.0, 3.0)}}, {}))

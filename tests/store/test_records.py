@@ -27,8 +27,10 @@ from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import (
     CampaignEntry,
     Event,
+    FieldPoint,
     Kind,
     Lockout,
+    Outlook,
     PlannedVisit,
     StoreError,
     VisitEntry,
@@ -239,7 +241,7 @@ class TestSchedule:
         )
         second = VisitEntry("B", "east", 11.0, 21.0, CalibrationOutcome.NO_BEAM, text="no spot")
         for visit in (first, second):
-            keeper.record_visit(visit)
+            keeper.record(visit)
         confirm(keeper)
         last, other = keeper.visits()
         assert (last.heliostat, last.number, last.good) == ("B", 2, False)
@@ -258,11 +260,21 @@ class TestSchedule:
         confirm(keeper)
         assert keeper.plan() == []
 
+    def test_an_outlook_replaces_the_one_made_at_its_time(self, keeper: Keeper) -> None:
+        points = (FieldPoint(5.0, 2e-3, 1 / 300), FieldPoint(9.0, 1e-3, 2e-3))
+        first = Outlook(5.0, 7, 3.5e-4, None, points, "not today")
+        better = replace(first, reached=9.0, text="reached")
+        for made in (first, replace(first, made=6.0), better):
+            keeper.record(made)
+        confirm(keeper)
+        assert keeper.outlooks(5.0) == [better, replace(first, made=6.0)]
+        assert keeper.outlooks(5.5) == [replace(first, made=6.0)]
+
     def test_campaigns(self, keeper: Keeper) -> None:
         begun = CampaignEntry("spring", 5.0, model="malan8", expected={"rms": 0.3, "odd": math.nan})
-        keeper.record_campaign(begun)
-        keeper.record_campaign(replace(begun, finished=9.0, found={"rms": 0.31}))
-        keeper.record_campaign(CampaignEntry("summer", 10.0))
+        keeper.record(begun)
+        keeper.record(replace(begun, finished=9.0, found={"rms": 0.31}))
+        keeper.record(CampaignEntry("summer", 10.0))
         confirm(keeper)
         summer, spring = keeper.campaigns()
         assert (summer.name, summer.finished) == ("summer", None)
@@ -299,9 +311,7 @@ class TestEventsAndAlarms:
         line = encode(raised)
         heard = decode(line.replace(b'"warning"', b'"WARNING"') if upper else line)
         assert isinstance(heard, Alarm)
-        keeper.record_alarm(
-            heard.condition, heard.subject, heard.severity, heard.text, 5.0, active=True
-        )
+        keeper.record_alarm(heard, 5.0)
         confirm(keeper)
         (kept,) = keeper.alarms()
         assert (kept.condition, kept.subject, kept.severity) == ("node_silent", "A1", "warning")
@@ -322,7 +332,7 @@ class TestEventsAndAlarms:
 
     def test_an_alarm_from_its_beginning_to_its_end(self, keeper: Keeper) -> None:
         def alarm(at: float, text: str = "12 m/s", *, active: bool = True) -> None:
-            keeper.record_alarm("wind", "mast", "warning", text, at, active=active)
+            keeper.record_alarm(Alarm("wind", "mast", Severity.WARNING, text, active), at)
 
         alarm(1.0)
         alarm(2.0, "14 m/s")
@@ -344,8 +354,8 @@ class TestEventsAndAlarms:
     def test_what_is_old_and_settled_is_forgotten(self, keeper: Keeper) -> None:
         for at in (1.0, 2.0, 9.0):
             keeper.record_event(Event(at, "test", str(at)))
-            keeper.record_alarm(f"c{at}", "", "alarm", "", at, active=True)
-        keeper.record_alarm("c1.0", "", "alarm", "", 3.0, active=False)
+            keeper.record_alarm(Alarm(f"c{at}", "", Severity.ALARM, ""), at)
+        keeper.record_alarm(Alarm("c1.0", "", Severity.ALARM, "", active=False), 3.0)
         keeper.record_acknowledgement("c1.0", "", "anna", 4.0)
         keeper.forget_events(5.0)
         confirm(keeper)

@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 
 from heliotrope.console import _secrets
 from heliotrope.console.beside import ConsoleProcesses
-from heliotrope.console.lines import Lines
-from heliotrope.console.process import Given
+from heliotrope.console.listeners import Listeners
+from heliotrope.console.process import ProcessInput
 from heliotrope.console.remote import RemotePlant
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
@@ -49,12 +49,12 @@ async def serving(
     interface: PlantInterface, settings: ConsoleSettings
 ) -> AsyncIterator[tuple[ConsoleServer, str]]:
     """Serve a console of a plant during a block; yield it with its address."""
-    lines = Lines(settings)
+    lines = Listeners(settings)
     page, way = lines.open()
     plant = RemotePlant(interface.folder, interface.key)
     server = ConsoleServer(plant, lines.settings, page)
     urgent = LocalConnection(interface.folder / EMERGENCY, {"key": interface.key}, 10.0)
-    beside = server_of(urgent, Given(interface.folder, interface.key, lines.settings, way))
+    beside = server_of(urgent, ProcessInput(interface.folder, interface.key, lines.settings, way))
     async with asyncio.TaskGroup() as group:
         connecting = [group.create_task(one.run()) for one in (plant, urgent)]
         async with running(server), running(beside):
@@ -155,7 +155,7 @@ class LiveConsole:
                 self._tell,
                 self._child,
             )
-            self.process, self.way, self.beside = beside.page, beside.way, beside
+            self.process, self.way, self.beside = beside.page, beside.emergency, beside
             async with self.live.running(), self.interface.running(beside.run):
                 await asyncio.to_thread(self._over.wait)
         self.keeper.close()

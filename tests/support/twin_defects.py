@@ -315,7 +315,7 @@ def _sun_in_the_dark(patch: pytest.MonkeyPatch) -> None:
 
 def _two_plants_obeyed(patch: pytest.MonkeyPatch) -> None:
     """A cluster takes the lease of every plant with its key."""
-    patch.setattr(_runs.Runs, "admits", lambda self, run, now: True)
+    patch.setattr(_runs.PlantRuns, "admits", lambda self, run, now: True)
 
 
 def _brown_out_as_queued(patch: pytest.MonkeyPatch) -> None:

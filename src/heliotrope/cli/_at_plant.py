@@ -53,20 +53,20 @@ class AtPlant:
         HeliotropeError
             If the plant refuses it, or cannot be reached.
         """
-        request, given, blob = f"{method} {path}", dict(body or {}), b""
+        request, arguments, blob = f"{method} {path}", dict(body or {}), b""
         if request == "POST aim":
-            points = given.pop("points", {})
-            given["points"] = list(points)
+            points = arguments.pop("points", {})
+            arguments["points"] = list(points)
             blob = array("d", [x for point in points.values() for x in point]).tobytes()
         if request == "POST flights":
-            given, blob = {}, json.dumps(given).encode()
+            arguments, blob = {}, json.dumps(arguments).encode()
         if request not in URGENT:
-            return ask_once(self._folder / ORDINARY, self._hello, request, given, blob)
+            return ask_once(self._folder / ORDINARY, self._hello, request, arguments, blob)
         try:
-            return ask_once(self._folder / EMERGENCY, self._hello, request, given)
+            return ask_once(self._folder / EMERGENCY, self._hello, request, arguments)
         except CallError:
             # A token that has expired, or of a viewer, must not stop an emergency.
-            return ask_once(self._folder / EMERGENCY, _USER, request, given)
+            return ask_once(self._folder / EMERGENCY, _USER, request, arguments)
 
     def get(self, path: str) -> Any:
         """Return the view of a path."""

@@ -180,9 +180,9 @@ def _set_up_factor(client: "Client", own: str) -> None:
     segno.make(made["uri"]).terminal(compact=True)
     print(f"Read it with an authenticator, or type the secret there: {made['secret']}")
     code = typer.prompt("Code that it shows")
-    found = client.ask("PUT", "session/factor", {"code": code})
+    answer = client.ask("PUT", "session/factor", {"code": code})
     print("The second factor is in force. Recovery codes, shown only now, each good once:")
-    print("\n".join(found["codes"]))
+    print("\n".join(answer["codes"]))
 
 
 @app.command()
@@ -226,21 +226,21 @@ def account(
 def status(context: typer.Context, as_json: Json = False) -> None:
     """Print a summary of the plant."""
     with _client(context) as client:
-        found = client.get("summary")
-        order = client.get("emergency") if found["emergency"] else {}
+        answer = client.get("summary")
+        order = client.get("emergency") if answer["emergency"] else {}
     if as_json:
-        print_json(found)
+        print_json(answer)
         return
-    print(f"{found['name']}, {found['at']}")
-    print_table(("state", "heliostats"), [(k, str(v)) for k, v in found["states"].items()])
-    print(f"{found['clusters_alive']} of {found['clusters']} clusters heard")
-    print(f"{found['alarms']} alarms active or not acknowledged")
-    print(f"{found['holder'] or 'nobody'} has the command authority")
-    if found["emergency"]:
+    print(f"{answer['name']}, {answer['at']}")
+    print_table(("state", "heliostats"), [(k, str(v)) for k, v in answer["states"].items()])
+    print(f"{answer['clusters_alive']} of {answer['clusters']} clusters heard")
+    print(f"{answer['alarms']} alarms active or not acknowledged")
+    print(f"{answer['holder'] or 'nobody'} has the command authority")
+    if answer["emergency"]:
         print(f"EMERGENCY ({order['act']}): {order['text']}")
         _print_causes(order)
-    if found["resume"]:
-        print(f"automatic control waits for Resume: {found['resume']}")
+    if answer["resume"]:
+        print(f"automatic control waits for Resume: {answer['resume']}")
 
 
 @app.command()
@@ -349,19 +349,19 @@ def emergency(
     """Take all beams off the receiver now."""
     with _client(context) as client:
         if withdraw:
-            found = client.ask("DELETE", "emergency", {"owner": owner})
+            answer = client.ask("DELETE", "emergency", {"owner": owner})
         else:
-            found = client.ask("POST", "emergency", {"act": act.upper(), "reason": reason})
-    print(f"emergency {'in force' if found['on'] else 'not in force'}: {found['text']}")
-    _print_causes(found)
+            answer = client.ask("POST", "emergency", {"act": act.upper(), "reason": reason})
+    print(f"emergency {'in force' if answer['on'] else 'not in force'}: {answer['text']}")
+    _print_causes(answer)
 
 
-def _print_causes(found: dict[str, Any]) -> None:
+def _print_causes(answer: dict[str, Any]) -> None:
     """Print the orders of persons that stand; where none does, why an emergency holds."""
-    for call in found["calls"]:
+    for call in answer["calls"]:
         print(f"ordered by {call['who']} ({call['act']}, {_utc(call['at'])}): {call['reason']}")
-    if found["on"] and not found["calls"]:
-        print(found["reason"])
+    if answer["on"] and not answer["calls"]:
+        print(answer["reason"])
 
 
 @app.command()
@@ -383,8 +383,8 @@ def calibration(
 ) -> None:
     """Switch automatic calibration on or off."""
     with _client(context) as client:
-        found = client.ask("PUT", "calibration", {"on": on})
-    print(f"calibration {'on' if found['on'] else 'off'}; {found['done']} calibrated")
+        answer = client.ask("PUT", "calibration", {"on": on})
+    print(f"calibration {'on' if answer['on'] else 'off'}; {answer['done']} calibrated")
 
 
 @app.command()
@@ -445,15 +445,15 @@ def error_parameters(
     order = {"heliostat": heliostat, "reason": reason, "version": version}
     with _client(context) as client:
         if not values and not version:
-            found = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
-            _show_parameters(found, as_json)
+            answer = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
+            _show_parameters(answer, as_json)
             return
         if not reason.strip():
             raise InputError("ctl: give the reason for other parameters with --reason")
         units = {}
         if values:
-            found = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
-            units = {one["name"]: one["unit"] for one in found["parameters"]}
+            answer = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
+            units = {parameter["name"]: parameter["unit"] for parameter in answer["parameters"]}
         order["values"] = dict(_parameter(text, units) for text in values or ())
         _follow_with_authority(client, "parameters", order, wait)
 
@@ -464,33 +464,33 @@ _SHOWN = {"rad": ("mrad", 1e-3), "m": ("mm", 1e-3), "1": ("", 1.0)}
 
 def _parameter(text: str, units: dict[str, str]) -> tuple[str, float]:
     """Return name and value of NAME=VALUE, in the unit of the API."""
-    given, _, number = text.partition("=")
-    name = given
+    key, _, number = text.partition("=")
+    name = key
     for ending in ("_mrad", "_mm", "_deg"):
         name = name.removesuffix(ending)
     if name not in units:
         raise UnknownNameError("parameter", name, units)
-    size = 0.017453292519943295 if given.endswith("_deg") else _SHOWN[units[name]][1]
+    size = 0.017453292519943295 if key.endswith("_deg") else _SHOWN[units[name]][1]
     refusal = f"{text!r}: give NAME=VALUE with a number, {_SHOWN[units[name]][0]}"
     return name, parse_numbers(number, refusal)[0] * size
 
 
-def _show_parameters(found: dict[str, Any], as_json: bool) -> None:
+def _show_parameters(answer: dict[str, Any], as_json: bool) -> None:
     if as_json:
-        print_json(found)
+        print_json(answer)
         return
     rows = []
-    for one in found["parameters"]:
-        unit, size = _SHOWN[one["unit"]]
-        values = (one["file"], one["value"], one["sigma"], one["prior"])
+    for parameter in answer["parameters"]:
+        unit, size = _SHOWN[parameter["unit"]]
+        values = (parameter["file"], parameter["value"], parameter["sigma"], parameter["prior"])
         shown = ("" if v is None else f"{v / size:.3f}" for v in values)
-        rows.append((one["name"], *shown, unit))
+        rows.append((parameter["name"], *shown, unit))
     head = ("parameter", "plant file", "in use", "σ", "σ installed", "unit")
-    print_table(head, rows, f"{found['heliostat']}, version {found['version']}")
-    print(f"stored by its local controller: {found['stored']}")
+    print_table(head, rows, f"{answer['heliostat']}, version {answer['version']}")
+    print(f"stored by its local controller: {answer['stored']}")
     lines = [
         (str(e["version"]), _utc(e["at"]), e["person"], str(e["sightings"]), e["note"])
-        for e in found["earlier"]
+        for e in answer["earlier"]
     ]
     if lines:
         print_table(("earlier version", "time", "person", "sightings", "note"), lines)
@@ -505,8 +505,8 @@ def photograph(
     from urllib.parse import quote
 
     with _client(context) as client:
-        found = client.ask("POST", f"targets/{quote(target, safe='')}/photograph")
-    print(f"{target}, photograph {found['version']}", *found["reading"], sep="\n")
+        answer = client.ask("POST", f"targets/{quote(target, safe='')}/photograph")
+    print(f"{target}, photograph {answer['version']}", *answer["reading"], sep="\n")
 
 
 @app.command()
@@ -524,13 +524,12 @@ def photographs(
     from urllib.parse import quote
 
     with _client(context) as client:
-        found = client.get(f"photographs?heliostat={quote(heliostat, safe='')}&limit={limit}")
+        answer = client.get(f"photographs?heliostat={quote(heliostat, safe='')}&limit={limit}")
     if as_json:
-        print_json(found)
+        print_json(answer)
         return
     rows = [
-        (str(one["identity"]), _utc(one["at"]), one["target"], one["outcome"], one["text"])
-        for one in found
+        (str(p["identity"]), _utc(p["at"]), p["target"], p["outcome"], p["text"]) for p in answer
     ]
     print_table(("number", "time", "target", "outcome", ""), rows)
 
@@ -546,23 +545,23 @@ def frames(
     from urllib.parse import quote
 
     with _client(context) as client:
-        found = client.ask("POST", f"clusters/{quote(cluster, safe='')}/frames")
+        answer = client.ask("POST", f"clusters/{quote(cluster, safe='')}/frames")
     if heliostat:
-        found = [one for one in found if one["whom"] in (heliostat, "all", "")]
+        answer = [frame for frame in answer if frame["whom"] in (heliostat, "all", "")]
     if as_json:
-        print_json(found)
+        print_json(answer)
         return
     rows = [
         (
-            datetime.fromtimestamp(one["at"], UTC).strftime("%H:%M:%S.%f")[:-3],
-            one["way"],
-            one["whom"],
-            one["kind"] + (" (signed)" if one["signed"] else ""),
-            str(one["sequence"]),
-            str(one["size"]),
-            one["text"],
+            datetime.fromtimestamp(frame["at"], UTC).strftime("%H:%M:%S.%f")[:-3],
+            frame["way"],
+            frame["whom"],
+            frame["kind"] + (" (signed)" if frame["signed"] else ""),
+            str(frame["sequence"]),
+            str(frame["size"]),
+            frame["text"],
         )
-        for one in found
+        for frame in answer
     ]
     print_table(("time", "way", "heliostat", "kind", "number", "bytes", ""), rows)
 
@@ -578,18 +577,18 @@ def flight(
 
     document = read_flight(file).model_dump()
     with _client(context) as client:
-        found = client.ask("POST", "flights", {**document, "name": name or document["name"]})
+        answer = client.ask("POST", "flights", {**document, "name": name or document["name"]})
     print(
-        f"flight {found['name']}: {found['orientations']} orientations of {found['heliostats']} "
+        f"flight {answer['name']}: {answer['orientations']} orientations of {answer['heliostats']} "
         f"heliostats"
     )
     print(
-        f"new parameters: {found['in_use']} in use, {found['at_stow']} when next at stow, "
-        f"{found['at_target']} after a photograph on a target; {found['unchanged']} unchanged"
+        f"new parameters: {answer['in_use']} in use, {answer['at_stow']} when next at stow, "
+        f"{answer['at_target']} after a photograph on a target; {answer['unchanged']} unchanged"
     )
-    rows = [(word, f"{value:+.2g}", f"{sigma:.2g}") for word, value, sigma in found["shared"]]
+    rows = [(word, f"{value:+.2g}", f"{sigma:.2g}") for word, value, sigma in answer["shared"]]
     print_table(("shared error", "found", "σ"), rows)
-    for line in found["problems"]:
+    for line in answer["problems"]:
         print(line)
 
 
@@ -602,10 +601,10 @@ def learn(
 ) -> None:
     """Learn drift, noise and installation of the mirrors now, as at night; nothing moves."""
     with _client(context) as client:
-        found = client.ask("POST", "learning", {"group": group})
-    for one in found:
-        print(f"group {one['group']}: {one['said']}")
-        print(f"  in force: {one['drift']}")
+        answer = client.ask("POST", "learning", {"group": group})
+    for entry in answer:
+        print(f"group {entry['group']}: {entry['said']}")
+        print(f"  in force: {entry['drift']}")
 
 
 @app.command()
@@ -638,37 +637,37 @@ def timetable(
             "ctl timetable: give NAME HELIOSTAT… with --at or --every, or NAME --remove"
         )
     with _client(context) as client:
-        found = client.get("timetable")
+        answer = client.get("timetable")
         if plant_file or name:
-            entries = None if plant_file else _entries(found, name, remove)
+            entries = None if plant_file else _entries(answer, name, remove)
             if entries is not None and gives:
                 seconds = parse_duration(every).total_seconds() if every else None
                 entry = {"name": name, "heliostats": heliostats or [], "target": target}
                 entries.append({**entry, "at": at or [], "every_s": seconds})
-            found = client.ask("PUT", "timetable", {"entries": entries})
+            answer = client.ask("PUT", "timetable", {"entries": entries})
     if as_json:
-        print_json(found)
+        print_json(answer)
         return
     rows = [
         (
-            one["name"],
-            ", ".join(one["heliostats"][:3]) + ("…" if len(one["heliostats"]) > 3 else ""),
-            one["target"] or "any",
-            ", ".join(one["at"]) + (f" every {one['every_s']:g} s" if one["every_s"] else ""),
-            _utc(one["next"]),
-            one["text"] or "not due yet",
+            row["name"],
+            ", ".join(row["heliostats"][:3]) + ("…" if len(row["heliostats"]) > 3 else ""),
+            row["target"] or "any",
+            ", ".join(row["at"]) + (f" every {row['every_s']:g} s" if row["every_s"] else ""),
+            _utc(row["next"]),
+            row["text"] or "not due yet",
         )
-        for one in found
+        for row in answer
     ]
     print_table(("entry", "heliostats", "target", "at", "next", "last"), rows, "timetable")
 
 
-def _entries(found: list[dict[str, Any]], name: str, remove: bool) -> list[dict[str, Any]]:
+def _entries(in_force: list[dict[str, Any]], name: str, remove: bool) -> list[dict[str, Any]]:
     """Return the entries in force but for one, as the API takes them."""
-    if remove and name not in [one["name"] for one in found]:
-        raise UnknownNameError("timetable entry", name, [one["name"] for one in found])
+    if remove and name not in [entry["name"] for entry in in_force]:
+        raise UnknownNameError("timetable entry", name, [entry["name"] for entry in in_force])
     keys = ("name", "heliostats", "target", "at", "every_s")
-    return [{key: one[key] for key in keys} for one in found if one["name"] != name]
+    return [{key: entry[key] for key in keys} for entry in in_force if entry["name"] != name]
 
 
 @app.command()
@@ -733,7 +732,7 @@ def _places(
     receivers: list[str] | None,
     tower: bool,
 ) -> dict[str, object]:
-    """Return what a person locks or gives back, as the API takes it."""
+    """Return the places that a person locks or gives back, as the API takes them."""
     named = {"heliostats": heliostats, "targets": targets, "receivers": receivers}
     return {key: list(names or ()) for key, names in named.items()} | {"tower": tower}
 
@@ -796,13 +795,15 @@ def _follow_all(client: "Client | AtPlant", tickets: list[dict[str, Any]], wait:
             if printed.get(ticket["identity"]) != ticket["text"]:
                 printed[ticket["identity"]] = ticket["text"]
                 print(ticket["text"], flush=True)
-        left = [ticket["identity"] for ticket in tickets if not ticket["finished"]]
-        if not left or time.monotonic() >= until:
+        unfinished = [ticket["identity"] for ticket in tickets if not ticket["finished"]]
+        if not unfinished or time.monotonic() >= until:
             break
         time.sleep(0.5)
         tickets = [
-            client.get(f"commands/{each['identity']}") if each["identity"] in left else each
-            for each in tickets
+            client.get(f"commands/{ticket['identity']}")
+            if ticket["identity"] in unfinished
+            else ticket
+            for ticket in tickets
         ]
     if wait > 0.0 and not all(ticket["good"] for ticket in tickets):
         raise typer.Exit(1)

@@ -81,8 +81,8 @@ class BusKeys:
         self._taken: tuple[bytes, ...] = ()
         self._held: dict[int, _Held] = {}
         self._next = 0
-        self._wrong: dict[int, float] = {}  # nodes that have not the keys, and since when
-        self._told: set[int] = set()
+        self._missing: dict[int, float] = {}  # nodes that have not the keys, and since when
+        self._reported: set[int] = set()
         self._look()
 
     # -- the keys ----------------------------------------------------------------------------
@@ -104,7 +104,7 @@ class BusKeys:
         heard = [node for node in self._nodes if node.known and node.missed == 0]
         held = [self._held.get(node.index) for node in heard if node.flags & names.BUS_KEY]
         return bool(heard) and all(
-            each is not None and each.prints is not None and newest in each.prints for each in held
+            own is not None and own.prints is not None and newest in own.prints for own in held
         )
 
     def _due(self, prints: tuple[int, int]) -> bytes | None:
@@ -112,11 +112,11 @@ class BusKeys:
         newest, old = prints
         if not self._keys:
             return NO_KEY if newest else None
-        wanted = list(self._keys)
-        if newest not in wanted and old not in wanted:
-            return self._keys[wanted[-1]]  # the one that signs now
-        if newest != wanted[0] or (len(wanted) == 1 and old):
-            return self._keys[wanted[0]]
+        keys = list(self._keys)
+        if newest not in keys and old not in keys:
+            return self._keys[keys[-1]]  # the one that signs now
+        if newest != keys[0] or (len(keys) == 1 and old):
+            return self._keys[keys[0]]
         return None
 
     # -- sessions ----------------------------------------------------------------------------
@@ -225,23 +225,23 @@ class BusKeys:
 
     def _report(self) -> None:
         now = self._clock()
-        wrong = {node.index for node in self._nodes if node.known and self._is_wrong(node)}
-        self._wrong = {index: self._wrong.get(index, now) for index in wrong}
-        late = {index for index, since in self._wrong.items() if now - since > _PATIENCE}
+        without = {node.index for node in self._nodes if node.known and self._lacks_keys(node)}
+        self._missing = {index: self._missing.get(index, now) for index in without}
+        late = {index for index, since in self._missing.items() if now - since > _PATIENCE}
         kind = alarms.BUS_KEY_MISSING if self._ring is None else alarms.BUS_UNSIGNED
-        if late - self._told:
-            if self._told:
+        if late - self._reported:
+            if self._reported:
                 self._reports.clear(kind.ended(cluster=self._cluster))
-            self._told = wrong
-            listed = ", ".join(self._nodes[index].name for index in sorted(wrong))
-            found = (self._held.get(index) for index in sorted(wrong))
-            why = next((each.why for each in found if each is not None and each.why), _MOVES)
+            self._reported = without
+            listed = ", ".join(self._nodes[index].name for index in sorted(without))
+            known = (self._held.get(index) for index in sorted(without))
+            why = next((held.why for held in known if held is not None and held.why), _MOVES)
             self._reports.alarm(kind.raised(cluster=self._cluster, heliostats=listed, why=why))
-        elif self._told and not wrong:
-            self._told = set()
+        elif self._reported and not without:
+            self._reported = set()
             self._reports.clear(kind.ended(cluster=self._cluster))
 
-    def _is_wrong(self, node: ClusterNode) -> bool:
+    def _lacks_keys(self, node: ClusterNode) -> bool:
         if self._ring is None:
             return bool(node.flags & names.BUS_KEY)
         if not self._keys:

@@ -56,14 +56,14 @@ class RecordedBus:
 
     def taken(self) -> tuple[float, str, bytes]:
         """End the record; return its beginning (POSIX s), why it is over, and its entries."""
-        found = self._utc_s, self._full or f"{LONGEST:g} s are over", b"".join(self._entries)
+        record = self._utc_s, self._full or f"{LONGEST:g} s are over", b"".join(self._entries)
         self._began, self._entries = None, []
-        return found
+        return record
 
-    def _keep(self, way: int, data: bytes, at: float) -> None:
+    def _keep(self, direction: int, data: bytes, at: float) -> None:
         if self._began is None or self.complete or not data:
             return
-        entry = struct.pack(BUS_ENTRY, at - self._began, way, len(data)) + data
+        entry = struct.pack(BUS_ENTRY, at - self._began, direction, len(data)) + data
         if len(self._entries) == MOST or self._size + len(entry) > LARGEST:
             self._full = f"{MOST} entries or {LARGEST >> 10} KiB are full"
             return

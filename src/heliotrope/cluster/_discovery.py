@@ -23,7 +23,7 @@ _GARBLED = 4
 
 
 @dataclass(frozen=True)
-class Here:
+class HereAnswer:
     """The answer of a local controller."""
 
     serial: int
@@ -39,18 +39,18 @@ class _Range:
     garbled: int = 0
 
 
-def heard(data: bytes, sequence: int) -> tuple[list[Here], bool]:
+def heard(data: bytes, sequence: int) -> tuple[list[HereAnswer], bool]:
     """Return the answers to a question, and whether other bytes came."""
     reader = wire.Reader()
     # A zero ends a frame that was cut off.
     frames = reader.feed(data + b"\0")
-    found = []
+    answers = []
     for frame in frames:
         values = frame.values()
         if frame.number == _HERE and frame.sequence == sequence and values is not None:
-            found.append(Here(*values))
+            answers.append(HereAnswer(*values))
     damaged = reader.crc + reader.cobs + reader.length + reader.version > 0
-    return found, damaged or len(found) < len(frames)
+    return answers, damaged or len(answers) < len(frames)
 
 
 class Discovery:
@@ -71,12 +71,12 @@ class Discovery:
 
     def __init__(self, nodes: Nodes, exchange: Exchange) -> None:
         self._nodes, self._exchange = nodes, exchange
-        self._found: dict[int, Here] = {}
+        self._answers: dict[int, HereAnswer] = {}
         self._garbled: list[int] = []
         serials = [node.member.serial for node in nodes if node.member.serial is not None]
         low, high = min(serials, default=0), max(serials, default=_LARGEST)
         ranges = [_Range(low, high), _Range(0, low - 1), _Range(high + 1, _LARGEST)]
-        self._ranges = [each for each in reversed(ranges) if each.low <= each.high]
+        self._ranges = [span for span in reversed(ranges) if span.low <= span.high]
         self.questions = 0
 
     @property
@@ -91,9 +91,9 @@ class Discovery:
         if data is None:
             return  # something urgent came between
         self.questions += 1
-        found, garbled = heard(data, sequence)
-        fresh = [here for here in found if self._found.get(here.serial) != here]
-        self._found.update((here.serial, here) for here in found)
+        answers, garbled = heard(data, sequence)
+        fresh = [answer for answer in answers if self._answers.get(answer.serial) != answer]
+        self._answers.update((answer.serial, answer) for answer in answers)
         if not garbled:
             now.clean = 0 if fresh else now.clean + 1
             if now.clean >= _CLEAN:
@@ -114,23 +114,23 @@ class Discovery:
         numbers whose answers were always damaged (two with the same number).
         """
         named = {node.member.serial: node for node in self._nodes}
-        found = [
+        listed = [
             {
-                "serial": here.serial,
-                "firmware": here.firmware,
-                "address": here.address,
-                "name": named[here.serial].name if here.serial in named else "",
-                "expected": named[here.serial].address if here.serial in named else 0,
+                "serial": answer.serial,
+                "firmware": answer.firmware,
+                "address": answer.address,
+                "name": named[answer.serial].name if answer.serial in named else "",
+                "expected": named[answer.serial].address if answer.serial in named else 0,
             }
-            for here in sorted(self._found.values(), key=lambda here: here.serial)
+            for answer in sorted(self._answers.values(), key=lambda answer: answer.serial)
         ]
         missing = [
             node.name
             for node in self._nodes
-            if node.member.serial is not None and node.member.serial not in self._found
+            if node.member.serial is not None and node.member.serial not in self._answers
         ]
         return {
-            "found": found,
+            "found": listed,
             "missing": missing,
             "garbled": self._garbled,
             "questions": self.questions,

@@ -173,9 +173,9 @@ class Emergencies:
             and other.began <= begin
             and node in other.waiting
         ]
-        for one in (order, *same):
-            one.tries[node.index] += 1
-            self._sent(one, [node])
+        for emergency in (order, *same):
+            emergency.tries[node.index] += 1
+            self._sent(emergency, [node])
         if answer is None:
             node.retried()
             order.waiting.append(node)

@@ -62,10 +62,10 @@ class Epoch:
     def second(self) -> None:
         """Begin an epoch if the local controllers are out of step, or one that is stored."""
         self._rest = max(0, self._rest - 1)
-        one = max(self._of_one.values(), default=0) >= _OUT_OF_STEP and not self._rest
-        if one:
+        single = max(self._of_one.values(), default=0) >= _OUT_OF_STEP and not self._rest
+        if single:
             self._rest = _REST
-        if one or self._duplicates >= _OUT_OF_STEP:
+        if single or self._duplicates >= _OUT_OF_STEP:
             self._begin(0)
         self._use()
 
@@ -82,7 +82,7 @@ class Epoch:
         self._storing, self._duplicates = True, 0
         self._of_one.clear()
 
-        def told(epoch: int, error: Exception | None) -> None:
+        def stored(epoch: int, error: Exception | None) -> None:
             self._storing = False
             if error is not None:
                 self._reports.alarm(alarms.STATE_UNWRITABLE.raised(problem=error))
@@ -91,7 +91,7 @@ class Epoch:
             self._of_time = self._of_time or at_least > 0
             self._reports.clear(alarms.STATE_UNWRITABLE.ended())
 
-        self._kept.begin(at_least, told)
+        self._kept.begin(at_least, stored)
 
     def _use(self) -> None:
         """Begin the stored epoch: only before SESSION, which tells it to the local controllers."""

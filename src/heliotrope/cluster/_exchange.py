@@ -150,7 +150,7 @@ class Exchange:
         """
         frame = self.sender.frame(node.address, name, *values, key=key)
         sequence = self.sender.count & 0xFFFF
-        wanted = tuple(messages.NUMBER_OF[number] for number in numbers)
+        expected = tuple(messages.NUMBER_OF[number] for number in numbers)
         for attempt in range(tries):
             begin = self._clock.monotonic()
             if begin >= expires or (attempt and self._hurry):
@@ -164,13 +164,13 @@ class Exchange:
                 data = await self._bus.transact(frame, self._answer, expires=expires, urgent=urgent)
             if data is None:
                 break
-            answer = answer_in(data, node.address, sequence, wanted) if data else None
-            found = None if answer is None else answer.values()
-            if answer is not None and found is not None:
+            answer = answer_in(data, node.address, sequence, expected) if data else None
+            fields = None if answer is None else answer.values()
+            if answer is not None and fields is not None:
                 now = self._clock.monotonic()
                 self._answered += 1
                 node.answered(now, now - begin)
-                return NodeAnswer(answer.name, found, attempt)
+                return NodeAnswer(answer.name, fields, attempt)
             self._spoilt(node, data, begin)
         return None
 

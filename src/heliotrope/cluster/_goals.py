@@ -43,26 +43,26 @@ class Goal:
 
     Attributes
     ----------
-    there, on_way
+    goal_states, on_way
         States.
     clear, needed
         Flags that must be clear, and set, in one of ``there``; until then it is on its way.
     near
         Whether the step counts must be near their goal. A defocused mirror follows the sun beside
         the receiver, so it never stands still.
-    told
+    evidence
         States and flags, one of which shows that the command was taken where the goal looks like
         the state before it and the answer was lost. None: the goal itself shows it.
     limit
         Time allowed to get there, s.
     """
 
-    there: frozenset[int]
+    goal_states: frozenset[int]
     on_way: frozenset[int] = frozenset()
     clear: int = 0
     needed: int = 0
     near: bool = False
-    told: tuple[frozenset[int], int] | None = None
+    evidence: tuple[frozenset[int], int] | None = None
     limit: float = _LONGEST
 
     def reached(self, state: int, flags: int, off: int) -> bool | None:
@@ -70,14 +70,14 @@ class Goal:
 
         ``off`` is the distance of the step counts from their goal.
         """
-        if state in self.there:
+        if state in self.goal_states:
             clear = not flags & self.clear and (not self.near or off <= _NEAR)
             return True if clear and flags & self.needed == self.needed else None
         return None if state in self.on_way else False
 
     def shown(self, state: int, flags: int) -> bool:
         """Whether state and flags show that the command was taken."""
-        return self.told is None or state in self.told[0] or bool(flags & self.told[1])
+        return self.evidence is None or state in self.evidence[0] or bool(flags & self.evidence[1])
 
 
 #: Neither states nor flags show whether it was taken.
@@ -87,14 +87,14 @@ GOALS = {
     "IDLE": Goal(frozenset({IDLE})),
     "TRACK": Goal(frozenset({TRACKING})),
     "REFOCUS": Goal(frozenset({TRACKING})),
-    "SEARCH": Goal(frozenset({SEARCHING, IDLE}), told=(frozenset({SEARCHING}), 0)),
+    "SEARCH": Goal(frozenset({SEARCHING, IDLE}), evidence=(frozenset({SEARCHING}), 0)),
     "LOCK": Goal(frozenset({LOCKED})),
     "UNLOCK": Goal(_ALL - {LOCKED}),
     "CLEAR_FAULT": Goal(_ALL - {FAULT}),
-    "JOG": Goal(frozenset({IDLE}), clear=names.MOVING, told=_NOTHING),
-    "GOTO": Goal(frozenset({IDLE}), clear=names.MOVING, told=_NOTHING),
+    "JOG": Goal(frozenset({IDLE}), clear=names.MOVING, evidence=_NOTHING),
+    "GOTO": Goal(frozenset({IDLE}), clear=names.MOVING, evidence=_NOTHING),
     "DIAGNOSE": Goal(
-        frozenset({IDLE}), clear=names.DIAGNOSING, told=(frozenset(), names.DIAGNOSING)
+        frozenset({IDLE}), clear=names.DIAGNOSING, evidence=(frozenset(), names.DIAGNOSING)
     ),
     "DEFOCUS": Goal(_BEAM_OFF, near=True, limit=DEFOCUS_BUDGET),
     "STOW": Goal(
@@ -103,8 +103,8 @@ GOALS = {
 }
 #: Goals that an order leaves in force, besides those of its own name: a stow is not undone.
 _SPARED = {"DEFOCUS": ("STOW",)}
-assert STOWED in GOALS["STOW"].there
-assert STOWING in GOALS["STOW"].there
+assert STOWED in GOALS["STOW"].goal_states
+assert STOWING in GOALS["STOW"].goal_states
 
 
 @dataclass(frozen=True)
@@ -193,17 +193,17 @@ class Goals:
             self._judge(nodes[index], functools.partial(_late, nodes[index], now))
 
     def _judge(self, node: ClusterNode, verdict: "Callable[[_Watch], str | None]") -> None:
-        left = []
+        kept = []
         for watch in self._watches.get(node.index, []):
             text = verdict(watch)
             if text is None:
-                left.append(watch)
+                kept.append(watch)
             elif text:
                 self._reports.add(watch.identity, Stage.FAILED, node.name, f"{watch.name}: {text}")
             else:
                 self._reports.add(watch.identity, Stage.DONE, node.name)
-        if left:
-            self._watches[node.index] = left
+        if kept:
+            self._watches[node.index] = kept
         else:
             self._watches.pop(node.index, None)
 
@@ -229,7 +229,7 @@ class Goals:
         off = max(abs(primary_goal - primary), abs(secondary_goal - secondary))
         reached = goal.reached(node.state, node.flags, off)
         # No later STATUS would show it either.
-        ended = not watch.sure and goal.told is _NOTHING
+        ended = not watch.sure and goal.evidence is _NOTHING
         if reached is None and not ended:
             return None
         state = states.STATES[node.state]

@@ -57,7 +57,7 @@ class Question:
     def read(self, data: bytes, address: int, sequence: int) -> tuple[Any, ...] | None:
         """Return the answer's values if the bytes are exactly that answer, else None.
 
-        COBS is decoded in place: where no block is full, each of its codes stands for one zero.
+        COBS is decoded in place: where no block is full, each of its codes means one zero.
         """
         last = self.size - 1
         if len(data) != self.size or data.find(0) != last:
@@ -270,16 +270,16 @@ class Nodes:
             raise OrderRefusedError(f"cluster {self._cluster} has no heliostat {name!r}")
         return node
 
-    def chosen(self, wanted: Iterable[str]) -> tuple[list[ClusterNode], dict[str, str]]:
+    def chosen(self, heliostats: Iterable[str]) -> tuple[list[ClusterNode], dict[str, str]]:
         """Return heliostats by name, all if none is named, and the refusals of unknown names."""
-        names = dict.fromkeys(wanted)
-        found, refused = list[ClusterNode](), dict[str, str]()
+        names = dict.fromkeys(heliostats)
+        nodes, refused = list[ClusterNode](), dict[str, str]()
         for name in names:
             try:
-                found.append(self.named(name))
+                nodes.append(self.named(name))
             except OrderRefusedError as refusal:
                 refused[name] = str(refusal)
-        return (found if names else list(self._nodes)), refused
+        return (nodes if names else list(self._nodes)), refused
 
     def rows(self, now: float) -> bytes:
         """Return a row of `messages.NODE` for each, at a monotonic time."""

@@ -347,13 +347,13 @@ class Orders:
             stored=True,
             complete=lambda data: data.endswith(b"\0") and bool(data.strip(b"\0")),
         )
-        found = [] if data is None else heard(data, sequence)[0]
-        if not found:
+        answers = [] if data is None else heard(data, sequence)[0]
+        if not answers:
             return self._again(job, f"no answer from serial number {serial} before it expired")
-        if found[0].address != address:
+        if answers[0].address != address:
             return self._again(
                 job,
-                f"serial number {serial} stays at address {found[0].address}: its key or "
+                f"serial number {serial} stays at address {answers[0].address}: its key or "
                 "edition differs, or its state forbids it",
             )
         return self._advance(job)
@@ -427,10 +427,10 @@ class Orders:
         shift = job.shift()
         job.place += 1
         job.unanswered = False
-        left = order.steps[job.place :]
-        if not done.item and (not left or left[0].item):
+        rest = order.steps[job.place :]
+        if not done.item and (not rest or rest[0].item):
             self._reports.add(order.identity, Stage.ACKNOWLEDGED, node.name)
-        if left:
+        if rest:
             self._ready.append(job)
         elif done.item:
             self._reports.add(order.identity, Stage.DONE, node.name)

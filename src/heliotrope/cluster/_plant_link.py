@@ -122,7 +122,7 @@ class PlantLink:
         try:
             role = AcknowledgeRole[message.role.upper()]
         except KeyError:
-            known = " or ".join(each.name.lower() for each in AcknowledgeRole)
+            known = " or ".join(role.name.lower() for role in AcknowledgeRole)
             refusal = f"role {message.role!r} is not known; give {known}"
         else:
             refusal = self._watch.acknowledge(message.condition, message.who, role)
@@ -139,12 +139,12 @@ class PlantLink:
             self._opened, self._told_names = opened, self._number
         self._was_connected = connected
         now = self._made_at = self._clock.monotonic()
-        told = (self._number - self._told_names) % _NAMES_EVERY == 0
-        if told:
+        with_names = (self._number - self._told_names) % _NAMES_EVERY == 0
+        if with_names:
             self._reports.repeat()
         # Alarms are not repeated at once: on a slow line they may be what kept the status back.
         # What is made before the line is there may be the first that the plant gets of this file.
-        told, self._names_lost = told or self._names_lost or not connected, False
+        with_names, self._names_lost = with_names or self._names_lost or not connected, False
         self._reports.status(
             ClusterStatus(
                 cluster=self._cluster,
@@ -155,12 +155,12 @@ class PlantLink:
                 lease_left=self._watch.lease_left(now),
                 cycle_s=now - begin,
                 acts=self._watch.verdict.acts,
-                names=self._names if told else (),
+                names=self._names if with_names else (),
                 site=self._site,
                 settings=self._settings,
                 block=self._nodes.rows(now),
                 run=self._watch.runs.holder,
-                barred=self._watch.runs.barred,
+                barred=self._watch.runs.blocked,
             )
         )
         self._reports.publish()

@@ -1,4 +1,4 @@
-"""Polling: each heliostat is asked for its state once a second, in the order of addresses.
+"""Polling: each heliostat reports its state once a second, in the order of addresses.
 
 Commands are sent in between. Answers are checked, faults and silence are reported, and the
 goals of commands are judged.
@@ -53,7 +53,7 @@ class Polling:
         self._number = 0  # of the second
         self._next = 0  # the place at which the last round was cut off
         self._silent: set[int] = set()
-        self._strange: set[int] = set()
+        self._unreadable: set[int] = set()
         self._jumped: dict[str, float] = {}
         self.overruns = 0
 
@@ -108,10 +108,10 @@ class Polling:
         """Take a STATUS; return False if its firmware has states unknown here."""
         if status[0] >= len(states.STATES):
             self._reports.alarm(alarms.NODE_UNINTELLIGIBLE.raised(node.name, state=status[0]))
-            self._strange.add(node.index)
+            self._unreadable.add(node.index)
             return False
-        if node.index in self._strange:
-            self._strange.remove(node.index)
+        if node.index in self._unreadable:
+            self._unreadable.remove(node.index)
             self._reports.clear(alarms.NODE_UNINTELLIGIBLE.ended(node.name))
         before = node.fault
         node.take_status(status, asked_at)
@@ -156,7 +156,7 @@ class Polling:
             silent = now - max(node.heard_at, self._started) > limit
             # One that answers, but does not tell its step counts: its beam may be anywhere.
             unsure = now - max(node.steps_at, self._started) > limit + self._config.steps_every
-            silent |= unsure and node.index not in self._strange
+            silent |= unsure and node.index not in self._unreadable
             if silent and node.index not in self._silent:
                 self._silent.add(node.index)
                 self._report_silence(node, limit)

@@ -27,13 +27,13 @@ class _Recall:
 
     def __init__(self, ask: Ask, node: ClusterNode) -> None:
         self.ask, self.node = ask, node
-        self.found: dict[str, bytes] = {}
+        self.items: dict[str, bytes] = {}
         self.tries = 0
 
     @property
     def item(self) -> str:
         """The next item."""
-        return _STORED[len(self.found)]
+        return _STORED[len(self.items)]
 
 
 class Questions:
@@ -148,7 +148,7 @@ class Questions:
 
     async def _recall(self, recall: _Recall) -> None:
         """Ask for one item; items already received are not asked for again."""
-        ask, node, found = recall.ask, recall.node, recall.found
+        ask, node, items = recall.ask, recall.node, recall.items
         data = await stored(self._exchange, node, recall.item, self._clock() + _PATIENCE)
         if data is None:
             recall.tries += 1
@@ -157,12 +157,12 @@ class Questions:
             else:
                 self._error(ask, f"{node.name} does not answer")
             return
-        found[recall.item] = data
-        if len(found) < len(_STORED):
+        items[recall.item] = data
+        if len(items) < len(_STORED):
             self._waiting.appendleft(recall)
             return
-        data_of = {"names": list(found), "sizes": [len(data) for data in found.values()]}
-        self._reports.answer(Answer(ask.identity, data_of, b"".join(found.values())))
+        data_of = {"names": list(items), "sizes": [len(data) for data in items.values()]}
+        self._reports.answer(Answer(ask.identity, data_of, b"".join(items.values())))
 
     def _error(self, ask: Ask, text: str) -> None:
         self._reports.answer(Answer(ask.identity, {"error": text}))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from heliotrope.cluster._reports import Reports
-from heliotrope.cluster._runs import Runs
+from heliotrope.cluster._runs import PlantRuns
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.links.messages import Lease
 from heliotrope.safety import (
@@ -85,7 +85,7 @@ class Watch:
     Attributes
     ----------
     token
-        Token of the command authority in the last lease; 0: nobody has it.
+        Token of the command authority in the last lease; 0: none.
     verdict
         Demands of the safety table in this second.
     runs
@@ -112,7 +112,7 @@ class Watch:
         self._step(present, now)
         self.token = 0
         self.verdict = Verdict()
-        self.runs = Runs()
+        self.runs = PlantRuns()
 
     def _table(self) -> tuple[Condition, ...]:
         rows = watched_by(limited(conditions(self._autonomy), self._limits), Watcher.CLUSTER)
@@ -120,8 +120,8 @@ class Watch:
 
     # -- the lease -------------------------------------------------------------------------
 
-    def take(self, lease: Lease, now: float) -> str:
-        """Take a new lease; return why it is refused, "" if it is accepted."""
+    def take(self, lease: Lease, now: float) -> str | None:
+        """Take a new lease; return the reason if it is refused."""
         if not _SHORTEST_LEASE <= lease.lifetime <= _PLANT_LEASE:
             return f"lease of {lease.lifetime:g} s: give {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s"
         if not (0 <= lease.token <= 0xFFFFFFFF and lease.autonomy >= 0.0):
@@ -142,7 +142,7 @@ class Watch:
         self._lease = Reading(_PLANT_LEASE - lease.lifetime, now)
         self._over = now + lease.lifetime
         self.runs.took(lease.run, now, self._over)
-        return ""
+        return None
 
     def lease_left(self, now: float) -> float:
         """Return the remaining time of the plant's lease without autonomy, s; below 0: over."""
@@ -178,8 +178,8 @@ class Watch:
             self._reports.alarm(alarms.TIME_SOURCE.raised(problem=time.note))
         else:
             self._reports.clear(alarms.TIME_SOURCE.ended())
-        if rivals := self.runs.rivals(now):
-            runs = ", ".join(rivals)
+        if second := self.runs.second_plants(now):
+            runs = ", ".join(second)
             self._reports.alarm(alarms.TWO_PLANTS.raised(runs=runs, holder=self.runs.holder))
         else:
             self._reports.clear(alarms.TWO_PLANTS.ended())

@@ -24,7 +24,7 @@ class Member:
     address
         On the bus, 1 to 65534.
     serial
-        Serial number of its local controller, by which it is found and given its address; None:
+        Serial number of its local controller, for finding it and giving it an address; None:
         not known.
     key
         Key of its local controller, for stored items; b"": nothing can be stored.
@@ -109,7 +109,7 @@ class ClusterConfig:
                 f"{at}: {len(self.heliostats)} heliostats; one bus carries 1 to {MOST_MEMBERS}"
             )
         for what in ("name", "address", "serial"):
-            values = [getattr(each, what) for each in self.heliostats]
+            values = [getattr(member, what) for member in self.heliostats]
             for value in values:
                 if value is not None and values.count(value) > 1:
                     raise InputError(
@@ -140,10 +140,10 @@ class ClusterConfig:
         UnknownNameError
             If this cluster has no heliostat of that name.
         """
-        for each in self.heliostats:
-            if each.name == name:
-                return each
-        raise UnknownNameError("heliostat", name, [each.name for each in self.heliostats])
+        for member in self.heliostats:
+            if member.name == name:
+                return member
+        raise UnknownNameError("heliostat", name, [member.name for member in self.heliostats])
 
 
 def spread_phase(index: int, count: int) -> float:

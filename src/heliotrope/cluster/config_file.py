@@ -139,8 +139,8 @@ class SafetyTable(Table):
     @property
     def limits(self) -> Limits:
         """The numbers by condition."""
-        given = ("emergency_line", "longest_autonomy_s")
-        return self.model_dump(exclude_defaults=True, exclude=set(given))
+        apart = ("emergency_line", "longest_autonomy_s")
+        return self.model_dump(exclude_defaults=True, exclude=set(apart))
 
 
 class MemberTable(Table):
@@ -239,10 +239,10 @@ class Installation:
         FormatError
             If it cannot be used, or has no key of the plant any more.
         """
-        found = Keys(self.key_file, HELIOSTATS)
-        if not found.plant:
+        keys = Keys(self.key_file, HELIOSTATS)
+        if not keys.plant:
             raise FormatError(self.key_file, "its key is gone; the link needs it", "plant")
-        self.plant_keys.keys, self.password.word = found.plant, found.password
+        self.plant_keys.keys, self.password.word = keys.plant, keys.password
 
     def take_bus_keys(self) -> None:
         """Read the file of the bus's keys again.
@@ -289,7 +289,7 @@ def _install(
     path: Path, document: ClusterDocument, key_file: Path | None, secrets: Keys
 ) -> Installation:
     site, bus, polling = document.site, document.bus, document.polling
-    names = [each.name for each in document.heliostats]
+    names = [member.name for member in document.heliostats]
     secrets.check(names)
     config = ClusterConfig(
         name=document.name,
@@ -303,8 +303,8 @@ def _install(
             site.delta_t_s,
         ),
         heliostats=tuple(
-            Member(each.name, each.address, each.serial, *secrets.members.get(each.name, ()))
-            for each in document.heliostats
+            Member(m.name, m.address, m.serial, *secrets.members.get(m.name, ()))
+            for m in document.heliostats
         ),
         answer=bus.answer_s,
         stored_answer=bus.stored_answer_s,

@@ -204,12 +204,12 @@ class Cluster:
 
     async def _serve_until(self, due: float) -> None:
         """Carry out orders until the next second begins; an emergency wakes it at once."""
-        while not self._closing.is_set() and (left := due - self._clock.monotonic()) > 0.0:
+        while not self._closing.is_set() and (remaining := due - self._clock.monotonic()) > 0.0:
             if self._work.ready():
                 await self._work.serve()
                 continue
             self._wake.clear()
-            alarm = asyncio.get_running_loop().call_later(max(left, 1e-6), self._wake.set)
+            alarm = asyncio.get_running_loop().call_later(max(remaining, 1e-6), self._wake.set)
             try:
                 await self._wake.wait()
             finally:

@@ -55,7 +55,7 @@ class Kept:
             self.epoch, self._edition = _read(path)
         self._reserved = self._edition
         #: What was last given to the disk: no later writing may take it back.
-        self._given = (self.epoch, self._reserved)
+        self._handed = (self.epoch, self._reserved)
         self._reserving = False
         self._problem: Exception | None = None
 
@@ -78,12 +78,12 @@ class Kept:
         """Store an epoch as in `start`; call ``then`` with it and None, or an error, when done."""
         epoch = self._above(at_least)
 
-        def told(error: Exception | None) -> None:
+        def stored(error: Exception | None) -> None:
             if error is None:
                 self.epoch = epoch
             then(epoch, error)
 
-        self._disk.do(partial(self._write, epoch, 0), told)
+        self._disk.do(partial(self._write, epoch, 0), stored)
 
     def next_edition(self, above: int = 0) -> int | None:
         """Return an edition that was never used, above another one; None: it is being stored.
@@ -112,17 +112,17 @@ class Kept:
         return max(self.epoch + 1, at_least) & _LARGEST
 
     def _reserve(self, reserved: int) -> None:
-        def told(error: Exception | None) -> None:
+        def stored(error: Exception | None) -> None:
             self._reserving, self._problem = False, error
             if error is None:
                 self._reserved = max(self._reserved, reserved)
 
         self._reserving = True
-        self._disk.do(partial(self._write, 0, reserved), told)
+        self._disk.do(partial(self._write, 0, reserved), stored)
 
     def _write(self, epoch: int, reserved: int) -> None:
         """Write both numbers, neither below what was written before; one piece at a time."""
-        epoch, reserved = max(epoch, self._given[0]), max(reserved, self._given[1])
+        epoch, reserved = max(epoch, self._handed[0]), max(reserved, self._handed[1])
         if self._path is not None:
             beside = self._path.with_name(self._path.name + ".new")
             beside.unlink(missing_ok=True)
@@ -132,7 +132,7 @@ class Kept:
                 file.flush()
                 os.fsync(file.fileno())
             beside.replace(self._path)
-        self._given = (epoch, reserved)
+        self._handed = (epoch, reserved)
 
 
 def _read(path: Path) -> tuple[int, int]:

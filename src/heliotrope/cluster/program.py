@@ -88,11 +88,11 @@ class LocalCluster:
     def __init__(self, path: Path, name: str, members: tuple[str, ...], clock: Clock) -> None:
         installation = self.installation = read_cluster(path)
         config = installation.config
-        found = {member.name for member in config.heliostats}
+        listed = {member.name for member in config.heliostats}
         if config.name != name:
             raise FormatError(path, f"it is for cluster {config.name}, not for {name}", "name")
-        if found != set(members):
-            odd = min(found ^ set(members))
+        if listed != set(members):
+            odd = min(listed ^ set(members))
             where = "the plant file" if odd in members else "this file"
             raise FormatError(path, f"{odd} is a heliostat of {name} in {where} only", "heliostats")
         near, far, _ = memory_pair(clock, names=("plant", name))

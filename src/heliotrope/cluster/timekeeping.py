@@ -190,16 +190,16 @@ class _Bound:
     def at(self, now: float, *, jumped: bool) -> float:
         """Return the bound at a monotonic time, s."""
         grown = self._error + _GROWTH * (now - self._at)
-        told = self._ask()
-        self.kept = told < math.inf
+        reported = self._ask()
+        self.kept = reported < math.inf
         if not self.kept:
             if jumped:
                 self._error = math.inf
             return math.inf if jumped else grown
-        if told < self._error or told > grown + _RENEWED:
+        if reported < self._error or reported > grown + _RENEWED:
             self.renewed_at = now
-        self._error, self._at = told, now
-        return told
+        self._error, self._at = reported, now
+        return reported
 
 
 class SystemTime:

@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 
-from heliotrope.console.process import Given, main, serve
+from heliotrope.console.process import ProcessInput, main, serve
 from heliotrope.console.remote import RemotePlant
 from heliotrope.console.serve import ConsoleServer
 
@@ -13,9 +13,9 @@ from heliotrope.console.serve import ConsoleServer
 _NICE, _EXPENDABLE = 5, 500
 
 
-async def _run(given: Given) -> None:
-    plant = RemotePlant(given.folder, given.key)
-    server = ConsoleServer(plant, given.settings, given.line)
+async def _run(inputs: ProcessInput) -> None:
+    plant = RemotePlant(inputs.folder, inputs.key)
+    server = ConsoleServer(plant, inputs.settings, inputs.line)
     await serve(
         server,
         plant.run,

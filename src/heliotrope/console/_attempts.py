@@ -23,7 +23,7 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 
-class Attempts:
+class SignInFailures:
     """The failures of the last hour.
 
     Parameters
@@ -78,7 +78,7 @@ class Attempts:
         self._pairs.pop(pair, None)
         for failures in (self._names.get(name), self._addresses.get(address)):
             if failures is not None:
-                others = [one for one in failures if one[1] != pair]
+                others = [failure for failure in failures if failure[1] != pair]
                 failures.clear()
                 failures.extend(others)
         self._good[pair] = None
@@ -89,11 +89,11 @@ class Attempts:
 
 def _kept(kept: "OrderedDict[K, deque[V]]", key: K, most: int, largest: int) -> "deque[V]":
     """Return the failures of a key, which is now the last used."""
-    found = kept.setdefault(key, deque(maxlen=most))
+    failures = kept.setdefault(key, deque(maxlen=most))
     kept.move_to_end(key)
     if len(kept) > largest:
         kept.popitem(last=False)
-    return found
+    return failures
 
 
 def _own_until(times: Collection[float], now: float) -> float:

@@ -22,20 +22,20 @@ class Repeated(logging.Filter):
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._now = monotonic
-        self._seen: dict[tuple[str, int, str], tuple[float, int]] = {}
+        self._counts: dict[tuple[str, int, str], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether a line is written."""
         kind = (record.name, record.lineno, str(record.msg)[:60].partition("\n")[0])
         now = self._now()
-        begun, count = self._seen.get(kind, (now, 0))
+        begun, count = self._counts.get(kind, (now, 0))
         if now - begun >= SPAN:
             if count > MOST:
                 record.msg = f"{record.msg} ({count - MOST} more like this were left out)"
             begun, count = now, 0
-        if len(self._seen) >= KINDS and kind not in self._seen:
-            del self._seen[next(iter(self._seen))]
-        self._seen[kind] = (begun, count + 1)
+        if len(self._counts) >= KINDS and kind not in self._counts:
+            del self._counts[next(iter(self._counts))]
+        self._counts[kind] = (begun, count + 1)
         return count < MOST
 
 
@@ -43,5 +43,5 @@ def limit() -> None:
     """Limit the repeated lines of the noisy loggers, once for the process."""
     for name in NOISY:
         logger = logging.getLogger(name)
-        if not any(isinstance(one, Repeated) for one in logger.filters):
+        if not any(isinstance(entry, Repeated) for entry in logger.filters):
             logger.addFilter(Repeated())

@@ -9,8 +9,8 @@ def csrf_of(session: str) -> str:
     return hmac.new(session.encode(), b"heliotrope csrf", hashlib.sha256).hexdigest()
 
 
-def same(one: str, other: str) -> bool:
+def same(word: str, other: str) -> bool:
     """Return whether two words are equal, in constant time."""
     # JSON may hold half a surrogate pair, which UTF-8 has no bytes for.
-    said, meant = (word.encode(errors="surrogatepass") for word in (one, other))
+    said, meant = (word.encode(errors="surrogatepass") for word in (word, other))
     return hmac.compare_digest(said, meant)

@@ -9,10 +9,10 @@ from heliotrope.console import _secrets, models
 from heliotrope.console.api import REFUSALS, Named
 from heliotrope.console.auth import (
     Anyone,
+    AppConsole,
     Caller,
     Console,
     Engineer,
-    Here,
     refused,
     same_origin,
     signed_in,
@@ -55,21 +55,19 @@ async def session(who: Anyone) -> models.CallerState:
     },
 )
 async def sign_in(
-    console: Here, request: Request, response: Response, given: models.LogIn
+    console: AppConsole, request: Request, response: Response, body: models.LogIn
 ) -> models.CallerState:
     """Sign in: the answer sets the session's cookie."""
     if not same_origin(console, request):
         await console.note(SecurityEvent.ORIGIN_REFUSED, request)
         raise HTTPException(403, "this page comes from another site; sign in at the console itself")
-    account, secret, expires = await log_in(
-        console, given.name, given.password, given.code, request
-    )
+    account, secret, expires = await log_in(console, body.name, body.password, body.code, request)
     set_cookie(console, response, secret)
     return _who(signed_in(console, account, secret, expires))
 
 
 @router.delete("/session", status_code=204, tags=["people"])
-async def sign_out(console: Here, who: Anyone, request: Request, response: Response) -> None:
+async def sign_out(console: AppConsole, who: Anyone, request: Request, response: Response) -> None:
     """Sign out."""
     if who.by == "session":
         await console.ask(lambda: console.people.close_session(who.secret))
@@ -85,26 +83,26 @@ async def sign_out(console: Here, who: Anyone, request: Request, response: Respo
     responses={429: {"model": models.Problem, "description": "Too many failures"}},
 )
 async def own_password(
-    console: Here, who: Anyone, request: Request, response: Response, given: models.OwnPassword
+    console: AppConsole, who: Anyone, request: Request, response: Response, body: models.OwnPassword
 ) -> None:
     """Change your own password; your sessions, including this one, and your tokens end."""
-    await confirm(console, who, request, given.old)
-    if given.new == given.old:
+    await confirm(console, who, request, body.old)
+    if body.new == body.old:
         raise HTTPException(422, "this is your password already; give another one")
-    await _set_password(console, who.person.name, given.new)
+    await _set_password(console, who.person.name, body.new)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
     await console.note(SecurityEvent.PASSWORD_CHANGED, request, who.person.name)
 
 
 @router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
 async def reset_password(
-    console: Here, who: Engineer, request: Request, name: Named, given: models.Confirmed
+    console: AppConsole, who: Engineer, request: Request, name: Named, body: models.Confirmed
 ) -> models.GivenPassword:
     """Give a person a new password, shown once; all their sessions and tokens end.
 
     It must be changed at first use.
     """
-    await confirm(console, who, request, given.own_password)
+    await confirm(console, who, request, body.own_password)
     if name == who.person.name:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     await _find(console, name, password=True)
@@ -115,90 +113,90 @@ async def reset_password(
 
 
 @router.get("/accounts", response_model=list[models.AccountState], tags=["people"])
-async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
+async def accounts(console: AppConsole, who: Engineer) -> list[models.AccountState]:
     """Return the accounts."""
     del who
-    return [_account(one) for one in await console.ask(console.people.accounts)]
+    return [_account(account) for account in await console.ask(console.people.accounts)]
 
 
 @router.post("/accounts", response_model=models.AccountState, status_code=201, tags=["people"])
 async def new_account(
-    console: Here, who: Engineer, request: Request, given: models.NewAccount
+    console: AppConsole, who: Engineer, request: Request, body: models.NewAccount
 ) -> models.AccountState:
     """Create an account; its password must be changed at first use."""
-    await confirm(console, who, request, given.own_password)
-    kept = await _hashed(console, given.password)
+    await confirm(console, who, request, body.own_password)
+    kept = await _hashed(console, body.password)
     made = await console.ask(
-        lambda: console.people.add(given.name, kept, given.role, console.now(), due=True)
+        lambda: console.people.add(body.name, kept, body.role, console.now(), due=True)
     )
-    what = f"{given.name}, {given.role}"
+    what = f"{body.name}, {body.role}"
     await console.note(SecurityEvent.ACCOUNT_MADE, request, who.person.name, what)
     return _account(made)
 
 
 @router.patch("/accounts/{name}", response_model=models.AccountState, tags=["people"])
 async def change_account(
-    console: Here, who: Engineer, request: Request, name: Named, given: models.AccountChange
+    console: AppConsole, who: Engineer, request: Request, name: Named, body: models.AccountChange
 ) -> models.AccountState:
     """Change the role or password of an account, or disable it; not yours."""
-    await confirm(console, who, request, given.own_password)
-    if name == who.person.name and given.password is not None:
+    await confirm(console, who, request, body.own_password)
+    if name == who.person.name and body.password is not None:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
-    if name == who.person.name and (given.disabled or given.role not in (None, "engineer")):
+    if name == who.person.name and (body.disabled or body.role not in (None, "engineer")):
         raise HTTPException(409, f"{name}: you cannot change your own role; ask another engineer")
-    await _find(console, name, password=given.password is not None)
-    kept = await _hashed(console, given.password) if given.password is not None else None
+    await _find(console, name, password=body.password is not None)
+    kept = await _hashed(console, body.password) if body.password is not None else None
     made = await console.ask(
         lambda: console.people.change(
             name,
             console.now(),
-            role=given.role,
+            role=body.role,
             password_hash=kept,
-            disabled=given.disabled,
+            disabled=body.disabled,
             due=True,
         )
     )
     console.known.clear()
-    detail = _changes(name, given)
+    detail = _changes(name, body)
     await console.note(SecurityEvent.ACCOUNT_CHANGED, request, who.person.name, detail)
     return _account(made)
 
 
 @router.get("/tokens", response_model=list[models.TokenState], tags=["people"])
-async def tokens(console: Here, who: Anyone) -> list[models.TokenState]:
+async def tokens(console: AppConsole, who: Anyone) -> list[models.TokenState]:
     """Return the tokens: your own, or all of them for an engineer."""
-    found = await console.ask(lambda: console.people.tokens(_whose(who)))
-    return [models.TokenState(**asdict(one)) for one in found]
+    listed = await console.ask(lambda: console.people.tokens(_whose(who)))
+    return [models.TokenState(**asdict(token)) for token in listed]
 
 
 @router.post("/tokens", response_model=models.TokenState, status_code=201, tags=["people"])
 async def new_token(
-    console: Here, who: Anyone, request: Request, given: models.NewToken
+    console: AppConsole, who: Anyone, request: Request, body: models.NewToken
 ) -> models.TokenState:
     """Create a token for a program; its secret is shown in this answer only."""
-    await confirm(console, who, request, given.own_password)
-    if ROLES[given.role] > who.person.role:
+    await confirm(console, who, request, body.own_password)
+    if ROLES[body.role] > who.person.role:
         await refused(console, request, who)
-        raise HTTPException(403, f"token: role {given.role} is higher than your own")
-    lifetime = 86_400.0 * given.days
+        raise HTTPException(403, f"token: role {body.role} is higher than your own")
+    lifetime = 86_400.0 * body.days
     made, secret = await console.ask(
         lambda: console.people.add_token(
-            who.person.name, given.label, given.role, console.now(), lifetime
+            who.person.name, body.label, body.role, console.now(), lifetime
         )
     )
-    what = f"{given.label}, {given.role}, {given.days:g} days"
+    what = f"{body.label}, {body.role}, {body.days:g} days"
     await console.note(SecurityEvent.TOKEN_MADE, request, who.person.name, what)
     return models.TokenState(**asdict(made), secret=secret)
 
 
 @router.delete("/tokens/{key}", status_code=204, tags=["people"])
 async def revoke(
-    console: Here, who: Anyone, request: Request, key: Named, given: models.Confirmed
+    console: AppConsole, who: Anyone, request: Request, key: Named, body: models.Confirmed
 ) -> None:
     """Revoke a token: your own, or any as an engineer."""
-    await confirm(console, who, request, given.own_password)
-    found = await console.ask(lambda: console.people.tokens(_whose(who)))
-    token = next((one for one in found if one.key == key), None)
+    await confirm(console, who, request, body.own_password)
+    listed = await console.ask(lambda: console.people.tokens(_whose(who)))
+    token = next((token for token in listed if token.key == key), None)
     if token is None:
         raise HTTPException(404, f"there is no token {key}")
     await console.ask(lambda: console.people.revoke_token(key))
@@ -209,10 +207,10 @@ async def revoke(
 
 async def _find(console: Console, name: str, *, password: bool) -> None:
     """Check that there is an account, and that it may have a password if that is to be changed."""
-    found = await console.ask(lambda: console.people.account(name))
-    if found is None:
+    account = await console.ask(lambda: console.people.account(name))
+    if account is None:
         raise HTTPException(404, f"there is no account {name}")
-    if password and found.by_proxy:
+    if password and account.by_proxy:
         raise HTTPException(409, f"{name} signs in by the proxy, and has no password here")
 
 
@@ -229,16 +227,16 @@ async def _set_password(console: Console, name: str, password: str, *, due: bool
     console.known.clear()
 
 
-def _changes(name: str, given: models.AccountChange) -> str:
+def _changes(name: str, change: models.AccountChange) -> str:
     """Return in one line how an account was changed."""
-    found = [name]
-    if given.role is not None:
-        found.append(f"role {given.role}")
-    if given.disabled is not None:
-        found.append("disabled" if given.disabled else "enabled")
-    if given.password is not None:
-        found.append("new password")
-    return ", ".join(found)
+    parts = [name]
+    if change.role is not None:
+        parts.append(f"role {change.role}")
+    if change.disabled is not None:
+        parts.append("disabled" if change.disabled else "enabled")
+    if change.password is not None:
+        parts.append("new password")
+    return ", ".join(parts)
 
 
 def _whose(who: Caller) -> str:
@@ -246,11 +244,11 @@ def _whose(who: Caller) -> str:
     return "" if who.person.role >= Role.ENGINEER else who.person.name
 
 
-def _account(one: Account) -> models.AccountState:
+def _account(account: Account) -> models.AccountState:
     return models.AccountState(
-        name=one.name,
-        role=one.role,
-        disabled=one.disabled,
-        created=one.created,
-        factor=one.factor,
+        name=account.name,
+        role=account.role,
+        disabled=account.disabled,
+        created=account.created,
+        factor=account.factor,
     )

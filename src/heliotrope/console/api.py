@@ -22,10 +22,10 @@ from heliotrope.console._files import SMALL, takes_gzip
 from heliotrope.console.auth import (
     DUES,
     Anyone,
+    AppConsole,
     Caller,
     Console,
     Engineer,
-    Here,
     Operator,
     console_of,
     find_caller,
@@ -55,7 +55,7 @@ Named = Annotated[str, Path(max_length=64)]
 
 
 def answer(value: Any) -> JSONResponse:
-    """Return a view; its model stands in the description of the route."""
+    """Return a view; the route describes its model."""
     return JSONResponse(value, headers={"Cache-Control": "no-store"})
 
 
@@ -82,26 +82,26 @@ async def shared(
 
 
 @router.get("/health", tags=["plant"], responses={})
-async def health(console: Here) -> dict[str, Any]:
+async def health(console: AppConsole) -> dict[str, Any]:
     """Return whether the console answers; open to all, reveals nothing of the plant."""
     del console
     return {"ok": True, "version": __version__}
 
 
-async def photograph(console: Here, request: Request, who: Anyone, name: Named) -> Response:
+async def photograph(console: AppConsole, request: Request, who: Anyone, name: Named) -> Response:
     """Send a photograph only where the browser does not have it."""
     known = request.headers.get("if-none-match", "").strip('"')
     version = int(known) if known.isdecimal() and len(known) < 16 else -1
     view, jpeg = await console.plant.fetch("photograph", who.person, name=name, known=version)
     headers = {"ETag": f'"{view["version"]}"', "Cache-Control": "private, no-cache"}
     if not jpeg:
-        seen = view["version"] == version
-        return Response(status_code=304 if seen and version else 204, headers=headers)
+        unchanged = view["version"] == version
+        return Response(status_code=304 if unchanged and version else 204, headers=headers)
     return Response(jpeg, media_type="image/jpeg", headers=headers)
 
 
 async def command(
-    console: Here, who: Operator, request: Request, order: orders.CommandOrder
+    console: AppConsole, who: Operator, request: Request, order: orders.CommandOrder
 ) -> Response:
     """Give STOW and DEFOCUS as what they are; some others need an engineer."""
     name = order.command
@@ -120,7 +120,7 @@ def _endpoint(name: str, call: Call) -> Callable[..., Any]:
     """Return the function of a route: it makes a call with the arguments of the request."""
 
     async def endpoint(
-        console: Console, request: Request, who: Caller, order: Any = None, **given: Any
+        console: Console, request: Request, who: Caller, order: Any = None, **parameters: Any
     ) -> Response:
         arguments, blob = {} if order is None else order.model_dump(), b""
         if call.pack is not None:
@@ -128,8 +128,8 @@ def _endpoint(name: str, call: Call) -> Callable[..., Any]:
             if len(blob) > REQUEST_BLOB:
                 raise HTTPException(413, f"it is longer than {REQUEST_BLOB >> 20} MiB; divide it")
         if call.fresh and call.answer is not WithBlob:
-            return await shared(console, request, name, call.fresh, **given)
-        value, data = await console.plant.fetch(name, who.person, blob, **arguments, **given)
+            return await shared(console, request, name, call.fresh, **parameters)
+        value, data = await console.plant.fetch(name, who.person, blob, **arguments, **parameters)
         if call.answer is None:
             return Response(status_code=204)
         if call.answer is not WithBlob:
@@ -137,9 +137,9 @@ def _endpoint(name: str, call: Call) -> Callable[..., Any]:
         kept = f"private, max-age={call.fresh:.0f}, immutable" if call.fresh else "no-store"
         return Response(data, media_type="image/jpeg", headers={"Cache-Control": kept})
 
-    fixed = {"console": Here, "request": Request, "who": _AT_LEAST[call.role]}
-    found = [_argument(key, hint) for key, hint in fixed.items()]
-    vars(endpoint)["__signature__"] = Signature([*found, *_arguments(call)])
+    fixed = {"console": AppConsole, "request": Request, "who": _AT_LEAST[call.role]}
+    own = [_argument(key, hint) for key, hint in fixed.items()]
+    vars(endpoint)["__signature__"] = Signature([*own, *_arguments(call)])
     return endpoint
 
 
@@ -200,16 +200,16 @@ for _name, _each in CALLS.items():
 async def live(socket: WebSocket) -> None:
     """Send the live stream; see docs/reference/api-http.md."""
     console: Console = console_of(socket)
-    found = await find_caller(console, socket)
-    if found is None or not same_origin(console, socket):
-        if found is not None:
-            await console.note(SecurityEvent.ORIGIN_REFUSED, socket, found.person.name)
+    who = await find_caller(console, socket)
+    if who is None or not same_origin(console, socket):
+        if who is not None:
+            await console.note(SecurityEvent.ORIGIN_REFUSED, socket, who.person.name)
         await socket.accept()
         await socket.close(4401, "sign in, or send a valid token")
         return
     await socket.accept()
-    if found.owes:
-        await socket.close(4403, DUES[found.owes][0])
+    if who.owes:
+        await socket.close(4403, DUES[who.owes][0])
         return
     if console.stream.viewers >= console.settings.viewers:
         await socket.close(4429, f"{console.settings.viewers} viewers are connected already")

@@ -16,7 +16,7 @@ from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Resp
 
 from heliotrope import __version__
 from heliotrope.console import accounts, api, factor
-from heliotrope.console._attempts import Attempts
+from heliotrope.console._attempts import SignInFailures
 from heliotrope.console._files import Files, page
 from heliotrope.console.auth import Caller, Console, introduced
 from heliotrope.console.by_proxy import ByProxy
@@ -60,7 +60,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     """
     chosen = settings or ConsoleSettings()
     people, stream = RemotePeople(plant), Stream(plant, chosen.period)
-    attempts = Attempts(time.monotonic, chosen.proxies)
+    attempts = SignInFailures(time.monotonic, chosen.proxies)
     console = Console(plant, people, chosen, stream, attempts)
     if chosen.people_by_proxy is not None:
         console.by_proxy = ByProxy.read(chosen.people_by_proxy)
@@ -116,16 +116,18 @@ def _problem(status: int) -> Callable[[Request, Exception], Response]:
 
 
 def _invalid(request: Request, error: Exception) -> Response:
-    """Return what is wrong with a request, without its contents."""
+    """Return the errors of a request, without its contents."""
     del request
     assert isinstance(error, RequestValidationError)
     errors = [
         {
-            "type": str(one["type"])[:LONGEST_WORD],
-            "loc": [part if isinstance(part, int) else part[:LONGEST_WORD] for part in one["loc"]],
-            "msg": str(one["msg"])[:LONGEST_TEXT],
+            "type": str(problem["type"])[:LONGEST_WORD],
+            "loc": [
+                part if isinstance(part, int) else part[:LONGEST_WORD] for part in problem["loc"]
+            ],
+            "msg": str(problem["msg"])[:LONGEST_TEXT],
         }
-        for one in itertools.islice(error.errors(), MOST_ERRORS)
+        for problem in itertools.islice(error.errors(), MOST_ERRORS)
     ]
     return JSONResponse({"detail": errors}, 422)
 
@@ -137,7 +139,7 @@ def _routes() -> Routes:
 
 
 def _pages(app: FastAPI) -> None:
-    """Add the pages; the guard has sent away everybody who may not see one."""
+    """Add the pages; the guard admits only those who may see them."""
     texts = {path: page(name) for path, name in PAGES.items()}
 
     async def show(request: Request) -> Response:
@@ -156,9 +158,9 @@ def _pages(app: FastAPI) -> None:
 
     async def login(request: Request) -> Response:
         console: Console = request.scope["heliotrope"]
-        if (found := introduced(console, request)) is not None:
+        if (person := introduced(console, request)) is not None:
             answer = RedirectResponse("/", 303)
-            set_cookie(console, answer, await enter(console, found, request))
+            set_cookie(console, answer, await enter(console, person, request))
             return answer
         return HTMLResponse(page("login"))
 

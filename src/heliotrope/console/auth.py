@@ -18,7 +18,7 @@ from fastapi import Depends, HTTPException
 from starlette.requests import HTTPConnection
 
 from heliotrope.console import _words
-from heliotrope.console._attempts import Attempts
+from heliotrope.console._attempts import SignInFailures
 from heliotrope.console.by_proxy import ByProxy, Introduced
 from heliotrope.console.connections import FOUND
 from heliotrope.console.headers import address_of, host_known, parts_of, secret_of
@@ -67,7 +67,7 @@ class Console:
     people: RemotePeople
     settings: ConsoleSettings
     stream: Stream
-    attempts: Attempts
+    attempts: SignInFailures
     #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
     hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
 
@@ -98,9 +98,11 @@ class Console:
         """
         while True:
             with contextlib.suppress(HeliotropeError):  # others report a full store
-                for one in await self.ask(lambda: self.people.forget_expired(self.now())):
-                    ended = SecurityEvent.TOKEN_ENDED if one.token else SecurityEvent.SESSION_ENDED
-                    await self.plant.note(ended, one.name, "", one.label)
+                for expired in await self.ask(lambda: self.people.forget_expired(self.now())):
+                    ended = (
+                        SecurityEvent.TOKEN_ENDED if expired.token else SecurityEvent.SESSION_ENDED
+                    )
+                    await self.plant.note(ended, expired.name, "", expired.label)
             await asyncio.sleep(60.0)
 
     async def note(
@@ -182,7 +184,7 @@ class Caller:
         return _words.csrf_of(self.secret) if self.by == "session" else ""
 
 
-async def here(connection: HTTPConnection) -> Console:
+async def app_console(connection: HTTPConnection) -> Console:
     """Return the console of an application, in the loop: a thread would cost more."""
     return console_of(connection)
 
@@ -192,19 +194,19 @@ def console_of(connection: HTTPConnection) -> Console:
     return cast("Console", connection.app.state.console)
 
 
-Here = Annotated[Console, Depends(here)]
+AppConsole = Annotated[Console, Depends(app_console)]
 
 
 async def find_caller(console: Console, connection: HTTPConnection) -> Caller | None:
     """Return the caller, None if unknown or no longer valid.
 
-    EMERGENCY accepts a caller who was known recently: it must not wait for a store that is slow or
+    EMERGENCY accepts a caller known recently: it must not wait for a store that is slow or
     gone.
     """
-    found = secret_of(connection)
-    if found is None:
+    presented = secret_of(connection)
+    if presented is None:
         return None
-    by, secret = found
+    by, secret = presented
     trusted = LONG_TRUSTED if _is_emergency(connection) else TRUSTED
     known, now = console.known.get((by, secret)), time.monotonic()
     if known is None or now - known[0] > trusted:
@@ -229,40 +231,40 @@ def _as_introduced(console: Console, connection: HTTPConnection, who: Caller) ->
     """Whether a session is that of the person whom the proxy names now, with that role."""
     if who.by != "session":
         return True
-    found = introduced(console, connection)
-    if found is None:
+    person = introduced(console, connection)
+    if person is None:
         return not who.by_proxy
-    return who.by_proxy and (found.name, found.role) == (who.person.name, who.person.role.title)
+    return who.by_proxy and (person.name, person.role) == (who.person.name, who.person.role.title)
 
 
 async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Caller] | None:
     """Ask the store for the owner of a secret."""
     now = console.now()
-    found: ApiToken | Session | None
+    record: ApiToken | Session | None
     if by == "token":
-        found = await console.ask(lambda: console.people.token(secret, now))
+        record = await console.ask(lambda: console.people.token(secret, now))
     else:
-        found = await console.ask(lambda: console.people.session(secret, now))
-    if found is None:
+        record = await console.ask(lambda: console.people.session(secret, now))
+    if record is None:
         console.known.pop((by, secret), None)
         return None
-    if isinstance(found, Session):
-        who = signed_in(console, found, secret, found.expires)
+    if isinstance(record, Session):
+        who = signed_in(console, record, secret, record.expires)
     else:
-        who = Caller(person_of(found.name, found.role), by, secret, found.expires)
+        who = Caller(person_of(record.name, record.role), by, secret, record.expires)
     if len(console.known) > MOST_KNOWN:
         console.known.clear()
     known = console.known[by, secret] = (time.monotonic(), who)
     return known
 
 
-def signed_in(console: Console, found: Account | Session, secret: str, expires: float) -> Caller:
+def signed_in(console: Console, account: Account | Session, secret: str, expires: float) -> Caller:
     """Return the caller of a session."""
-    person, least = person_of(found.name, found.role), console.settings.second_factor
-    has_one = found.factor or found.by_proxy  # theirs is the proxy's business
+    person, least = person_of(account.name, account.role), console.settings.second_factor
+    has_one = account.factor or account.by_proxy  # theirs is the proxy's business
     needs_factor = bool(least) and person.role >= ROLES[least] and not has_one
-    owes = "password" if found.password_due else "factor" if needs_factor else ""
-    return Caller(person, "session", secret, expires, owes, found.factor, found.by_proxy)
+    owes = "password" if account.password_due else "factor" if needs_factor else ""
+    return Caller(person, "session", secret, expires, owes, account.factor, account.by_proxy)
 
 
 def _is_emergency(connection: HTTPConnection) -> bool:
@@ -275,13 +277,13 @@ def same_origin(console: Console, connection: HTTPConnection) -> bool:
     origin = connection.headers.get("origin")
     if origin is None:
         return True
-    there = parts_of(origin)
-    return there.netloc == connection.headers.get("host") and host_known(
-        console.settings, there.netloc
+    page = parts_of(origin)
+    return page.netloc == connection.headers.get("host") and host_known(
+        console.settings, page.netloc
     )
 
 
-async def caller(connection: HTTPConnection, console: Here) -> Caller:
+async def caller(connection: HTTPConnection, console: AppConsole) -> Caller:
     """Return the caller.
 
     Raises
@@ -291,10 +293,10 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
         owes something.
     """
     if FOUND in connection.scope:
-        found = cast("Caller | None", connection.scope[FOUND])
+        who = cast("Caller | None", connection.scope[FOUND])
     else:
-        found = await find_caller(console, connection)
-    if found is None:
+        who = await find_caller(console, connection)
+    if who is None:
         if "authorization" in connection.headers:
             await console.note(SecurityEvent.TOKEN_REFUSED, connection)
         raise HTTPException(401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
@@ -302,14 +304,14 @@ async def caller(connection: HTTPConnection, console: Here) -> Caller:
     if changes:
         # A caller that makes a change must see it.
         console.forget()
-    if found.by == "session" and changes:
+    if who.by == "session" and changes:
         word = connection.headers.get("x-csrf-token", "")
-        if not same_origin(console, connection) or not _words.same(word, found.csrf):
-            await console.note(SecurityEvent.ORIGIN_REFUSED, connection, found.person.name)
+        if not same_origin(console, connection) or not _words.same(word, who.csrf):
+            await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
             raise HTTPException(403, "the header X-CSRF-Token is missing or not this session's")
     if (connection.scope.get("method", "GET"), connection.scope["path"]) not in _ALWAYS:
-        settle(found, connection)
-    return found
+        settle(who, connection)
+    return who
 
 
 def settle(who: Caller, connection: HTTPConnection) -> None:

@@ -5,7 +5,7 @@ import socket
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from heliotrope.console.lines import Lines
+from heliotrope.console.listeners import Listeners
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.plant.interface import CONSOLE, EMERGENCY_WAY, ConsoleProcess, PlantInterface
 from heliotrope.plant.interface.console_process import Patience
@@ -36,31 +36,31 @@ class ConsoleProcesses:
         on_address: Callable[[str], None],
         patience: Patience | None = None,
     ) -> None:
-        self._lines = Lines(settings)
+        self._listeners = Listeners(settings)
         self.page = ConsoleProcess(
             interface, CONSOLE, self._listen(0), on_alarm, on_address, patience
         )
-        self.way = ConsoleProcess(
+        self.emergency = ConsoleProcess(
             interface, EMERGENCY_WAY, self._listen(1), on_alarm, lambda _: None, patience
         )
 
     def _listen(self, which: int) -> Callable[[], tuple[socket.socket, Mapping[str, Any]]]:
         def listen() -> tuple[socket.socket, Mapping[str, Any]]:
-            line = self._lines.open()[which]
-            return line, self._lines.settings.given
+            line = self._listeners.open()[which]
+            return line, self._listeners.settings.values
 
         return listen
 
     @property
     def settings(self) -> ConsoleSettings:
         """The settings, with the ports that are used once a process has begun."""
-        return self._lines.settings
+        return self._listeners.settings
 
     async def run(self) -> None:
         """Keep both running until cancelled."""
         try:
             async with asyncio.TaskGroup() as group:
-                group.create_task(self.way.run())
+                group.create_task(self.emergency.run())
                 group.create_task(self.page.run())
         finally:
-            self._lines.close()
+            self._listeners.close()

@@ -97,13 +97,13 @@ def _length(headers: Headers) -> int | None:
 
 def replayed(body: bytes, receive: Receive) -> Receive:
     """Return a `receive` that gives a body which was read already."""
-    given = False
+    delivered = False
 
     async def again() -> Message:
-        nonlocal given
-        if given:
+        nonlocal delivered
+        if delivered:
             return await receive()
-        given = True
+        delivered = True
         return {"type": "http.request", "body": body, "more_body": False}
 
     return again

@@ -74,8 +74,8 @@ class ByProxy:
         FormatError
             If one cannot be used, or others may read the secret.
         """
-        given = read_document(path, "proxy", _ProxyFile, (_ProxyFile,))
-        place = path.parent / given.secret_file
+        document = read_document(path, "proxy", _ProxyFile, (_ProxyFile,))
+        place = path.parent / document.secret_file
         word = read_text(place, "the secret of a proxy", _LARGEST).strip()
         if place.stat().st_mode & 0o077:
             raise FormatError(place, "others may read it; run chmod 600 on it")
@@ -83,7 +83,7 @@ class ByProxy:
             raise FormatError(
                 place, f"give at least {_SHORTEST} letters and digits, as of `openssl rand -hex 32`"
             )
-        return cls(given.person, given.groups, given.secret, word, given.roles)
+        return cls(document.person, document.groups, document.secret, word, document.roles)
 
     def introduced(self, headers: Headers) -> Introduced | None:
         """Return the person of a request from a proxy; None without the secret or a name."""
@@ -91,7 +91,7 @@ class ByProxy:
         names = headers.getlist(self.person)
         if not hmac.compare_digest(word, self.word.encode()) or len(names) != 1 or not names[0]:
             return None
-        groups = {one.strip() for one in ",".join(headers.getlist(self.groups)).split(",")}
+        groups = {group.strip() for group in ",".join(headers.getlist(self.groups)).split(",")}
         roles = [role for group, role in self.roles.items() if group in groups]
         return Introduced(names[0], max(roles, key=ROLES.index, default=""))
 

@@ -126,4 +126,6 @@ def _detail(answer: httpx.Response) -> str:
         return f"the console answers {answer.status_code}"
     if isinstance(detail, str):
         return detail
-    return "; ".join(f"{'.'.join(map(str, one['loc'][1:]))}: {one['msg']}" for one in detail)
+    return "; ".join(
+        f"{'.'.join(map(str, problem['loc'][1:]))}: {problem['msg']}" for problem in detail
+    )

@@ -120,7 +120,7 @@ class Connection:
         self.length = 0
 
     @property
-    def gone(self) -> bool:
+    def closed(self) -> bool:
         """Whether its socket is closed."""
         return self.line.fileno() < 0
 
@@ -246,16 +246,16 @@ class Listener:
             line.setblocking(False)
             key = ((str(peer[0]), int(peer[1])), self.port)
             self._make_room(key[0][0])
-            found = self._strangers[key] = Connection(key[0][0], line, self._now())
-            found.opening = group.create_task(self._open(loop, found, protocol, tls))
+            connection = self._strangers[key] = Connection(key[0][0], line, self._now())
+            connection.opening = group.create_task(self._open(loop, connection, protocol, tls))
             # A task that is cancelled before its first turn cannot close the socket itself.
-            found.opening.add_done_callback(partial(_close_unopened, found))
+            connection.opening.add_done_callback(partial(_close_unopened, connection))
         return True
 
     async def _open(
         self,
         loop: asyncio.AbstractEventLoop,
-        found: Connection,
+        connection: Connection,
         protocol: Protocols,
         tls: TlsSource,
     ) -> None:
@@ -263,12 +263,12 @@ class Listener:
         limit = 10.0 * self.limits.handshake if tls is not None else None  # `look` is earlier
         try:
             made, _ = await loop.connect_accepted_socket(
-                protocol, found.line, ssl=context_of(tls), ssl_handshake_timeout=limit
+                protocol, connection.line, ssl=context_of(tls), ssl_handshake_timeout=limit
             )
         except OSError:
             return
-        found.transport = made
-        found.enter(Stage.HEADER, self._now())
+        connection.transport = made
+        connection.enter(Stage.HEADER, self._now())
 
     def _make_room(self, address: str) -> None:
         """Close the connection whose place a new one gets, if the limits are reached."""
@@ -276,9 +276,13 @@ class Listener:
         if len(self._strangers) >= fewest or len(self) >= self.limits.most:
             self._sort()
         if len(self._strangers) >= self.limits.address and address not in self._shared:
-            here = {key: one for key, one in self._strangers.items() if one.address == address}
-            if len(here) >= self.limits.address:
-                self._evict(here)
+            same_address = {
+                key: connection
+                for key, connection in self._strangers.items()
+                if connection.address == address
+            }
+            if len(same_address) >= self.limits.address:
+                self._evict(same_address)
         if len(self._strangers) >= self.limits.strangers:
             self._evict(self._strangers)
         elif len(self) >= self.limits.most:
@@ -289,10 +293,10 @@ class Listener:
         if not among:
             return
         key = min(among, key=lambda key: _rank(among[key]))
-        one = among[key]
+        connection = among[key]
         self._strangers.pop(key, None)
         self._known.pop(key, None)
-        one.abort()
+        connection.abort()
 
     def look(self, stalled: float = 0.0) -> None:
         """Close connections that are late, and forget those that are gone.
@@ -307,9 +311,11 @@ class Listener:
         self._sort()
         now = self._now()
         for kept in (self._known, self._strangers):
-            for one in kept.values():
-                one.since = min(now, one.since + stalled)
-            for key in [key for key, one in kept.items() if one.late(self.limits, now)]:
+            for connection in kept.values():
+                connection.since = min(now, connection.since + stalled)
+            for key in [
+                key for key, connection in kept.items() if connection.late(self.limits, now)
+            ]:
                 kept.pop(key).abort()
 
     def _sort(self) -> None:
@@ -319,44 +325,49 @@ class Listener:
             return
         self._sorted = now
         for kept in (self._known, self._strangers):
-            for key in [key for key, one in kept.items() if one.gone]:
+            for key in [key for key, connection in kept.items() if connection.closed]:
                 del kept[key]
-        for key in [key for key, one in self._strangers.items() if one.present]:
+        for key in [key for key, connection in self._strangers.items() if connection.present]:
             self._known[key] = self._strangers.pop(key)
 
     @contextlib.contextmanager
     def request(self, scope: Scope) -> Iterator[Callable[[], None]]:
         """Note a request of a connection during a block; yield what to call after its body."""
         key = (tuple(scope["client"] or ()), self.port)
-        found = self._known.get(key) or self._strangers.get(key)
-        if found is None:
+        connection = self._known.get(key) or self._strangers.get(key)
+        if connection is None:
             yield lambda: None
             return
         length = Headers(scope=scope).get("content-length", "0")
-        found.length = int(length) if length.isdigit() and len(length) < 12 else 0
-        found.enter(Stage.BODY if found.length else Stage.ANSWER, self._now())
-        found.scope = scope
+        connection.length = int(length) if length.isdigit() and len(length) < 12 else 0
+        connection.enter(Stage.BODY if connection.length else Stage.ANSWER, self._now())
+        connection.scope = scope
         try:
-            yield lambda: found.enter(Stage.ANSWER, self._now())
+            yield lambda: connection.enter(Stage.ANSWER, self._now())
         finally:
             now = self._now()
-            if found.present:
-                found.known = now
+            if connection.present:
+                connection.known = now
                 if self._strangers.pop(key, None) is not None:
-                    self._known[key] = found
-            found.scope = None
-            found.enter(Stage.IDLE, now)
+                    self._known[key] = connection
+            connection.scope = None
+            connection.enter(Stage.IDLE, now)
 
 
-def _close_unopened(found: Connection, task: "asyncio.Task[None]") -> None:
+def _close_unopened(connection: Connection, task: "asyncio.Task[None]") -> None:
     del task
-    if found.transport is None:
-        found.line.close()
+    if connection.transport is None:
+        connection.line.close()
 
 
-def _rank(one: Connection) -> tuple[bool, float, int, float]:
+def _rank(connection: Connection) -> tuple[bool, float, int, float]:
     """Return the order in which connections are closed: first those that wait for a request."""
-    return (one.present, one.known or 0.0, max(one.stage, Stage.IDLE), one.held)
+    return (
+        connection.present,
+        connection.known or 0.0,
+        max(connection.stage, Stage.IDLE),
+        connection.held,
+    )
 
 
 class Doors:
@@ -391,11 +402,11 @@ class Doors:
 def raise_descriptors() -> int:
     """Raise the number of descriptors that this process may open; return how many are left."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = WANTED if hard == resource.RLIM_INFINITY else min(WANTED, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
+    limit = WANTED if hard == resource.RLIM_INFINITY else min(WANTED, hard)
+    if soft != resource.RLIM_INFINITY and soft < limit:
         with contextlib.suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-            soft = wanted
+            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+            soft = limit
     most = WANTED if soft == resource.RLIM_INFINITY else soft
     return most - _open_now()
 

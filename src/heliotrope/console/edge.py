@@ -34,7 +34,7 @@ class Edge:
         self._stranger = Buckets(*STRANGER, monotonic)
         self._strangers = Buckets(*STRANGERS, monotonic)
         self._known = Buckets(*KNOWN, monotonic)
-        self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._admitted: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._large: list[tuple[str, str]] = []
 
     async def find(self, console: Console, connection: HTTPConnection) -> Caller | None:
@@ -49,17 +49,17 @@ class Edge:
             429 if requests come too often.
         """
         secret = secret_of(connection)
-        if secret is None or secret not in self._seen:
+        if secret is None or secret not in self._admitted:
             self._count_stranger(console, connection)
-        found = None if secret is None else await find_caller(console, connection)
-        if secret is None or found is None:
-            self._seen.pop(secret or ("", ""), None)
+        who = None if secret is None else await find_caller(console, connection)
+        if secret is None or who is None:
+            self._admitted.pop(secret or ("", ""), None)
             return None
-        self._seen[secret] = None
-        self._seen.move_to_end(secret)
-        if len(self._seen) > _MOST_SEEN:
-            self._seen.popitem(last=False)
-        return found
+        self._admitted[secret] = None
+        self._admitted.move_to_end(secret)
+        if len(self._admitted) > _MOST_SEEN:
+            self._admitted.popitem(last=False)
+        return who
 
     def _count_stranger(self, console: Console, connection: HTTPConnection) -> None:
         address = network_of(address_of(console.settings, connection))

@@ -4,7 +4,7 @@ from fastapi import APIRouter, HTTPException, Request
 
 from heliotrope.console import models
 from heliotrope.console.api import REFUSALS, Named
-from heliotrope.console.auth import Anyone, Engineer, Here
+from heliotrope.console.auth import Anyone, AppConsole, Engineer
 from heliotrope.console.sign_in import confirm
 from heliotrope.plant.operations.security import SecurityEvent
 
@@ -13,13 +13,13 @@ router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 @router.post("/session/factor", response_model=models.NewFactor, tags=["people"])
 async def begin_factor(
-    console: Here, who: Anyone, request: Request, given: models.Confirmed
+    console: AppConsole, who: Anyone, request: Request, body: models.Confirmed
 ) -> models.NewFactor:
     """Make the secret of your second factor, shown once; `PUT session/factor` puts it in force."""
     import pyotp
     import segno
 
-    await confirm(console, who, request, given.own_password)
+    await confirm(console, who, request, body.own_password)
     name = who.person.name
     secret = await console.ask(lambda: console.people.begin_factor(name, console.now()))
     uri = pyotp.TOTP(secret).provisioning_uri(name=name, issuer_name="Heliotrope")
@@ -28,15 +28,13 @@ async def begin_factor(
 
 @router.put("/session/factor", response_model=models.RecoveryCodes, tags=["people"])
 async def confirm_factor(
-    console: Here, who: Anyone, request: Request, given: models.FactorCode
+    console: AppConsole, who: Anyone, request: Request, body: models.FactorCode
 ) -> models.RecoveryCodes:
     """Put your second factor in force by its first code; the recovery codes are shown once."""
     if who.by != "session":
         raise HTTPException(403, "a token cannot change a second factor; sign in to do so")
     name = who.person.name
-    codes = await console.ask(
-        lambda: console.people.confirm_factor(name, given.code, console.now())
-    )
+    codes = await console.ask(lambda: console.people.confirm_factor(name, body.code, console.now()))
     console.known.clear()
     await console.note(SecurityEvent.FACTOR_CHANGED, request, name, "set up")
     return models.RecoveryCodes(codes=list(codes))
@@ -44,10 +42,10 @@ async def confirm_factor(
 
 @router.delete("/session/factor", status_code=204, tags=["people"])
 async def remove_own_factor(
-    console: Here, who: Anyone, request: Request, given: models.ConfirmedTwice
+    console: AppConsole, who: Anyone, request: Request, body: models.ConfirmedTwice
 ) -> None:
     """Remove your own second factor."""
-    await confirm(console, who, request, given.own_password, given.own_code)
+    await confirm(console, who, request, body.own_password, body.own_code)
     name = who.person.name
     if not await console.ask(lambda: console.people.remove_factor(name)):
         raise HTTPException(404, f"{name} has no second factor")
@@ -57,14 +55,14 @@ async def remove_own_factor(
 
 @router.delete("/accounts/{name}/factor", status_code=204, tags=["people"])
 async def remove_factor(
-    console: Here, who: Engineer, request: Request, name: Named, given: models.ConfirmedTwice
+    console: AppConsole, who: Engineer, request: Request, name: Named, body: models.ConfirmedTwice
 ) -> None:
     """Remove the second factor of another person, whose sessions end; needs one of your own."""
     if not who.factor:
         raise HTTPException(409, f"{who.person.name}: set up your own second factor first")
     if name == who.person.name:
         raise HTTPException(409, f"{name}: remove your own one with DELETE session/factor")
-    await confirm(console, who, request, given.own_password, given.own_code)
+    await confirm(console, who, request, body.own_password, body.own_code)
     if await console.ask(lambda: console.people.account(name)) is None:
         raise HTTPException(404, f"there is no account {name}")
     if not await console.ask(lambda: console.people.remove_factor(name)):

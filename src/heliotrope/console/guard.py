@@ -19,7 +19,7 @@ from heliotrope.console.auth import AtLeast, Caller, Console, caller, refused
 from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
 from heliotrope.console.headers import host_known, parts_of
-from heliotrope.console.routes import FORM, LARGEST, TINY, Found, Routes
+from heliotrope.console.routes import FORM, LARGEST, TINY, RouteMatch, Routes
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.plant.operations.security import SecurityEvent
 
@@ -94,21 +94,23 @@ class Guard:
                 raise HTTPException(404, "nothing is at this address")
             await self._app(scope, receive, send)
             return
-        found = self._route(scope, who)
-        if found.role is not None:
+        route = self._route(scope, who)
+        if route.role is not None:
             who = await caller(connection, console)
-            if who.person.role < found.role:
+            if who.person.role < route.role:
                 await refused(console, connection, who)
-            AtLeast(found.role).admitted(who)
+            AtLeast(route.role).admitted(who)
         if who is not None and not _is_emergency(scope):
             self._edge.count(who)
         if (place := _elsewhere(scope["path"], who)) is not None:
             await RedirectResponse(place, 303)(scope, receive, send)
             return
-        length = bodies.length_of(headers, found.largest)
+        length = bodies.length_of(headers, route.largest)
         if length > FORM:
             # What is longer than names and points of the whole field would only cost time.
-            length = bodies.length_of(headers, FORM + found.each * await console.heliostats())
+            length = bodies.length_of(
+                headers, FORM + route.per_heliostat * await console.heliostats()
+            )
         with contextlib.ExitStack() as stack:
             if length > FORM and who is not None:
                 stack.enter_context(self._edge.large(who))
@@ -120,18 +122,18 @@ class Guard:
                 receive = bodies.replayed(body, receive)
             await self._app(scope, receive, send)
 
-    def _route(self, scope: Scope, who: Caller | None) -> Found:
+    def _route(self, scope: Scope, who: Caller | None) -> RouteMatch:
         """Return the route of a request; raises `HTTPException` if there is none."""
-        found = self._routes.find(scope)
-        if found.status == 200:
-            return found
+        route = self._routes.find(scope)
+        if route.status == 200:
+            return route
         if who is None:
             # Strangers do not learn which addresses there are.
             if scope["path"].startswith("/api/"):
                 raise HTTPException(401, "sign in, or send a valid token")
             raise HTTPException(404, "nothing is at this address")
-        if found.status == 405:
-            raise HTTPException(405, "not this method", {"Allow": ", ".join(found.allow)})
+        if route.status == 405:
+            raise HTTPException(405, "not this method", {"Allow": ", ".join(route.allow)})
         raise HTTPException(404, "nothing is at this address")
 
     def _dress(self, console: Console, scope: Scope, headers: Any) -> None:

@@ -49,14 +49,14 @@ def address_of(settings: ConsoleSettings, connection: HTTPConnection) -> str:
 def network_of(address: str) -> str:
     """Return the address that is counted: of IPv6 the /64, of which one machine has all."""
     try:
-        found = ipaddress.ip_address(address)
+        ip = ipaddress.ip_address(address)
     except ValueError:
         return address
-    if isinstance(found, ipaddress.IPv4Address):
-        return str(found)
-    if found.ipv4_mapped is not None:
-        return str(found.ipv4_mapped)
-    return str(ipaddress.IPv6Network((int(found) >> 64 << 64, 64)))
+    if isinstance(ip, ipaddress.IPv4Address):
+        return str(ip)
+    if ip.ipv4_mapped is not None:
+        return str(ip.ipv4_mapped)
+    return str(ipaddress.IPv6Network((int(ip) >> 64 << 64, 64)))
 
 
 def secret_of(connection: HTTPConnection) -> tuple[str, str] | None:

@@ -112,15 +112,15 @@ class Stream:
             if self.viewers == 1:
                 await self.make()
             data = await self.whole()
-            seen = self.tick if data else -1
+            sent = self.tick if data else -1
             if data:
                 await send(data)
             while True:
                 await self._turned.wait()
                 if not await allowed():
                     return
-                data = self.news if self.tick == seen + 1 else await self.whole()
-                seen = self.tick
+                data = self.news if self.tick == sent + 1 else await self.whole()
+                sent = self.tick
                 await send(data)
         finally:
             self.viewers -= 1

@@ -28,7 +28,7 @@ _END = 1.0
 
 
 @dataclass(frozen=True)
-class Given:
+class ProcessInput:
     """What a process is given: see the module."""
 
     folder: Path
@@ -51,7 +51,7 @@ class Served(Protocol):
         ...
 
 
-def main(work: Callable[[Given], Coroutine[Any, Any, None]]) -> int:
+def main(work: Callable[[ProcessInput], Coroutine[Any, Any, None]]) -> int:
     """Do the work of a process until standard input ends; return the exit code."""
     # The plant stows its field after Ctrl-C, and people watch that here.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -59,7 +59,7 @@ def main(work: Callable[[Given], Coroutine[Any, Any, None]]) -> int:
     line = socket.socket(fileno=read["line"])
     settings = ConsoleSettings.of(read["settings"])
     try:
-        asyncio.run(work(Given(Path(read["folder"]), read["key"], settings, line)))
+        asyncio.run(work(ProcessInput(Path(read["folder"]), read["key"], settings, line)))
     except ExceptionGroup as group:
         known, _ = group.split(HeliotropeError)
         if known is None:

@@ -102,19 +102,19 @@ class RemotePeople:
 
     def account(self, name: str) -> Account | None:
         """Return an account, None if the name is unknown."""
-        found = self._ask("account", name=name)
-        return None if found is None else Account(**found)
+        values = self._ask("account", name=name)
+        return None if values is None else Account(**values)
 
     def accounts(self) -> tuple[Account, ...]:
         """Return all accounts by name."""
-        return tuple(Account(**one) for one in self._ask("accounts"))
+        return tuple(Account(**values) for values in self._ask("accounts"))
 
     def add(
         self, name: str, password_hash: str, role: str, now: float, *, due: bool = False
     ) -> Account:
         """Make an account; see `People.add`."""
-        given = {"name": name, "password_hash": password_hash, "role": role, "now": now}
-        return Account(**self._ask("add", **given, due=due))
+        values = {"name": name, "password_hash": password_hash, "role": role, "now": now}
+        return Account(**self._ask("add", **values, due=due))
 
     def change(
         self,
@@ -145,8 +145,8 @@ class RemotePeople:
 
     def session(self, secret: str, now: float) -> Session | None:
         """Return the session of a secret; see `People.session`."""
-        found = self._ask("session", secret=secret, now=now)
-        return None if found is None else Session(**found)
+        values = self._ask("session", secret=secret, now=now)
+        return None if values is None else Session(**values)
 
     def close_session(self, secret: str) -> None:
         """End a session, if it exists."""
@@ -166,8 +166,8 @@ class RemotePeople:
 
     def check_factor(self, name: str, code: str, now: float) -> Used | None:
         """Use a code; see `Factors.check`."""
-        found = self._ask("check_factor", name=name, code=code, now=now)
-        return None if found is None else Used(**found)
+        values = self._ask("check_factor", name=name, code=code, now=now)
+        return None if values is None else Used(**values)
 
     def remove_factor(self, name: str) -> bool:
         """Remove a second factor; see `Factors.remove`."""
@@ -184,12 +184,12 @@ class RemotePeople:
 
     def token(self, secret: str, now: float) -> ApiToken | None:
         """Return the token of a secret; see `People.token`."""
-        found = self._ask("token", secret=secret, now=now)
-        return None if found is None else ApiToken(**found)
+        values = self._ask("token", secret=secret, now=now)
+        return None if values is None else ApiToken(**values)
 
     def tokens(self, name: str = "") -> tuple[ApiToken, ...]:
         """Return the tokens of an account, or all, the oldest first."""
-        return tuple(ApiToken(**one) for one in self._ask("tokens", name=name))
+        return tuple(ApiToken(**values) for values in self._ask("tokens", name=name))
 
     def revoke_token(self, key: str) -> None:
         """Remove a token by its key, if it exists."""
@@ -197,4 +197,4 @@ class RemotePeople:
 
     def forget_expired(self, now: float) -> tuple[Expired, ...]:
         """Remove expired sessions and tokens; see `People.forget_expired`."""
-        return tuple(Expired(**one) for one in self._ask("forget_expired", now=now))
+        return tuple(Expired(**values) for values in self._ask("forget_expired", now=now))

@@ -28,7 +28,7 @@ READ = ("GET", "HEAD")
 
 
 @dataclass(frozen=True)
-class Found:
+class RouteMatch:
     """The route of a request.
 
     Attributes
@@ -37,7 +37,7 @@ class Found:
         200, or 404 or 405 if there is none.
     role
         Least role; None: open to all.
-    largest, each
+    largest, per_heliostat
         Largest body, and how much of it for each heliostat of the plant, bytes.
     allow
         Methods that the path has.
@@ -46,7 +46,7 @@ class Found:
     status: int
     role: Role | None = None
     largest: int = TINY
-    each: int = EACH
+    per_heliostat: int = EACH
     allow: tuple[str, ...] = ()
 
 
@@ -69,35 +69,35 @@ class Routes:
         self._api = [(route, _of(route)) for router in routers for route in router.routes]
         self._files, self._own = frozenset(files), dict(own)
 
-    def find(self, scope: Scope) -> Found:
+    def find(self, scope: Scope) -> RouteMatch:
         """Return the route of a request."""
         path, method = scope["path"], scope["method"]
         if path in self._files or path in self._own:
-            found = Found(200, self._own.get(path))
-            return found if method in READ else Found(405, allow=READ)
+            result = RouteMatch(200, self._own.get(path))
+            return result if method in READ else RouteMatch(405, allow=READ)
         allow: list[str] = []
-        for route, found in self._api:
+        for route, result in self._api:
             match, _ = route.matches({**scope, "type": "http"})
             if match is Match.FULL:
-                return found
+                return result
             if match is Match.PARTIAL:
                 allow += sorted(getattr(route, "methods", ()))
-        return Found(405, allow=tuple(allow)) if allow else Found(404)
+        return RouteMatch(405, allow=tuple(allow)) if allow else RouteMatch(404)
 
 
-def _of(route: BaseRoute) -> Found:
+def _of(route: BaseRoute) -> RouteMatch:
     if not isinstance(route, APIRoute):
-        return Found(404)
+        return RouteMatch(404)
     field = route.body_field
     model = None if field is None else field.field_info.annotation
     role = least_role(route.dependant)
     largest = TINY if model is None or role is None else _largest(model)
-    return Found(200, role, largest, EACH_FLOWN if model is FlightDocument else EACH)
+    return RouteMatch(200, role, largest, EACH_FLOWN if model is FlightDocument else EACH)
 
 
 def least_role(dependant: Any) -> Role | None:
     """Return the least role that the dependencies of a route ask for; None: open to all."""
-    roles = [least_role(one) for one in dependant.dependencies]
+    roles = [least_role(dependency) for dependency in dependant.dependencies]
     if isinstance(dependant.call, AtLeast):
         roles.append(dependant.call.role)
     elif dependant.call is caller:

@@ -91,14 +91,14 @@ class ConsoleSettings:
             )
 
     @classmethod
-    def of(cls, given: Mapping[str, Any]) -> "ConsoleSettings":
-        """Return the settings of `given`."""
-        files = {name: Path(given[name]) for name in _FILES if given[name]}
-        tuples = {name: tuple(given[name]) for name in ("names", "proxies")}
-        return cls(**{**given, **tuples, **files})
+    def of(cls, values: Mapping[str, Any]) -> "ConsoleSettings":
+        """Return the settings of `values`."""
+        files = {name: Path(values[name]) for name in _FILES if values[name]}
+        tuples = {name: tuple(values[name]) for name in ("names", "proxies")}
+        return cls(**{**values, **tuples, **files})
 
     @property
-    def given(self) -> dict[str, Any]:
+    def values(self) -> dict[str, Any]:
         """The settings as JSON values, for the console's process."""
         files = {name: str(getattr(self, name) or "") or None for name in _FILES}
         lists = {"names": list(self.names), "proxies": list(self.proxies)}

@@ -44,7 +44,7 @@ async def log_in(
     return account, secret, now + lifetime
 
 
-async def enter(console: Console, found: Introduced, connection: HTTPConnection) -> str:
+async def enter(console: Console, person: Introduced, connection: HTTPConnection) -> str:
     """Return the secret of a new session of somebody whom a trusted proxy has signed in.
 
     Raises
@@ -54,9 +54,9 @@ async def enter(console: Console, found: Introduced, connection: HTTPConnection)
     HeliotropeError
         If the account cannot be made or changed.
     """
-    name, role, people, now = found.name, found.role, console.people, console.now()
+    name, role, people, now = person.name, person.role, console.people, console.now()
     account = await console.ask(lambda: people.account(name))
-    check_account(found, account)
+    check_account(person, account)
     if account is None:
         await console.ask(lambda: people.add(name, BY_PROXY, role, now))
         detail = f"{name}, {role}, as the proxy says"
@@ -142,8 +142,8 @@ async def _use_code(
         await console.note(failure, connection, name, "wrong code of the second factor")
         raise HTTPException(401, _WRONG_CODE)
     if used.recovery:
-        left = f"a recovery code was used, {used.left} are left"
-        await console.note(SecurityEvent.FACTOR_CHANGED, connection, name, left)
+        text = f"a recovery code was used, {used.left} are left"
+        await console.note(SecurityEvent.FACTOR_CHANGED, connection, name, text)
 
 
 async def confirm(
@@ -166,8 +166,8 @@ async def confirm(
             "whose account has one",
         )
     try:
-        wrong = SecurityEvent.CONFIRMATION_FAILED
-        await checked(console, who.person.name, password, request, wrong, code)
+        event = SecurityEvent.CONFIRMATION_FAILED
+        await checked(console, who.person.name, password, request, event, code)
     except HTTPException as error:
         if error.status_code == 401:
             text = _WRONG_CODE if error.detail == _WRONG_CODE else "your current password is wrong"

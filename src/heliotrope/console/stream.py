@@ -44,10 +44,10 @@ class RemoteError(HeliotropeError):
 def changed(before: npt.NDArray[Any], after: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the rows of ``after`` that differ; NaN equals NaN."""
     width = ROW.itemsize
-    one = before.view(np.uint8).reshape(-1, width)
-    other = after.view(np.uint8).reshape(-1, width)
-    found: npt.NDArray[Any] = after[(one != other).any(axis=1)]
-    return found
+    old = before.view(np.uint8).reshape(-1, width)
+    new = after.view(np.uint8).reshape(-1, width)
+    rows: npt.NDArray[Any] = after[(old != new).any(axis=1)]
+    return rows
 
 
 def message(header: dict[str, Any], rows: npt.NDArray[Any]) -> bytes:

@@ -137,20 +137,20 @@ class EmergencyWay:
         if not secret:
             return None
         now = time.time()
-        given = {"secret": secret, "now": now}
+        arguments = {"secret": secret, "now": now}
         try:
-            found, _ = await self._ask(f"people.{by}", given, within=_STORE)
+            account, _ = await self._ask(f"people.{by}", arguments, within=_STORE)
         except (AwayError, CallError):
             if known is None or time.monotonic() - at > _TRUSTED:
                 raise HTTPException(503, "the store cannot say who this is; try again") from None
             expires = known["expires"]
             return known if expires is None or expires > now else None
         self._known.pop(key, None)
-        if found is not None:
+        if account is not None:
             if len(self._known) >= _MOST_KNOWN:
                 self._known.pop(next(iter(self._known)))
-            self._known[key] = time.monotonic(), found
-        return dict(found) if found is not None else None
+            self._known[key] = time.monotonic(), account
+        return dict(account) if account is not None else None
 
     def _count(self, connection: HTTPConnection) -> None:
         address = network_of(address_of(self._settings, connection))
@@ -160,16 +160,14 @@ class EmergencyWay:
 
     def _from_page(self, origin: str, host: str) -> bool:
         """Whether an origin is the page of this console, at the name that the request names."""
-        there, here = parts_of(origin), parts_of(f"//{host}")
+        page, own = parts_of(origin), parts_of(f"//{host}")
         try:
-            port, name = there.port, there.hostname
+            port, name = page.port, page.hostname
         except ValueError:
             return False
         # Behind a proxy the page has the proxy's port.
         behind = self._settings.plain and port is None
-        return (
-            name is not None and name == here.hostname and (behind or port == self._settings.port)
-        )
+        return name is not None and name == own.hostname and (behind or port == self._settings.port)
 
 
 async def _read(headers: Headers, receive: Receive) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import sys
 import time
 from typing import Any
 
-from heliotrope.console.process import Given, main, serve
+from heliotrope.console.process import ProcessInput, main, serve
 from heliotrope.console.server import Server
 from heliotrope.console.urgent import LIMITS, EmergencyWay
 from heliotrope.local import EMERGENCY, LocalConnection
@@ -19,7 +19,7 @@ _ANSWER = 10.0
 _CONNECT = 5.0
 
 
-def server_of(plant: LocalConnection, given: Given) -> Server:
+def server_of(plant: LocalConnection, inputs: ProcessInput) -> Server:
     """Return the server of the way; an order that comes before the plant is connected waits."""
 
     async def ask(call: str, arguments: dict[str, Any], **named: Any) -> tuple[Any, bytes]:
@@ -28,14 +28,14 @@ def server_of(plant: LocalConnection, given: Given) -> Server:
             await asyncio.sleep(0.02)
         return await plant.ask(call, arguments, **named)
 
-    way = EmergencyWay(ask, given.settings)
-    return Server(way, given.line, LIMITS, given.settings, page=False)
+    app = EmergencyWay(ask, inputs.settings)
+    return Server(app, inputs.line, LIMITS, inputs.settings, page=False)
 
 
-async def _run(given: Given) -> None:
-    plant = LocalConnection(given.folder / EMERGENCY, {"key": given.key}, _ANSWER)
+async def _run(inputs: ProcessInput) -> None:
+    plant = LocalConnection(inputs.folder / EMERGENCY, {"key": inputs.key}, _ANSWER)
     await serve(
-        server_of(plant, given),
+        server_of(plant, inputs),
         plant.run,
         lambda address: plant.ask("heartbeat", {"part": "emergency", "address": address}),
     )

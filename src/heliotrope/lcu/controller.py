@@ -268,17 +268,17 @@ class Controller:
             self._judge()
         stepper = motion.stepper
         if stepper is not None:
-            one, two, place = motion.place(0), motion.place(1), len(self.out)
+            primary, secondary, place = motion.place(0), motion.place(1), len(self.out)
             stepper.advance(elapsed, self.out, SEGMENT)
             if len(self.out) > place:
-                steps = (BEFORE_STEPS, one, two, motion.place(0), motion.place(1))
+                steps = (BEFORE_STEPS, primary, secondary, motion.place(0), motion.place(1))
                 self.out.insert(place, steps)
                 self._moving = True
             elif self._moving and motion.still() and not motion.following():
                 # A mirror that follows the sun stops several times a second: recording each stop in
                 # flash would wear it out in a year.
                 self._moving = False
-                self.out.append((AT_REST, one, two))
+                self.out.append((AT_REST, primary, secondary))
             if motion.may_rest(elapsed) == self._powered:
                 self._powered = not self._powered
                 self.out.insert(place, (DRIVERS, self._powered))
@@ -293,12 +293,12 @@ class Controller:
 
     def _event(self, name: str) -> bool:
         """Pass an event to the state table; False if it is refused, and nothing has changed."""
-        found = states.transition(self.state, name)
-        if found is None:
+        change = states.transition(self.state, name)
+        if change is None:
             return False
-        before, self.state = self.state, found[0]
-        if found[1]:
-            getattr(self.motion, found[1])()
+        before, self.state = self.state, change[0]
+        if change[1]:
+            getattr(self.motion, change[1])()
         if self.state in (states.DEFOCUSED, states.FAULT) and before != self.state:
             self._dark.start(self._seen, self.config.stow_wait_ms)
         self._mark()

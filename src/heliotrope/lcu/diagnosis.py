@@ -69,7 +69,7 @@ class Diagnosis:
     def _judged(self) -> "tuple[Any, ...]":
         pointing, drives = self.config.pointing, self.config.drives
         assert pointing is not None
-        bits, moved, seen = 0, [0, 0], (0.0, 0.0)
+        bits, moved, tilt = 0, [0, 0], (0.0, 0.0)
         axis = pointing.axis_1
         for i in (0, 1):
             drive, before, after = drives[i], self._tilts[0], self._tilts[i + 1]
@@ -82,9 +82,9 @@ class Diagnosis:
             turn = abs(drive.angle(self.home[i] + moved[i]) - angle)
             # Gravity, seen from the mirror, turns with it, except for the part along the axis.
             expected = turn * math.sqrt(axis[0] * axis[0] + axis[1] * axis[1])
-            seen = after[0] - before[0], after[1] - before[1]
+            tilt = after[0] - before[0], after[1] - before[1]
             if expected > NOTICED:
-                good = math.sqrt(seen[0] * seen[0] + seen[1] * seen[1]) > 0.5 * expected
+                good = math.sqrt(tilt[0] * tilt[0] + tilt[1] * tilt[1]) > 0.5 * expected
                 bits |= (MOVED_PRIMARY if good else STUCK_PRIMARY) << i
             axis = pointing.turned((math.sin(angle), math.cos(angle), 0.0, 1.0), pointing.axis_2)
-        return bits, moved[0], moved[1], seen[0], seen[1]
+        return bits, moved[0], moved[1], tilt[0], tilt[1]

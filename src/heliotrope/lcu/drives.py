@@ -106,25 +106,25 @@ class Drive:
         thousandth of a step.
         """
         phi = (theta - self.bias) / (1.0 + self.numbers[SCALE])
-        found = self._of_ideal(phi)
+        count = self._of_ideal(phi)
         if self.span == 0.0:
-            return found
+            return count
         low, high = self._of_ideal(phi - self.span), self._of_ideal(phi + self.span)
         f_low, f_high = self.angle(low) - theta, self.angle(high) - theta
         for i in range(60):
-            error = self.angle(found) - theta
+            error = self.angle(count) - theta
             if (error > 0.0) == (f_low > 0.0):
-                low, f_low = found, error
+                low, f_low = count, error
             else:
-                high, f_high = found, error
-            before, found = found, 0.5 * (low + high)
+                high, f_high = count, error
+            before, count = count, 0.5 * (low + high)
             if i % 3 != 2 and f_high != f_low:
-                found = low - f_low * (high - low) / (f_high - f_low)
+                count = low - f_low * (high - low) / (f_high - f_low)
             if error == 0.0:
                 return before
-            if abs(found - before) <= 1e-3 + 2.0 * self.eps * abs(before):
-                return found
-        return found
+            if abs(count - before) <= 1e-3 + 2.0 * self.eps * abs(before):
+                return count
+        return count
 
     def nearest(self, theta: float) -> int:
         """Return the whole number of steps nearest to a joint angle (rad)."""

@@ -190,7 +190,7 @@ class Journal:
     boots
         Total of boots, modulo 65536.
     unhealthy
-        Consecutive boots that did not reach a healthy minute; 7 stands for 7 or more.
+        Consecutive boots that did not reach a healthy minute; 7 means 7 or more.
     """
 
     def __init__(self, storage: "Storage", stride: int = STRIDE) -> None:
@@ -228,7 +228,7 @@ class Journal:
     def load(self) -> "dict[str, bytes]":
         """Read the newest whole records, and return ``items``. Nothing is written."""
         self._clear()
-        found = False
+        intact = False
         for slot in (0, 1):
             data = self._storage.read(slot * self._storage.block_size, SLOT_SIZE)
             magic, layout, mask, counter = struct.unpack(SLOT_HEAD, data[:SLOT_HEAD_SIZE])
@@ -237,11 +237,11 @@ class Journal:
                 whole = whole or _whole(data[:size])
             if not whole or magic != MAGIC or layout != LAYOUT:
                 self.damaged = self.damaged or data != b"\xff" * SLOT_SIZE
-            elif not found or _newer(counter, self._slot_counter):
-                found = True
+            elif not intact or _newer(counter, self._slot_counter):
+                intact = True
                 self._slot, self._slot_counter = slot, counter
                 self.items = self._split(mask, data)
-        self.damaged = self.damaged and not found
+        self.damaged = self.damaged and not intact
         self._load_ring()
         return self.items
 
@@ -305,7 +305,7 @@ class Journal:
 
     @property
     def doubt(self) -> int:
-        """Number of steps by which the counts may be wrong; -1 if nothing is known of them."""
+        """Greatest error of the counts, steps; -1 if they are unknown."""
         return self.doubts * self.stride if self.doubts < MOST else -1
 
     @property

@@ -1,7 +1,7 @@
 """All messages of the wire, version 2: one table.
 
 A row: number, name, who may send it, codes of the payload, names of its fields, traits. Codes are
-those of ``struct``, little-endian; ``s`` alone stands for the remaining bytes. A field of several
+those of ``struct``, little-endian; ``s`` alone means the remaining bytes. A field of several
 numbers has a code with a count ("18d"). Names of fields end in their unit. The meaning of a message
 is in the comment above its row, from where ``docs/reference/wire.md`` takes it (on a
 microcontroller a comment costs no memory).

@@ -73,7 +73,7 @@ class Motion:
         position is by now.
     aside
         Goals of the defocus that has begun, as step counts; () once it has ended, and the mirror
-        stands beside its aim or moves with the sun; None: another motion has begun since.
+        rests beside its aim or moves with the sun; None: another motion has begun since.
     blind
         Way (1, -1) in which a mirror with unknown counts may turn away; 0: it has done so.
     cut, unreachable
@@ -221,9 +221,9 @@ class Motion:
             if drive is None:
                 return None
             self._near[i] = drive.angle(self.place(i))
-        found = pointing.solve(self.sun.vector(ahead_ms), aim, self._stops, self._near)
-        self.unreachable = found.status != OK
-        return found if found.status == OK else None
+        pose = pointing.solve(self.sun.vector(ahead_ms), aim, self._stops, self._near)
+        self.unreachable = pose.status != OK
+        return pose if pose.status == OK else None
 
     def reaches(self, points: "list[tuple[float, float, float]]") -> bool:
         """Whether the beam can be sent to all these points now."""
@@ -253,17 +253,17 @@ class Motion:
         """Keep the beam on an aim while time goes on; return False if no pose reaches it."""
         if self._knot_ms <= 0:
             # Goals hold until the next renewal: they are right at its middle.
-            here = self.pose(aim, RENEW_MS // 2)
-            if here is None:
+            pose = self.pose(aim, RENEW_MS // 2)
+            if pose is None:
                 return False
-            self._start[:] = here.angles
+            self._start[:] = pose.angles
             self._slope[0] = self._slope[1] = 0.0
             self._knot_ms = RENEW_MS
-            there = self.pose(aim, RENEW_MS // 2 + KNOT_MS)
-            if there is not None:
-                one, two = [there.angles[i] - self._start[i] for i in (0, 1)]
-                if max(abs(one), abs(two)) <= KNOT_LIMIT:
-                    self._slope[0], self._slope[1] = one / KNOT_MS, two / KNOT_MS
+            later = self.pose(aim, RENEW_MS // 2 + KNOT_MS)
+            if later is not None:
+                primary, secondary = [later.angles[i] - self._start[i] for i in (0, 1)]
+                if max(abs(primary), abs(secondary)) <= KNOT_LIMIT:
+                    self._slope[0], self._slope[1] = primary / KNOT_MS, secondary / KNOT_MS
                     self._knot_ms = KNOT_MS
             self._since_ms = 0
         angles = [self._start[i] + self._slope[i] * self._since_ms for i in (0, 1)]
@@ -292,15 +292,15 @@ class Motion:
         way. A mirror that is held elsewhere, where a person has left it, turns off the aim. Without
         a recent sun, by the angles.
         """
-        one, two = self._offset = self.config.defocus
+        primary, secondary = self._offset = self.config.defocus
         if not self.known or self.sun.since_ms > RECENT_MS:
             return None
-        near, unreachable, kind, found = self._near, self.unreachable, self.kind, None
-        way = self._path[: max(0, self._place)] if kind == APPROACH else []
+        near, unreachable, kind, chosen = self._near, self.unreachable, self.kind, None
+        points = self._path[: max(0, self._place)] if kind == APPROACH else []
         at_standby = self.ready and self._target is self.config.standby
         if kind == STANDBY or (kind == HOLD and at_standby):
-            way = self.way()[:-1]
-        for point in way[::-1]:
+            points = self.way()[:-1]
+        for point in points[::-1]:
             pose = self.pose(point, 0)
             if pose is None:
                 break
@@ -308,24 +308,24 @@ class Motion:
             if max(first, second) > FAR:
                 break
             # The next pose overwrites this one, even where the beam cannot follow.
-            found, self._target, self._offset = list(pose.angles), point, (0.0, 0.0)
-            if first >= one or second >= two or point[2] <= way[0][2]:
+            chosen, self._target, self._offset = list(pose.angles), point, (0.0, 0.0)
+            if first >= primary or second >= secondary or point[2] <= points[0][2]:
                 break
         tracks = kind in (TRACK, SEARCH)
         other = self.config.standby if tracks else self.aim
-        pose = None if other is None or found is not None else self.pose(other, 0)
+        pose = None if other is None or chosen is not None else self.pose(other, 0)
         self.unreachable = unreachable
         if pose is not None:
             first, second = near[0] - pose.angles[0], near[1] - pose.angles[1]
             if not tracks:
-                one, two = math.copysign(one, first), math.copysign(two, second)
+                primary, secondary = math.copysign(primary, first), math.copysign(secondary, second)
             else:
-                if abs(first + one) < abs(first):
-                    one = -one
-                if abs(second + two) < abs(second):
-                    two = -two
-            self._offset = one, two
-        return found
+                if abs(first + primary) < abs(first):
+                    primary = -primary
+                if abs(second + secondary) < abs(second):
+                    secondary = -secondary
+            self._offset = primary, secondary
+        return chosen
 
     # Actions of the state table.
 
@@ -375,18 +375,18 @@ class Motion:
             self.declare((first.low + first.high) // 2, (second.low + second.high) // 2, False)
             self.blind, self._turns = 0, sense
             self.kind = HOLD
-        found = self._turn()
+        down = self._turn()
         self._base, self.kind = self.kind, DEFOCUS
         self._knot_ms = self._renew_ms = 0
         angles = [0.0, 0.0]
         for i in (0, 1):
             drive = self.config.drives[i]
             assert drive is not None
-            here = drive.angle(self.place(i))
-            away = self._away(i, here)
+            angle = drive.angle(self.place(i))
+            away = self._away(i, angle)
             # The other way is twice as far: past the place where the first turn began.
-            angles[i] = away if sense > 0 else 3.0 * here - 2.0 * away
-        self._go_angles(angles if found is None else found, BOTH)
+            angles[i] = away if sense > 0 else 3.0 * angle - 2.0 * away
+        self._go_angles(angles if down is None else down, BOTH)
         self.aside = (self.goal(0), self.goal(1)) if self.known else None
 
     def stow(self) -> None:
@@ -397,16 +397,16 @@ class Motion:
         if self.kind == APPROACH:
             self._path = self._path[: max(0, self._place)][::-1]
         elif self.ready and self.config.standby is not None:
-            way = self.way()[::-1]
+            points = self.way()[::-1]
             if self.kind in (TRACK, SEARCH) and self.aim is not None:
-                way = self._pieces([self.aim] + way)[1:]
+                points = self._pieces([self.aim] + points)[1:]
             elif self.kind == DEFOCUS:
                 # Beside the receiver: down from there, not across it.
                 top = self.config.standby[2]
                 if self._target is not None:
                     top = min(top, self._target[2])
-                way = [point for point in way if point[2] < top]
-            self._path = way
+                points = [point for point in points if point[2] < top]
+            self._path = points
         else:
             self._path = []
         self.kind, self.ready = RETURN, False
@@ -511,15 +511,15 @@ class Motion:
         points = list(config.path)
         if not points:
             # Beside the tower on the ground, half-way to its foot, then the foot.
-            here = config.location if config.location is not None else config.pointing.origin
-            east, north = 0.5 * (standby[0] - here[0]), 0.5 * (standby[1] - here[1])
+            base = config.location if config.location is not None else config.pointing.origin
+            east, north = 0.5 * (standby[0] - base[0]), 0.5 * (standby[1] - base[1])
             sine, cosine = 0.5, 0.866
             aside = (
-                here[0] + cosine * east - sine * north,
-                here[1] + sine * east + cosine * north,
-                here[2],
+                base[0] + cosine * east - sine * north,
+                base[1] + sine * east + cosine * north,
+                base[2],
             )
-            points = [aside, (standby[0], standby[1], here[2])]
+            points = [aside, (standby[0], standby[1], base[2])]
         return self._pieces(points + [standby])
 
     def _pieces(
@@ -528,7 +528,7 @@ class Motion:
         """Return the points, with more between them; see ``PIECE``."""
         pointing = self.config.pointing
         assert pointing is not None
-        found = [points[0]]
+        path = [points[0]]
         for i in range(1, len(points)):
             a, b = points[i - 1], points[i]
             u, v = minus(a, pointing.origin), minus(b, pointing.origin)
@@ -536,16 +536,16 @@ class Motion:
             turn = math.atan2(norm(cross(u, v)), cosine)
             parts = 1 + int(turn / PIECE)
             for k in range(1, parts):
-                way = minus(b, a)
-                found.append(
+                step = minus(b, a)
+                path.append(
                     (
-                        a[0] + way[0] * k / parts,
-                        a[1] + way[1] * k / parts,
-                        a[2] + way[2] * k / parts,
+                        a[0] + step[0] * k / parts,
+                        a[1] + step[1] * k / parts,
+                        a[2] + step[2] * k / parts,
                     )
                 )
-            found.append(b)
-        return found
+            path.append(b)
+        return path
 
     def _on_path(self) -> str:
         """Advance along the path; return an event at its end or where no pose reaches it."""

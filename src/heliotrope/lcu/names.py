@@ -54,13 +54,13 @@ MOTIONS = {
 
 def transitions() -> list[tuple[int, str, int, str]]:
     """Return all transitions: state, event, new state, motion or ""."""
-    found = []
+    rows = []
     for line in states.TABLE.split("\n"):
         if line:
             words = line.split(" ") + [""]
             start, end = states.STATES.index(words[0]), states.STATES.index(words[2])
-            found.append((start, words[1], end, words[3]))
-    return found
+            rows.append((start, words[1], end, words[3]))
+    return rows
 
 
 #: Flags of STATUS, from bit 0 up.

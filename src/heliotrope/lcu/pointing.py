@@ -30,10 +30,10 @@ CLOSE = 0.05
 STOP_SLACK = 1e-6
 
 
-def epsilon(one: float) -> float:
-    """Return the rounding of numbers of the type of ``one`` (1.0)."""
-    step = one
-    while one + 0.5 * step != one:
+def epsilon(number: float) -> float:
+    """Return the rounding of numbers of the type of ``number`` (1.0)."""
+    step = number
+    while number + 0.5 * step != number:
         step = 0.5 * step
     return step
 
@@ -185,10 +185,10 @@ class Pointing:
         if pose.status == DEGENERATE:
             pose.residual = math.pi
             return
-        one, inside_1 = into_stops(math.atan2(turn[0], turn[1]), stops[0][0], stops[0][1], near[0])
-        two, inside_2 = into_stops(math.atan2(turn[2], turn[3]), stops[1][0], stops[1][1], near[1])
+        at_1, inside_1 = into_stops(math.atan2(turn[0], turn[1]), stops[0][0], stops[0][1], near[0])
+        at_2, inside_2 = into_stops(math.atan2(turn[2], turn[3]), stops[1][0], stops[1][1], near[1])
         if inside_1 and inside_2:
-            pose.angles[0], pose.angles[1] = one, two
+            pose.angles[0], pose.angles[1] = at_1, at_2
             pose.residual = self._residual(s, p, turn)
             return
         pose.status, pose.residual = STOPPED, math.pi
@@ -214,17 +214,17 @@ class Pointing:
         p: tuple[float, float, float],
         m: tuple[float, float, float],
     ) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
-        """(bisector of s and the way from m to p, that way, its length); length 0 if none."""
-        way = minus(p, m)
-        distance = norm(way)
+        """(bisector of s and the path from m to p, that path, its length); length 0 if none."""
+        path = minus(p, m)
+        distance = norm(path)
         if not distance > DEGENERATE_LIMIT:
-            return way, way, 0.0
-        way = times(1.0 / distance, way)
-        v = add(s, way)
+            return path, path, 0.0
+        path = times(1.0 / distance, path)
+        v = add(s, path)
         size = norm(v)
         if not size > DEGENERATE_LIMIT:
-            return way, way, 0.0
-        return times(1.0 / size, v), way, distance
+            return path, path, 0.0
+        return times(1.0 / size, v), path, distance
 
     def _direction(
         self, v: tuple[float, float, float], sign: float
@@ -237,14 +237,14 @@ class Pointing:
         # γ²|a × b|² = (|v across a| − h)(|v across a| + h): exact near the axis too.
         square = (radius - height) * (radius + height)
         reached = square >= -4.0 * self.eps * (radius + abs(height) + self.eps)
-        wanted = va
+        goal = va
         if not reached:
             # The nearest direction on the edge has the largest |z·a| on the circle z·b = u·b.
             edge = math.sqrt(max(0.0, 1.0 - self.ub * self.ub) / self.inverse)
-            wanted = self.ab * self.ub
-            wanted += edge if va >= self.ab * self.ub else -edge
-        along_a = (wanted - self.ab * self.ub) * self.inverse
-        along_b = (self.ub - self.ab * wanted) * self.inverse
+            goal = self.ab * self.ub
+            goal += edge if va >= self.ab * self.ub else -edge
+        along_a = (goal - self.ab * self.ub) * self.inverse
+        along_b = (self.ub - self.ab * goal) * self.inverse
         away = sign * math.sqrt(max(0.0, square) * self.inverse)
         sine_2 = along_a * self.sines[0] + away * self.sines[1]
         cosine_2 = along_a * self.cosines[0] + away * self.cosines[1]
@@ -265,7 +265,7 @@ class Pointing:
         m = self.vertex(turn)
         before = math.inf
         for step in range(STEPS):
-            v, way, distance = self._wanted(s, p, m)
+            v, path, distance = self._wanted(s, p, m)
             if distance == 0.0:
                 pose.status = DEGENERATE
                 return turn
@@ -273,8 +273,8 @@ class Pointing:
             new = self.vertex(turn)
             moved = minus(new, m)
             if reached:
-                # The ray leaves parallel to the old way: motion along it misses nothing.
-                moved = across(moved, way)
+                # The ray leaves parallel to the old path: motion along it misses nothing.
+                moved = across(moved, path)
             m = new
             size = norm(moved)
             if size <= self.tolerance:
@@ -291,9 +291,9 @@ class Pointing:
         p: tuple[float, float, float],
         turn: tuple[float, float, float, float],
     ) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
-        """(normal − bisector, way, distance) at a turn."""
-        v, way, distance = self._wanted(s, p, self.vertex(turn))
-        return minus(self.turned(turn, self.normal), v), way, distance
+        """(normal − bisector, path, distance) at a turn."""
+        v, path, distance = self._wanted(s, p, self.vertex(turn))
+        return minus(self.turned(turn, self.normal), v), path, distance
 
     def _residual(
         self,
@@ -333,10 +333,10 @@ class Pointing:
         if axis == 1:
             w = about(self.axis_1, turn[0], turn[1], self.axis_2)
             arm = minus(m, about(self.axis_1, turn[0], turn[1], self.elbow))
-        v, way, distance = self._wanted(s, p, m)
-        change = times(-1.0 / distance, across(cross(w, arm), way))
+        v, path, distance = self._wanted(s, p, m)
+        change = times(-1.0 / distance, across(cross(w, arm), path))
         # |s + t| = 2 v·t for unit vectors.
-        return minus(cross(w, n), times(0.5 / dot(v, way), across(change, v)))
+        return minus(cross(w, n), times(0.5 / dot(v, path), across(change, v)))
 
     def _newton(
         self,
@@ -365,9 +365,9 @@ class Pointing:
                 d00, d11 = h00 + lift, h11 + lift
                 determinant = d00 * d11 - h01 * h01
                 if determinant > 0.0:
-                    one = (h01 * e1 - d11 * e0) / determinant
-                    two = (h01 * e0 - d00 * e1) / determinant
-                    trial = _advanced(turn, one, two)
+                    step_1 = (h01 * e1 - d11 * e0) / determinant
+                    step_2 = (h01 * e0 - d00 * e1) / determinant
+                    trial = _advanced(turn, step_1, step_2)
                     new, _, distance = self._gap(s, p, trial)
                     if distance > 0.0 and dot(new, new) < cost:
                         turn, gap, cost = trial, new, dot(new, new)
@@ -401,11 +401,11 @@ class Pointing:
                 return
             if axis == 0:
                 back = about(self.axis_1, -math.sin(held), math.cos(held), v)
-                found = turn_between(self.axis_2, self.normal, back)
+                turned = turn_between(self.axis_2, self.normal, back)
             else:
                 u = about(self.axis_2, math.sin(held), math.cos(held), self.normal)
-                found = turn_between(self.axis_1, u, v)
-            before, free = free, into_stops(found, low, high, near[other])[0]
+                turned = turn_between(self.axis_1, u, v)
+            before, free = free, into_stops(turned, low, high, near[other])[0]
             if abs(free - before) <= 4.0 * self.eps:
                 break
         angles = (held, free) if axis == 0 else (free, held)

@@ -54,7 +54,7 @@ def counted(epoch: int, count: int) -> bytes:
 
 
 def fingerprint(sha256: "Hash", pads: "Pads") -> int:
-    """Return a number by which a key is recognised and which tells nothing about it; 0 is none."""
+    """Return a number that identifies a key and reveals nothing about it; 0 is none."""
     return int(struct.unpack("<I", tag(sha256, pads, b"id")[:4])[0]) or 1
 
 
@@ -105,7 +105,7 @@ class BusKeys:
         self._draw()
 
     def with_key(self, payload: bytes) -> bytes:
-        """Return what to store after a SET_BUS_KEY.
+        """Return the record to store after a SET_BUS_KEY.
 
         A new key comes before the present one, the present one again ends an old one, and zeros
         end all.

@@ -59,7 +59,7 @@ class Axis:
     rate, acceleration
         steps/s, steps/s².
     backlash
-        Steps by which a goal approached from above is passed, so that it is always
+        Steps past a goal that is approached from above, so that it is always
         reached from below.
     slot_ms
         Length of a slot.
@@ -94,7 +94,7 @@ class Axis:
         self.braking = False
 
     def still(self) -> bool:
-        """Whether the axis stands at its goal."""
+        """Whether the axis is at its goal."""
         return self.speed == 0 and self.count == self.leg == self.goal
 
     def aim(self, goal: int) -> bool:
@@ -137,8 +137,8 @@ class Axis:
         if held or self.braking or distance < stopping(slower, self.change):
             self.speed = slower
         else:
-            wanted = min(self.speed + self.change, self.top, fastest(distance, self.change))
-            self.speed = max(slower, wanted)
+            faster = min(self.speed + self.change, self.top, fastest(distance, self.change))
+            self.speed = max(slower, faster)
         moved = self.phase + self.speed
         steps = moved // SCALE
         self.phase = moved % SCALE

@@ -138,7 +138,7 @@ def _single(codes: str) -> str:
 
 
 def _refusal(code: str, value: "Any") -> str:
-    """Return why a value does not fit a code, or ""."""
+    """Return the reason for which a value does not fit a code, or ""."""
     if code == "s":
         return "" if isinstance(value, (bytes, bytearray)) else f"{value!r} is not bytes"
     if code in RANGES:

@@ -396,7 +396,7 @@ async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]
             task.cancel()
 
 
-class Runs(Protocol):
+class Runnable(Protocol):
     """Something that is run and closed: a `Link`, a `Bus`, a server."""
 
     async def run(self) -> None:
@@ -409,7 +409,7 @@ class Runs(Protocol):
 
 
 @contextlib.asynccontextmanager
-async def running(*parts: Runs) -> AsyncIterator[None]:
+async def running(*parts: Runnable) -> AsyncIterator[None]:
     """Run links, buses and servers during a block, and close them at its end."""
     failure: Exception | None = None
     async with asyncio.TaskGroup() as group:

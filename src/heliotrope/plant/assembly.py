@@ -33,7 +33,7 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.pictures import KeptCamera
-from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.ports import Cameras, Ports
 from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
@@ -45,7 +45,7 @@ from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import CONDITIONS, Severity, alarms, differences, limited, numbers
-from heliotrope.store.records import StoreError
+from heliotrope.store.records import PlannedVisit, StoreError
 
 #: A calibration that removes the errors of a quick installation.
 CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto")
@@ -378,14 +378,14 @@ class _WhereAwake:
 
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
-    ) -> Planned | None:
+    ) -> PlannedVisit | None:
         awake = self._cameras.awake(target)
         self._asleep = "" if awake else f"the camera of target {target} is silent"
         if not awake:
             return None
         return self._schedule.next(target, ready, beside)
 
-    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[PlannedVisit]:
         return self._schedule.plan(ready, limit)
 
     def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> Prospect | None:

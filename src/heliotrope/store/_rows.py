@@ -50,9 +50,9 @@ def replace(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
         return
     kind = postgresql if connection.dialect.name == "postgresql" else sqlite
     statement = kind.insert(table)
-    keys = [column.name for column in table.primary_key]
-    rest = {name: statement.excluded[name] for name in rows[0] if name not in keys}
-    connection.execute(statement.on_conflict_do_update(index_elements=keys, set_=rest), list(rows))
+    rest = {c.name: statement.excluded[c.key] for c in table.columns if not c.primary_key}
+    change = statement.on_conflict_do_update(index_elements=list(table.primary_key), set_=rest)
+    connection.execute(change, list(rows))
 
 
 def row_of(table: Table, record: object, **others: Any) -> Row:

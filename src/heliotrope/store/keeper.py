@@ -8,7 +8,7 @@ open for writing.
 import asyncio
 import json
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +18,7 @@ from sqlalchemy import Connection, Select, Table, and_, delete, func, select, up
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.safety import Severity
+from heliotrope.safety import Alarm, Severity
 from heliotrope.store import _rows as rows
 from heliotrope.store import chain, tables
 from heliotrope.store.database import Database, make_private
@@ -28,11 +28,12 @@ from heliotrope.store.records import (
     AlarmEntry,
     CampaignEntry,
     Event,
+    Fact,
     FlightEntry,
     KeptSightings,
     LearningEntry,
     Lockout,
-    OutlookEntry,
+    Outlook,
     PlannedVisit,
     StoreError,
     TimetableRecord,
@@ -42,6 +43,15 @@ from heliotrope.store.writer import Work, Writer
 
 T = TypeVar("T")
 _NUMBERED = (tables.sighting, tables.visit, tables.hold, tables.event, tables.alarm)
+#: Table of each kind of fact, and how its row gets there.
+_FACTS: dict[type[Fact], tuple[Table, Callable[[Connection, Table, list[rows.Row]], object]]] = {
+    VisitEntry: (tables.visit, rows.insert),
+    CampaignEntry: (tables.campaign, rows.replace),
+    FlightEntry: (tables.flight, rows.insert),
+    LearningEntry: (tables.learning, rows.insert),
+    TimetableRecord: (tables.timetable, rows.replace),
+    Outlook: (tables.outlook, rows.replace),
+}
 #: With more names than this a query reads all rows, which are then filtered.
 _MANY = 500
 #: Row of the table ``about`` with the numbers of the safety table in force.
@@ -259,15 +269,16 @@ class Keeper:
 
     # -- measurements and their plan -----------------------------------------------------
 
-    def record_visit(self, visit: VisitEntry) -> None:
-        """Record a measurement and its outcome."""
-        number = self._take_numbers(tables.visit)
-        row = rows.row_of(tables.visit, visit, number=number)
-        self.writer.put(lambda c: rows.insert(c, tables.visit, [row]))
+    def record(self, fact: Fact) -> None:
+        """Record a fact; see `Records`."""
+        table, write = _FACTS[type(fact)]
+        number = {"number": self._take_numbers(table)} if table in _NUMBERED else {}
+        row = rows.row_of(table, fact, **number)
+        self.writer.put(lambda c: write(c, table, [row]))
 
     def record_plan(self, plan: Sequence[PlannedVisit]) -> None:
         """Record the plan of the schedule; it replaces the plan before."""
-        in_order = enumerate(sorted(plan, key=lambda visit: visit.due))
+        in_order = enumerate(sorted(plan, key=lambda visit: visit.at))
         made = [rows.row_of(tables.plan, visit, place=place) for place, visit in in_order]
 
         def work(connection: Connection) -> None:
@@ -276,24 +287,9 @@ class Keeper:
 
         self.writer.put(work)
 
-    def record_campaign(self, campaign: CampaignEntry) -> None:
-        """Record a campaign; it replaces the one of the same name."""
-        row = rows.row_of(tables.campaign, campaign)
-        self.writer.put(lambda c: rows.replace(c, tables.campaign, [row]))
-
-    def record_flight(self, flight: FlightEntry) -> None:
-        """Record a flight that was taken."""
-        row = rows.row_of(tables.flight, flight)
-        self.writer.put(lambda c: rows.insert(c, tables.flight, [row]))
-
     def flights(self) -> list[FlightEntry]:
         """Return the flights, the first taken first."""
         return self._records(FlightEntry, select(tables.flight).order_by(tables.flight.c.at))
-
-    def record_learning(self, entry: LearningEntry) -> None:
-        """Record a group's learned hyperparameters."""
-        row = rows.row_of(tables.learning, entry)
-        self.writer.put(lambda c: rows.insert(c, tables.learning, [row]))
 
     def learnings(self) -> list[LearningEntry]:
         """Return the latest learned hyperparameters of each group."""
@@ -302,27 +298,17 @@ class Keeper:
         )
         return list({entry.group: entry for entry in entries}.values())
 
-    def record_timetable(self, timetable: TimetableRecord) -> None:
-        """Record a timetable; it replaces one of the same time."""
-        row = rows.row_of(tables.timetable, timetable)
-        self.writer.put(lambda c: rows.replace(c, tables.timetable, [row]))
-
     def timetables(self) -> list[TimetableRecord]:
         """Return the timetables that persons have put in force, the last first."""
         order = tables.timetable.c.at.desc()
         return self._records(TimetableRecord, select(tables.timetable).order_by(order))
 
-    def record_outlook(self, outlook: OutlookEntry) -> None:
-        """Record a prediction; it replaces one made at the same time."""
-        row = rows.row_of(tables.outlook, outlook)
-        self.writer.put(lambda c: rows.replace(c, tables.outlook, [row]))
-
-    def outlooks(self, since: float) -> list[OutlookEntry]:
+    def outlooks(self, since: float) -> list[Outlook]:
         """Return the predictions made since a time, oldest first."""
         o = tables.outlook.c
-        return self._records(
-            OutlookEntry, select(tables.outlook).where(o.at >= since).order_by(o.at)
-        )
+        query = select(o.made, o.document).where(o.made >= since).order_by(o.made)
+        with self.database.reading() as connection:
+            return [Outlook.of(*row) for row in connection.execute(query)]
 
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
         """Return the measurements, the latest first."""
@@ -358,31 +344,22 @@ class Keeper:
             self.writer.put(lambda c: chain.add_event(c, row))
             self._numbers[tables.event.name] = number
 
-    def record_alarm(
-        self,
-        condition: str,
-        subject: str,
-        severity: Severity,
-        text: str,
-        at: float,
-        *,
-        active: bool,
-    ) -> None:
-        """Record that an alarm stands, or (not active) that it is over.
-
-        A severity that is not known counts as an alarm: none is lost because of its severity.
-        """
-        severity = Severity.read(severity)
+    def record_alarm(self, alarm: Alarm, at: float) -> None:
+        """Record that an alarm stands, or (not active) that it is over; see `Records`."""
+        severity = Severity.read(alarm.severity)
         number = self._take_numbers(tables.alarm)
-        entry = AlarmEntry(condition, subject, severity, text, at, number=number)
+        entry = AlarmEntry(alarm.condition, alarm.subject, severity, alarm.text, at, number=number)
         row = rows.row_of(tables.alarm, entry)
         a = tables.alarm.c
-        stands = and_(a.condition == condition, a.subject == subject, a.cleared.is_(None))
-        change = {"severity": severity, "text": text} if active else {"cleared": at}
+        subject = and_(a.condition == alarm.condition, a.subject == alarm.subject)
+        now = {"severity": severity, "text": alarm.text}
+        change = now if alarm.active else {"cleared": at}
 
         def work(connection: Connection) -> None:
-            changed = connection.execute(update(tables.alarm).where(stands).values(change))
-            if active and not changed.rowcount:
+            changed = connection.execute(
+                update(tables.alarm).where(subject, a.cleared.is_(None)).values(change)
+            )
+            if alarm.active and not changed.rowcount:
                 rows.insert(connection, tables.alarm, [row])
 
         self.writer.put(work)
@@ -428,7 +405,7 @@ class Keeper:
         def work(connection: Connection) -> None:
             chain.forget_events(connection, before)
             connection.execute(delete(tables.alarm).where(over))
-            connection.execute(delete(tables.outlook).where(tables.outlook.c.at < before))
+            connection.execute(delete(tables.outlook).where(tables.outlook.c.made < before))
 
         self.writer.put(work)
 

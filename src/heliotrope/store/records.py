@@ -10,9 +10,10 @@ are sure to survive a crash.
     └── StoreError            a record that could not be kept, or a store that cannot be used
 """
 
+import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Protocol
@@ -24,7 +25,7 @@ from heliotrope.calibration.record import (
 )
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import HeliotropeError
-from heliotrope.safety import Severity
+from heliotrope.safety import Alarm, Severity
 
 SEVERITIES = tuple(Severity)
 
@@ -169,23 +170,25 @@ def _time(at: float) -> str:
 
 @dataclass(frozen=True)
 class PlannedVisit:
-    """A measurement that the schedule plans.
+    """A visit that the schedule plans.
 
     Attributes
     ----------
-    heliostat, target, due
-        Names, and POSIX s.
+    heliostat, target
+        Names.
+    at
+        Expected beginning, POSIX s.
     gain
-        Gain that the schedule expects, in its own unit.
-    note
-        Reason for measuring now.
+        Expected reduction of the tracking error over the year, rad; NaN if unknown.
+    reason
+        Why it is due, for people.
     """
 
     heliostat: str
     target: str
-    due: float
-    gain: float = float("nan")
-    note: str = ""
+    at: float
+    gain: float = math.nan
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -334,19 +337,61 @@ class TimetableRecord:
 
 
 @dataclass(frozen=True)
-class OutlookEntry:
-    """A prediction of the field's errors that the plant has made.
+class FieldPoint:
+    """Errors of all heliostats at one moment, calibrated or not.
 
     Attributes
     ----------
     at
-        When it was made, POSIX s.
-    document
-        The prediction as JSON; see `plant.operations.outlook`.
+        POSIX s.
+    median, percentile_90
+        Percentiles of their tracking errors, RMS over the suns of the year, rad.
     """
 
     at: float
-    document: str
+    median: float
+    percentile_90: float
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """A prediction for the rest of a day, or until the goal is reached.
+
+    Attributes
+    ----------
+    made
+        POSIX s.
+    heliostats
+        Number of heliostats that may be measured; the others keep their errors.
+    goal
+        Tracking error that 90 % of the heliostats shall not exceed, rad.
+    reached
+        When they do not, POSIX s; None if not on this day.
+    points
+        The predicted curve, oldest first; the first is what was known when it was made.
+    text
+        The outcome for people.
+    """
+
+    made: float
+    heliostats: int
+    goal: float
+    reached: float | None
+    points: tuple[FieldPoint, ...]
+    text: str
+
+    @property
+    def document(self) -> str:
+        """The prediction as JSON, without the time when it was made."""
+        own = asdict(self)
+        del own["made"]
+        return json.dumps(own | {"points": [astuple(point) for point in self.points]})
+
+    @classmethod
+    def of(cls, made: float, document: str) -> "Outlook":
+        """Return the prediction made at a time, from its document."""
+        own = json.loads(document)
+        return cls(made, **own | {"points": tuple(FieldPoint(*point) for point in own["points"])})
 
 
 @dataclass(frozen=True)
@@ -363,6 +408,10 @@ class AuditEntry:
     note: str = ""
     result: str = ""
     finished: str = ""
+
+
+#: A record that is one row of its own table.
+Fact = VisitEntry | CampaignEntry | FlightEntry | LearningEntry | TimetableRecord | Outlook
 
 
 class Records(Protocol):
@@ -410,49 +459,20 @@ class Records(Protocol):
         """Record a calibration; its version must be above the recorded ones of the heliostat."""
         ...
 
-    def record_visit(self, visit: VisitEntry) -> None:
-        """Record a measurement and its outcome."""
+    def record(self, fact: Fact) -> None:
+        """Record a fact; a campaign, a timetable or an outlook replaces the one of its key."""
         ...
 
     def record_plan(self, plan: Sequence[PlannedVisit]) -> None:
         """Record the plan of the schedule; it replaces the plan before."""
         ...
 
-    def record_campaign(self, campaign: CampaignEntry) -> None:
-        """Record a campaign; it replaces the one of the same name."""
-        ...
-
-    def record_flight(self, flight: FlightEntry) -> None:
-        """Record a flight that was taken."""
-        ...
-
-    def record_learning(self, entry: LearningEntry) -> None:
-        """Record a group's learned hyperparameters."""
-        ...
-
-    def record_timetable(self, timetable: TimetableRecord) -> None:
-        """Record a timetable; it replaces one of the same time."""
-        ...
-
-    def record_outlook(self, outlook: OutlookEntry) -> None:
-        """Record a prediction; it replaces one made at the same time."""
-        ...
-
     def record_event(self, event: Event) -> None:
         """Record an event."""
         ...
 
-    def record_alarm(
-        self,
-        condition: str,
-        subject: str,
-        severity: Severity,
-        text: str,
-        at: float,
-        *,
-        active: bool,
-    ) -> None:
-        """Record that an alarm stands, or (not active) that it is over.
+    def record_alarm(self, alarm: Alarm, at: float) -> None:
+        """Record that an alarm stands since a time, POSIX s, or (not active) that it is over.
 
         A severity that is not known counts as an alarm: none is lost because of its severity.
         """
@@ -545,7 +565,7 @@ class Records(Protocol):
         """Return the timetables that persons have put in force, the last first."""
         ...
 
-    def outlooks(self, since: float) -> list[OutlookEntry]:
+    def outlooks(self, since: float) -> list[Outlook]:
         """Return the predictions made since a time, oldest first."""
         ...
 

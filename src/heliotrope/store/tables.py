@@ -302,7 +302,7 @@ timetable = Table(
 outlook = Table(
     "outlook",
     metadata,
-    Column("at", Double, primary_key=True),
+    Column("at", Double, primary_key=True, key="made"),
     _text("document"),
 )
 
@@ -340,9 +340,9 @@ plan = Table(
     Column("place", Integer, primary_key=True, autoincrement=False),
     _text("heliostat"),
     _text("target"),
-    _real("due", needed=True),
+    Column("due", Double, nullable=False, key="at"),
     _figure_of("gain"),
-    _text("note"),
+    Column("note", Text, nullable=False, key="reason"),
 )
 
 hold = Table(

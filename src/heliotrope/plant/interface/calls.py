@@ -35,7 +35,7 @@ from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.zero import lock_position, zero
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.orders.tickets import Ticket
-from heliotrope.store.records import Lockout
+from heliotrope.store.records import Lockout, PlannedVisit
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
@@ -480,7 +480,7 @@ def calibrate(desk: Desk, who: Person, order: orders.OneCalibration) -> TicketSt
 
 
 @_call("GET schedule", "calibration", fresh=FRESH)
-def schedule(desk: Desk, order: orders.SomeVisits) -> tuple[views.Planned, ...]:
+def schedule(desk: Desk, order: orders.SomeVisits) -> tuple[PlannedVisit, ...]:
     """Return the planned next measurements."""
     return desk.operations.automatic.plan(order.limit)
 

@@ -39,14 +39,14 @@ from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.timetable import Timetable
-from heliotrope.plant.operations.views import CalibrationView, Planned
+from heliotrope.plant.operations.views import CalibrationView
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
-from heliotrope.store.records import Kind, Records
+from heliotrope.store.records import Kind, PlannedVisit, Records
 
 #: The person under whose name it commands.
 AUTOMATIC = Person("automatic control", Role.ENGINEER)
@@ -492,7 +492,7 @@ class AutomaticControl:
             "" if self._calibrating is None else self._calibrating.choice,
         )
 
-    def plan(self, limit: int) -> tuple[Planned, ...]:
+    def plan(self, limit: int) -> tuple[PlannedVisit, ...]:
         """Return the coming visits."""
         return () if self._calibrating is None else self._calibrating.plan(self._ready(), limit)
 

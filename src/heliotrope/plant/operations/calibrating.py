@@ -20,11 +20,12 @@ from heliotrope.plant.operations.foresight import Foreseeing
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.pictures import Pictures
-from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
+from heliotrope.plant.operations.views import CalibrationEntry, Running
 from heliotrope.plant.orders.authority import Person, RefusedError, TakenOutError
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 from heliotrope.plant.visits.coded_cycle import CodedCycle
 from heliotrope.safety import alarms
+from heliotrope.store.records import PlannedVisit
 
 #: Visits to a target that failed through no fault of a heliostat: the camera, clouds, refusals.
 PLACES = RetryLaw(
@@ -66,14 +67,14 @@ class Scheduling(Foreseeing, Protocol):
 
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
-    ) -> Planned | None:
+    ) -> PlannedVisit | None:
         """Return the next of the ready heliostats (N,) for a free target, None if none is due.
 
         With ``beside`` it goes there together with those returned before.
         """
         ...
 
-    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[PlannedVisit]:
         """Return the coming visits."""
         ...
 
@@ -252,7 +253,7 @@ class Calibrating:
         """Why the last visit was chosen, or why there was none; "" before the first."""
         return self._scheduler.reason
 
-    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> tuple[Planned, ...]:
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> tuple[PlannedVisit, ...]:
         """Return the coming visits of the ready heliostats, (N,)."""
         return tuple(self._scheduler.plan(ready, limit))
 

@@ -13,15 +13,15 @@ from heliotrope.lcu import states
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibration_book import CalibrationBook
-from heliotrope.plant.operations.views import Planned
 from heliotrope.plant.visits.calibration_cycle import CycleResult
 from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Alarm, alarms
+from heliotrope.store.records import PlannedVisit
 
 Mask = npt.NDArray[np.bool_]
 #: Returns the next of the ready heliostats (N,) for a target; with True others go there with it.
-Next = Callable[[str, Mask, bool], Planned | None]
+Next = Callable[[str, Mask, bool], PlannedVisit | None]
 
 #: Share of the largest expected error that a heliostat may have which automatic control sends: the
 #: sun moves on until the visit begins.

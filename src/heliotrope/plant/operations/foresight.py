@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.keeping import Keeping
-from heliotrope.plant.operations.outlook import FieldPoint, Outlook, day_of
+from heliotrope.plant.operations.solar_day import day_of
 from heliotrope.plant.workers import Worker
-from heliotrope.store.records import OutlookEntry
+from heliotrope.store.records import FieldPoint, Outlook
 
 #: Time between points of the curve that comes true, s, and number of points that are held.
 POINT_EVERY, _POINTS = 60.0, 1500
@@ -93,10 +93,10 @@ class Foresight:
     def recall(self) -> None:
         """Take up the predictions of this day that the store has kept."""
         now = self._utc()
-        kept = [Outlook.of(entry) for entry in self._keeping.outlooks(now - _DAY)]
-        mine = [one for one in kept if self._day(one.made) == self._day(now) and one.made <= now]
+        kept = self._keeping.outlooks(now - _DAY)
+        mine = [o for o in kept if self._day(o.made) == self._day(now) and o.made <= now]
         # The first point of each is what had come true by then.
-        self.points.extend(one.points[0] for one in mine)
+        self.points.extend(outlook.points[0] for outlook in mine)
         self.outlooks = tuple(dict.fromkeys(mine[:1] + mine[-1:]))
 
     async def look(
@@ -120,9 +120,9 @@ class Foresight:
             return
         made = await self._worker(prospect.outlook)
         if made is not None:
-            today = [one for one in self.outlooks if self._day(one.made) == self._day(made.made)]
+            today = [o for o in self.outlooks if self._day(o.made) == self._day(made.made)]
             self.outlooks = (*today[:1], made)
-            self._keeping.keep_outlook(OutlookEntry(made.made, made.document()))
+            self._keeping.record(made)
 
     def _due(self) -> bool:
         now = self._utc()

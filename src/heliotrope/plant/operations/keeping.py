@@ -14,12 +14,13 @@ from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.field.flights import TakenFlight
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.store.records import (
+    Fact,
     FlightEntry,
     KeptSightings,
     Kind,
     LearningEntry,
     Lockout,
-    OutlookEntry,
+    Outlook,
     Records,
     StoreError,
     TimetableRecord,
@@ -113,48 +114,30 @@ class Keeping:
         """
         if self._records is None:
             return np.zeros(len(flight.sightings), np.int64)
-        self._records.record_flight(entry)
+        self._records.record(entry)
         return self._records.record_sightings(
             flight.heliostats, flight.sightings, kind="drone", campaign=flight.name
         )
 
-    def learnings(self) -> list[LearningEntry]:
-        """Return what was learnt last of each group."""
-        return [] if self._records is None else self._records.learnings()
-
-    def keep_learning(self, entry: LearningEntry) -> None:
-        """Keep what was learnt of a group."""
+    def record(self, fact: Fact) -> None:
+        """Keep a fact; `lost` says why one could not be kept."""
         if self._records is None:
             return
         try:
-            self._records.record_learning(entry)
+            self._records.record(fact)
         except StoreError as error:
             self.lost = str(error)
+
+    def learnings(self) -> list[LearningEntry]:
+        """Return what was learnt last of each group."""
+        return [] if self._records is None else self._records.learnings()
 
     def timetable(self) -> TimetableRecord | None:
         """Return the timetable that a person has put in force last; None: nobody has."""
         kept = [] if self._records is None else self._records.timetables()
         return kept[0] if kept else None
 
-    def keep_timetable(self, timetable: TimetableRecord) -> None:
-        """Keep a timetable that a person has put in force."""
-        if self._records is None:
-            return
-        try:
-            self._records.record_timetable(timetable)
-        except StoreError as error:
-            self.lost = str(error)
-
-    def keep_outlook(self, outlook: OutlookEntry) -> None:
-        """Keep a prediction of the field's errors."""
-        if self._records is None:
-            return
-        try:
-            self._records.record_outlook(outlook)
-        except StoreError as error:
-            self.lost = str(error)
-
-    def outlooks(self, since: float) -> list[OutlookEntry]:
+    def outlooks(self, since: float) -> list[Outlook]:
         """Return the predictions made since a time, oldest first."""
         return [] if self._records is None else self._records.outlooks(since)
 
@@ -204,7 +187,7 @@ class Keeping:
             version=entry.version,
         )
         try:
-            self._records.record_visit(visit)
+            self._records.record(visit)
             seen = self._beliefs.seen(entry.heliostat)
             if seen is None or (seen.identities > 0).all():
                 self.lost = ""

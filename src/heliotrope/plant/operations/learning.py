@@ -49,9 +49,9 @@ class Learner(Protocol):
 
 @dataclass
 class _Group:
-    """How it stands with one group."""
+    """What is in force for one group (version 0: the defaults), and how the last attempt ended."""
 
-    entry: LearningEntry | None = None
+    entry: LearningEntry
     said: str = "the defaults are in force: nothing was learnt yet"
     #: Sightings known at the last attempt.
     known: int = -1
@@ -83,7 +83,10 @@ class Learning:
     ) -> None:
         self._plant, self._log, self._keeping = plant, log, keeping
         self._model, self._learner, self._nightly = model, learner, person
-        self._groups = {name: _Group() for name in plant.design.groups}
+        self._groups = {
+            name: _Group(LearningEntry(name, 0, math.nan, "", 0, 0, math.nan, ""))
+            for name in plant.design.groups
+        }
         self._asked: dict[str, Person] = {}
         self._running, self._tried = "", -math.inf
 
@@ -125,12 +128,12 @@ class Learning:
             said = f"waits to be learnt; {said}"
         return LearningView(
             name,
-            0 if entry is None else entry.version,
-            math.nan if entry is None else entry.at,
-            "" if entry is None else entry.person,
-            0 if entry is None else entry.heliostats,
-            0 if entry is None else entry.sightings,
-            math.nan if entry is None else entry.gain,
+            entry.version,
+            entry.at,
+            entry.person,
+            entry.heliostats,
+            entry.sightings,
+            entry.gain,
             described(self._in_force(name)),
             said,
         )
@@ -170,8 +173,8 @@ class Learning:
         try:
             found = await learner.learn(task)
         except HeliotropeError as error:
-            kept = "the defaults stay" if group.entry is None else f"version {group.entry.version} "
-            kept += "" if group.entry is None else "stays"
+            version = group.entry.version
+            kept = f"version {version} stays" if version else "the defaults stay"
             group.said = f"nothing new: {error}; {kept} in force"
         else:
             group.said = self._judged(name, group, person, found)
@@ -183,11 +186,10 @@ class Learning:
         origin = f"{found.sightings:,} photographs of {found.heliostats} heliostats"
         if not found.gain > 0.0:
             return f"{origin} are foretold no better by anything new; nothing changed"
-        last = group.entry
         document = {"model": self._names_of(name), "hyper": document_of(found.hyper)}
         entry = LearningEntry(
             name,
-            1 if last is None else last.version + 1,
+            group.entry.version + 1,
             self._utc(),
             person.name,
             found.heliostats,
@@ -196,7 +198,7 @@ class Learning:
             json.dumps(document),
         )
         self._adopt(entry, found.hyper)
-        self._keeping.keep_learning(entry)
+        self._keeping.record(entry)
         said = f"version {entry.version}, from {origin}: {described(found.hyper)}"
         self._plant.note(person, "LEARNT", f"group {name}: {said}")
         return f"{said}; a photograph's log density rose by {found.gain:.2f}"

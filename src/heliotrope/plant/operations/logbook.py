@@ -101,31 +101,14 @@ class Logbook:
         count = (known.count if known is not None else 0) + new
         by = known.acknowledged_by if known is not None and not new else ""
         at = self._now() if new or known is None else known.at
-        self._alarms[key] = AlarmRow(
-            at,
-            alarm.condition,
-            alarm.subject,
-            alarm.severity,
-            alarm.text,
-            alarm.active,
-            by,
-            max(count, 1),
-        )
+        self._alarms[key] = AlarmRow(**vars(alarm), at=at, acknowledged_by=by, count=max(count, 1))
         if new or (known is not None and known.active != alarm.active):
             over = "" if alarm.active else " (over)"
             self.event("alarm", alarm.subject, f"{alarm.condition}: {alarm.text}{over}")
             if self.forward is not None:
                 self.forward(alarm)
             if self._records is not None:
-                self._keep(
-                    self._records.record_alarm,
-                    alarm.condition,
-                    alarm.subject,
-                    alarm.severity,
-                    alarm.text,
-                    self._now(),
-                    active=alarm.active,
-                )
+                self._keep(self._records.record_alarm, alarm, self._now())
 
     def event(self, kind: str, who: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Take an event; see `EventRow`."""
@@ -134,10 +117,10 @@ class Logbook:
             line = f"{who}: {text}" if who else text
             self._keep(self._records.record_event, Event(self._now(), kind, line, severity))
 
-    def _keep(self, keep: Any, *values: Any, **named: Any) -> None:
+    def _keep(self, keep: Any, *values: Any) -> None:
         """Keep a record; one that cannot be kept raises an alarm and stops nothing."""
         try:
-            keep(*values, **named)
+            keep(*values)
         except StoreError as error:
             self.take_alarm(alarms.RECORDS.raised(problem=error))
         except HeliotropeError as error:

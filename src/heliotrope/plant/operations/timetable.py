@@ -79,7 +79,7 @@ class Timetable:
         self._check(made)
         document = "" if entries is None else json.dumps([entry.document for entry in made])
         self._entries, self._turns = made, {}
-        self._keeping.keep_timetable(TimetableRecord(self._now(), person.name, document))
+        self._keeping.record(TimetableRecord(self._now(), person.name, document))
         names = ", ".join(entry.name for entry in made) or "empty"
         origin = " (that of the plant file)" if entries is None else ""
         self._log.event("calibration", person.name, f"timetable{origin}: {names}")

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.emergency import Call
-from heliotrope.plant.operations.outlook import FieldPoint, Outlook
-from heliotrope.safety import Severity
+from heliotrope.safety import Alarm
+from heliotrope.store.records import FieldPoint, Outlook, PlannedVisit
 
 #: State shown for a row older than its limit, whose other values do not count.
 STALE_STATE = 255
@@ -112,29 +112,6 @@ class SightingView:
 
 
 @dataclass(frozen=True)
-class Planned:
-    """A planned visit.
-
-    Attributes
-    ----------
-    heliostat, target
-        Names.
-    at
-        Expected beginning, POSIX s.
-    gain
-        Expected reduction of the tracking error over the year, rad; NaN if unknown.
-    reason
-        The same for people.
-    """
-
-    heliostat: str
-    target: str
-    at: float
-    gain: float
-    reason: str = ""
-
-
-@dataclass(frozen=True)
 class HeliostatView:
     """One heliostat in detail.
 
@@ -200,7 +177,7 @@ class HeliostatView:
     truth_error: float
     history: tuple[SightingView, ...]
     results: tuple["CalibrationEntry", ...]
-    planned: Planned | None
+    planned: PlannedVisit | None
     hold: str
     locked: str
 
@@ -257,29 +234,20 @@ class ClusterRow:
 
 
 @dataclass(frozen=True)
-class AlarmRow:
-    """One alarm: the latest state of a condition of a subject.
+class AlarmRow(Alarm):
+    """The latest state of a condition of a subject.
 
     Attributes
     ----------
     at
         When it was raised, POSIX s.
-    condition, subject, severity, text
-        As in `links.messages.Alarm`.
-    active
-        Whether it is still active.
     acknowledged_by
         Person who has acknowledged it, "" if nobody has.
     count
         Number of times it was raised.
     """
 
-    at: float
-    condition: str
-    subject: str
-    severity: Severity
-    text: str
-    active: bool
+    at: float = field(kw_only=True)
     acknowledged_by: str = ""
     count: int = 1
 

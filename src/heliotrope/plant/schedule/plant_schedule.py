@@ -13,12 +13,13 @@ import numpy.typing as npt
 
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.schedule.choice import Assignment
 from heliotrope.plant.schedule.prospect import FieldProspect, ReceiverVisitTime
 from heliotrope.plant.schedule.scheduler import Scheduler, Visited
 from heliotrope.plant.schedule.settings import Settings, Weather
 from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.store.records import PlannedVisit
 
 #: Age at which a plan is replaced, s, and how far it looks ahead.
 REPLAN, HORIZON = 120.0, timedelta(hours=16)
@@ -68,8 +69,8 @@ class PlantSchedule:
     def __init__(self, plant: PlantController, scheduler: Scheduler) -> None:
         self._plant, self.scheduler = plant, scheduler
         self.weather = Weather()
-        self._plan: tuple[Planned, ...] = ()
-        self._draft: list[Planned] = []
+        self._plan: tuple[PlannedVisit, ...] = ()
+        self._draft: list[PlannedVisit] = []
         self._coming: Iterator[Assignment | None] | None = None
         self._made = -np.inf
         #: Heliostats that go to a target, by target.
@@ -80,7 +81,7 @@ class PlantSchedule:
 
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
-    ) -> Planned | None:
+    ) -> PlannedVisit | None:
         """Return the next of the ready heliostats (N,) for a free target, None if none is due.
 
         With ``beside`` it goes there together with those returned before.
@@ -108,7 +109,7 @@ class PlantSchedule:
         """Why the last choice was made, or why there was none; "" before the first."""
         return self.scheduler.reason
 
-    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[PlannedVisit]:
         """Return the coming visits; a new plan grows at each call while the old one is shown."""
         now = self._plant.now()
         if self._coming is None and now - self._made >= REPLAN:
@@ -150,9 +151,9 @@ class PlantSchedule:
         return _Ready(state, counts)
 
 
-def _planned(assignment: Assignment) -> Planned:
+def _planned(assignment: Assignment) -> PlannedVisit:
     # Pages show errors of the normal, half of those of the beam.
-    return Planned(
+    return PlannedVisit(
         assignment.heliostat,
         assignment.target,
         assignment.at,

@@ -26,8 +26,9 @@ from heliotrope.errors import InputError
 from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.plant.operations.outlook import FieldPoint, Outlook, end_of_day
+from heliotrope.plant.operations.solar_day import end_of_day
 from heliotrope.plant.schedule.settings import Settings
+from heliotrope.store.records import FieldPoint, Outlook
 from heliotrope.sun import Site
 
 #: Least and longest interval of the predicted curve, s.

@@ -23,13 +23,14 @@ from heliotrope.plant.assembly import CYCLE
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations import AutomaticSettings, Logbook, Operations
-from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
 from heliotrope.plant.schedule.scheduler import VISITS, Scheduler
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleSettings, JointCycle
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Alarm
 from heliotrope.store.keeper import Keeper
+from heliotrope.store.records import PlannedVisit
 from heliotrope.twin.cameras import FieldSnapshot
 from heliotrope.twin.world.photographs import LyingCamera
 
@@ -86,7 +87,7 @@ class _Rounds:
 
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
-    ) -> Planned | None:
+    ) -> PlannedVisit | None:
         del beside
         able = [name for name, free in zip(self._names, ready, strict=True) if free]
         if not able:
@@ -94,9 +95,9 @@ class _Rounds:
         name = min(able, key=lambda candidate: self._last[candidate])
         self._count += 1
         self._last[name] = self._count
-        return Planned(name, target, self._clock.utc().timestamp(), 0.0, "in turn")
+        return PlannedVisit(name, target, self._clock.utc().timestamp(), 0.0, "in turn")
 
-    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[PlannedVisit]:
         del ready, limit
         return ()
 

@@ -15,7 +15,7 @@ from heliotrope.errors import InputError
 _BACKLOG = 2048
 
 
-class Lines:
+class Listeners:
     """The sockets of the page and of the way for EMERGENCY alone.
 
     Parameters
@@ -32,7 +32,7 @@ class Lines:
     def __init__(self, settings: ConsoleSettings) -> None:
         self.settings = settings
         self._turn = threading.Lock()
-        self._found: tuple[socket.socket, socket.socket] | None = None
+        self._sockets: tuple[socket.socket, socket.socket] | None = None
 
     def open(self) -> tuple[socket.socket, socket.socket]:
         """Return the sockets, those of the first call; from any thread.
@@ -43,27 +43,27 @@ class Lines:
             If a port is not available; the next call tries again.
         """
         with self._turn:
-            if self._found is None:
-                self._found = self._open()
-            return self._found
+            if self._sockets is None:
+                self._sockets = self._open()
+            return self._sockets
 
     def _open(self) -> tuple[socket.socket, socket.socket]:
         chosen = self.settings
         page = _taken(chosen.host, chosen.port, "--port")
         port = int(page.getsockname()[1])
         try:
-            way = self._open_way(port)
+            emergency = self._open_way(port)
         except BaseException:
             page.close()
             raise
-        self.settings = replace(chosen, port=port, emergency_port=int(way.getsockname()[1]))
-        return page, way
+        self.settings = replace(chosen, port=port, emergency_port=int(emergency.getsockname()[1]))
+        return page, emergency
 
     def _open_way(self, page: int) -> socket.socket:
         """Open the next port, or a free one if that is taken; the one that was asked for."""
-        host, given = self.settings.host, self.settings.emergency_port
-        if given is not None:
-            return _taken(host, given, "--emergency-port")
+        host, chosen = self.settings.host, self.settings.emergency_port
+        if chosen is not None:
+            return _taken(host, chosen, "--emergency-port")
         try:
             if self.settings.port and page < 65_535:
                 return listening(host, page + 1)
@@ -74,9 +74,9 @@ class Lines:
     def close(self) -> None:
         """Listen no more."""
         with self._turn:
-            for line in self._found or ():
+            for line in self._sockets or ():
                 line.close()
-            self._found = None
+            self._sockets = None
 
 
 def listening(host: str, port: int) -> socket.socket:

@@ -1,0 +1,20 @@
+"""Days of local mean solar time, to which a prediction of the field's errors belongs."""
+
+from heliotrope.sun import Site
+
+_DAY = 86_400.0
+
+
+def day_of(at: float, site: Site) -> int:
+    """Return the number of the day of local mean solar time, from 1970."""
+    return int((at + _ahead(site)) // _DAY)
+
+
+def end_of_day(at: float, site: Site) -> float:
+    """Return the next midnight of local mean solar time, POSIX s."""
+    return (day_of(at, site) + 1) * _DAY - _ahead(site)
+
+
+def _ahead(site: Site) -> float:
+    """Return local mean solar time less UTC, s."""
+    return site.longitude_deg / 360.0 * _DAY
