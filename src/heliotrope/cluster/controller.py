@@ -152,6 +152,11 @@ class Cluster:
         self.cycle = 0.0
 
     @property
+    def leased(self) -> bool:
+        """Whether a plant leads it: the last lease and the autonomy that it grants last."""
+        return not self._watch.alone(self._clock.monotonic())
+
+    @property
     def overruns(self) -> int:
         """Rounds of polling that did not end within their second."""
         return self._polling.overruns
