@@ -152,9 +152,9 @@ class Cluster:
         self.cycle = 0.0
 
     @property
-    def leased(self) -> bool:
-        """Whether a plant leads it: the last lease and the autonomy that it grants last."""
-        return not self._watch.alone(self._clock.monotonic())
+    def lease_left(self) -> float:
+        """Remaining time of the plant's lease, s; below 0: no plant leads it."""
+        return self._watch.lease_left(self._clock.monotonic())
 
     @property
     def overruns(self) -> int:

@@ -17,10 +17,10 @@ from heliotrope.twin.program.cameras import TwinCameras
 from heliotrope.twin.program.folder import FLUX, TwinFolder
 from heliotrope.twin.program.server import TwinServer
 
-#: Share of the speed at which time goes on until the plant leads all clusters.
-_SLOW = 0.2
-#: Wall time between checks whether the plant leads all clusters, s.
-_CHECKED = 0.05
+#: Share of the speed at which time goes on while a lease of the plant is shorter than this, s.
+_SLOW, _SHORT = 0.2, 1.5
+#: Wall time between checks of the leases, s.
+_CHECKED = 0.1
 #: Clusters call a plant that begins beside them soon again.
 _LINK = LinkSettings(longest_pause=0.2)
 #: Time between values of the sensors, s.
@@ -107,22 +107,33 @@ class TwinProgram:
         cameras.start()
         try:
             async with world.running(), asyncio.TaskGroup() as group:
-                sensing = group.create_task(self._sense(world))
+                tasks = [group.create_task(self._sense(world))]
                 self._begun = True
                 if paced is not None:
-                    paced.speed = _SLOW * self._options.speed
-                    await self._led(world, ending)
-                    paced.speed = self._options.speed
+                    tasks.append(group.create_task(self._pace(world, paced)))
                 await ending.wait()
-                sensing.cancel()
+                for task in tasks:
+                    task.cancel()
         finally:
             server.close()
             cameras.close()
 
-    async def _led(self, world: World, ending: asyncio.Event) -> None:
-        """Wait until the plant leads all clusters."""
-        while not ending.is_set() and not all(cluster.leased for cluster in world.clusters):
-            await _wall(_CHECKED)
+    async def _pace(self, world: World, loop: PacedLoop) -> None:
+        """Slow the time down while the plant is late, so that it loses no heliostat by that.
+
+        Where the machine is too slow, everything takes longer, and nothing is lost. A plant that
+        leads no cluster any more has ended.
+        """
+        led = False
+        while True:
+            left = [cluster.lease_left for cluster in world.clusters]
+            led |= min(left) > 0.0
+            short = min(left) < _SHORT and (not led or max(left) > 0.0)
+            speed = self._options.speed * (_SLOW if short else 1.0)
+            if speed != loop.speed:
+                loop.speed = speed
+            # Wall time: the loop's own is what is slowed down.
+            await asyncio.to_thread(time.sleep, _CHECKED)
 
     def _clock(self, clock: Clock, paced: PacedLoop | None) -> dict[str, Any]:
         """Return the state of the clock: monotonic s, UTC, speed, and whether the field is up."""
@@ -144,11 +155,6 @@ class TwinProgram:
             share = world.flux.share()
             await asyncio.to_thread(_replace, path, f"{share:.5f}\n")
             await asyncio.sleep(_SENSED)
-
-
-async def _wall(seconds: float) -> None:
-    """Wait for wall time; the loop's own may stand still."""
-    await asyncio.to_thread(time.sleep, seconds)
 
 
 def _replace(path: Path, text: str) -> None:
