@@ -42,8 +42,9 @@ from heliotrope.plant.field.assigned import Points
 from heliotrope.plant.field.doubtful_positions import DoubtfulPositions
 from heliotrope.plant.field.identity import Identities
 from heliotrope.plant.field.state import FieldState
-from heliotrope.plant.motion.beam_watch import BeamWatch
+from heliotrope.plant.motion.paths import Paths
 from heliotrope.plant.motion.stray_beams import StrayBeams
+from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.sun import Site, vector
 
@@ -283,7 +284,7 @@ class _Run:
 def _at_rest(count: int) -> float:
     """Return the CPU for a second of the look at beams that nobody sent, all heliostats at rest.
 
-    The mirrors stand still away from stow; a third of them is looked at in each second.
+    The mirrors stand still away from stow; a third of them is checked in each second.
     """
     design = malan_plant(count)
     check = BeamCheck(design, design.names)
@@ -295,12 +296,12 @@ def _at_rest(count: int) -> float:
         field.rows[end] = field.rows[f"{end}_goal"] = place
     light = vector(_MORNING, design.site)
     points = Points(field.names, None)
-    beams = StrayBeams(check, field, points, lambda _: light, check.machines)
-    beams.look(0.1)  # the first compiles
+    beams = StrayBeams(Paths(check), field, points, lambda _: light)
+    beams.check(0.1)  # the first compiles
     spent = []
     for _ in range(9):
         begin = time.process_time()
-        beams.look(0.1)
+        beams.check(0.1)
         spent.append(time.process_time() - begin)
     return min(sum(spent[i : i + 3]) / 3.0 for i in (0, 3, 6))
 

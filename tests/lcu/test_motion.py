@@ -126,3 +126,21 @@ def test_stow_stops_a_motion_by_hand_before_its_end() -> None:
     assert furthest - at <= 8000**2 / (2 * 16_000) + 0.3 * 8000, "half a second, and the lead"
     bench.run(240, until="STOWED")
     assert bench.state == "STOWED"
+
+
+def test_a_defocus_down_the_path_ends_at_the_last_point_within_the_stops() -> None:
+    """It ended at the stop: the pose of the point beyond had overwritten the one before."""
+    bench = standing_by()
+    motion = bench.controller.motion
+    motion.config.defocus = (0.5, 0.5)
+    last, beyond = motion.way()[-3:-1][::-1]
+    found = motion.pose(beyond, 0)
+    assert found is not None
+    outer = found.angles[1]
+    found = motion.pose(last, 0)
+    assert found is not None
+    goals, inner = bench.machine.drives.counts(np.array(found.angles)), found.angles[1]
+    end = 0.5 * (inner + outer)
+    motion._stops[1][0 if outer < inner else 1] = end
+    motion.defocus()
+    assert np.abs(np.array([motion.goal(0), motion.goal(1)]) - goals).max() <= 1.0

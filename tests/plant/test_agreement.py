@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from heliotrope.field.example import example_plant
+from heliotrope.field.layouts import lay_out
+from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
 from heliotrope.lcu.names import FLAGS
 from heliotrope.links.clock import VirtualClock, run_virtual
@@ -25,12 +27,12 @@ AIM = (2.0, 0.0, 15.0)
 NAME = "P5A"
 
 
-def play(folder: Path, scene: Callable[[Bench], Awaitable[None]]) -> Bench:
+def play(folder: Path, scene: Callable[[Bench], Awaitable[None]], design: Plant = DESIGN) -> Bench:
     """Run a scene in virtual time."""
     made: list[Bench] = []
 
     async def main(clock: VirtualClock) -> None:
-        bench = Bench(clock, folder)
+        bench = Bench(clock, folder, design=design)
         made.append(bench)
         async with running(bench):
             await scene(bench)
@@ -247,7 +249,7 @@ def test_one_that_disagrees_is_defocused_alone(tmp_path: Path) -> None:
 def test_many_that_disagree_defocus_the_field(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        plant._agreement._wrong = {f"H{i}": 0.1 for i in range(120)}
+        plant._agreement._wrong = dict.fromkeys(plant.field.names, 0.1)
         plant._agreement._at = np.inf
         await bench.wait(5.0)
         assert alarmed(bench, "pointing_disagrees_many") == {""}
@@ -255,7 +257,7 @@ def test_many_that_disagree_defocus_the_field(tmp_path: Path) -> None:
         assert plant.sentinel.order is not None
         assert plant.sentinel.order.act is Act.DEFOCUS
 
-    play(tmp_path, scene)
+    play(tmp_path, scene, lay_out("radial", 120))
 
 
 def standing_at(bench: Bench, point: tuple[float, float, float], late: float) -> None:

@@ -15,7 +15,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.plant import refusals
 from heliotrope.plant.field.aims import BeamCheck
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.authority import Mandate, Person, Role
 from heliotrope.plant.visits.coded_layout import SentBeam, beams_of, coded
 from heliotrope.plant.visits.coded_visit import CodedVisit

@@ -140,11 +140,9 @@ def test_a_layout_computes_its_beams_at_once(plant: Any, monkeypatch: pytest.Mon
 
     def of(few: int) -> list[str]:
         calls.clear()
-        layout, _ = arranged(plant, target, names[:few], settings)
+        layout = arranged(plant, target, names[:few], settings)
         assert len(layout.names) == few
-        layout, _ = newcomers(
-            plant, target, names[6 : 6 + few], settings, dict.fromkeys(names, MODEL)
-        )
+        layout = newcomers(plant, target, names[6 : 6 + few], settings, dict.fromkeys(names, MODEL))
         assert len(layout.names) == few
         return sorted(calls)
 

@@ -207,7 +207,8 @@ def test_new_mirrors_have_codes_of_their_own_and_do_not_dazzle() -> None:
         plant, target = here.live.plant, here.live.design.targets[0]
         nominal = plant.beliefs.nominal
         model = {name: first_model(CYCLE, nominal(name)).parameters for name in here.names}
-        layout, wrong = newcomers(plant, target, here.names, JointSettings(), model)
+        layout = newcomers(plant, target, here.names, JointSettings(), model)
+        wrong = layout.left_out
         assert wrong == {}
         assert layout.codes == 6
         assert not layout.moves[..., 1].any(), "to the right and left only"
@@ -217,20 +218,22 @@ def test_new_mirrors_have_codes_of_their_own_and_do_not_dazzle() -> None:
         assert (np.abs(places) < 0.5 * target.width - 1.0).all(), "the beams keep off the border"
         assert all(np.trace(beam.covariance) > 0.5**2 for beam in layout.beams), "nobody knows them"
         dim = JointSettings(brightest=1.0)
-        fewer, wrong = newcomers(plant, target, here.names, dim, model)
+        fewer = newcomers(plant, target, here.names, dim, model)
+        wrong = fewer.left_out
         assert 0 < len(fewer.names) < 6
         assert all("might exceed 1 suns" in text for text in wrong.values())
-        few, wrong = newcomers(plant, target, here.names, JointSettings(first=4), model)
+        few = newcomers(plant, target, here.names, JointSettings(first=4), model)
+        wrong = few.left_out
         assert len(few.names) == 4
         assert all("4 heliostats are on left already" in text for text in wrong.values())
         # With others they have no place, and alone each may have a calibration as ever.
         assert here.cycle.first(here.names, target)
         believe(here.live, 1e-2)
         assert here.cycle.first(here.names, target), "known to 28 mrad"
-        wide, _ = newcomers(plant, target, here.names, JointSettings(), model)
+        wide = newcomers(plant, target, here.names, JointSettings(), model)
         believe(here.live, 3e-4)
         assert not here.cycle.first(here.names, target)
-        sure, _ = newcomers(plant, target, here.names, JointSettings(), model)
+        sure = newcomers(plant, target, here.names, JointSettings(), model)
         for one, other in zip(sure.beams, wide.beams, strict=True):
             assert np.trace(one.covariance) < 0.1 * np.trace(other.covariance)
         plant.beliefs._records.clear()
@@ -260,7 +263,8 @@ def test_a_beam_beside_the_target_is_looked_for_in_the_next_visit() -> None:
         model = {lost: first_model(CYCLE, nominal(lost)).parameters}
         places = []
         for missed in range(10):
-            layout, wrong = newcomers(plant, target, [lost], JointSettings(), model, {lost: missed})
+            layout = newcomers(plant, target, [lost], JointSettings(), model, {lost: missed})
+            wrong = layout.left_out
             assert wrong == {}
             places.append(target.plane_coordinates(layout.aims)[0])
         assert places[0] == pytest.approx((0.0, 0.0)), "alone it has the middle"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from heliotrope.lcu import messages, states
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.guards import Asked, Guards
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE, RefusedError
 
@@ -34,22 +34,22 @@ def plant(**parts: Any) -> Guards:
         "identities": SimpleNamespace(blocked=lambda name: None),
         "sync": SimpleNamespace(differing=lambda name: None),
         "doubtful": SimpleNamespace(reasons=lambda names, points: [None] * len(names)),
-        "lockouts": SimpleNamespace(blocked=lambda names, points: {}),
+        "lockouts": SimpleNamespace(reasons=lambda names, points: ()),
         "given": SimpleNamespace(untaken=lambda *_: None, unknown=lambda *_: None),
         "aims": np.zeros((3, 3)),
     }
     return Guards(**(free | parts))
 
 
-def alarms(barred: dict[str, dict[str, str]], cluster: str = "", night: str = "") -> Any:
+def alarms(blocked: dict[str, dict[str, str]], cluster: str = "", night: str = "") -> Any:
     """A sentinel whose rows keep heliostats from their aims, or hold a cluster."""
 
     def of(condition: str = "") -> dict[str, str]:
-        some = barred.values() if not condition else [barred.get(condition, {})]
+        some = blocked.values() if not condition else [blocked.get(condition, {})]
         return {name: text for each in some for name, text in each.items()}
 
     return SimpleNamespace(
-        table=SimpleNamespace(barred=of),
+        table=SimpleNamespace(blocked=of),
         refusal=lambda clusters: f"{cluster} holds" if cluster in clusters else "",
         night=night,
     )
@@ -134,7 +134,7 @@ def test_the_night_holds_what_follows_the_sun() -> None:
 
 
 def test_a_lock_of_a_person_lets_pass_what_moves_nothing() -> None:
-    out = plant(lockouts=SimpleNamespace(blocked=lambda names, points: {"A": "locked"}))
+    out = plant(lockouts=SimpleNamespace(reasons=lambda names, points: ["locked", None, None]))
     assert COMMANDS - stopped(out, OUT_OF_SERVICE) == messages.HARMLESS | messages.SAFE
 
 
@@ -175,7 +175,7 @@ def test_a_command_goes_to_the_others_and_is_refused_where_none_is_left() -> Non
         some.passed(Asked("IDLE", ("A", "C")), NOT_NOW, BEAM_REFUSED)
     with pytest.raises(RefusedError, match="IDLE: not accepted now: north holds"):
         plant(sentinel=alarms({}, "north")).passed(Asked("IDLE", ("A", "B")), NOT_NOW, BEAM_REFUSED)
-    locked = plant(lockouts=SimpleNamespace(blocked=lambda names, _: dict.fromkeys(names, "hands")))
+    locked = plant(lockouts=SimpleNamespace(reasons=lambda names, _: ["hands"] * len(names)))
     with pytest.raises(RefusedError, match="IDLE A and 2 more: hands"):
         locked.passed(Asked("IDLE", NAMES), OUT_OF_SERVICE)
 

@@ -401,10 +401,11 @@ def test_a_cluster_that_may_begin_no_motion_keeps_nothing_from_the_others(
                     home.rows["flags"][0] = ROUGH
             else:
                 plant.locks.take(names, 0, plant.now())
+                plant.ledger.sent("LOCK", names, plant.now())
                 for home in homes:
                     home.set(states.LOCKED, home.names[0])
                 if what == "STOW":
-                    plant._ways.ordered.sent("DEFOCUS", names, plant.now() + 0.5)
+                    plant.ledger.sent("DEFOCUS", names, plant.now() + 0.5)
             await bench.wait(2.0)
             with plant.stepping.fine(names if what == "ROUGH" else ()):
                 await bench.wait(6.0)

@@ -287,7 +287,8 @@ def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> N
         for row, one in enumerate(here.names):
             error = errors_on(plant, target, [one], JointSettings())
             assert on_target[row] == pytest.approx(error[one]), "one by one, and all at once"
-        layout, wrong = arranged(plant, target, here.names, JointSettings())
+        layout = arranged(plant, target, here.names, JointSettings())
+        wrong = layout.left_out
         assert list(wrong) == [name]
         assert "known to" in wrong[name]
         assert layout.names == here.names[1:]
@@ -296,14 +297,16 @@ def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> N
         sizes = np.abs(layout.moves).max(axis=(0, 2))
         slant = np.linalg.norm(plant.beams.armature.origin_1[1:] - target.center, axis=-1)
         np.testing.assert_allclose(sizes, 5e-4 * slant)
-        alone, _ = arranged(plant, target, here.names[1:2], JointSettings(brightest=0.1))
+        alone = arranged(plant, target, here.names[1:2], JointSettings(brightest=0.1))
         assert len(alone.names) == 1
         crowd = replace(target, corners=target.center + 0.3 * (target.corners - target.center))
         dim = JointSettings(brightest=5.0)
-        fewer, wrong = arranged(plant, crowd, here.names[1:], dim)
+        fewer = arranged(plant, crowd, here.names[1:], dim)
+        wrong = fewer.left_out
         assert 0 < len(fewer.names) < 5
         assert all("would exceed 5 suns" in text for text in wrong.values())
-        most, wrong = arranged(plant, target, here.names[1:], JointSettings(most=3, least=2))
+        most = arranged(plant, target, here.names[1:], JointSettings(most=3, least=2))
+        wrong = most.left_out
         assert len(most.names) == 3
         assert len(wrong) == 2
 

@@ -13,7 +13,7 @@ import pytest
 
 from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.lcu import states
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.visits import CycleResult, CycleSettings

@@ -17,7 +17,7 @@ from heliotrope.links.messages import Ask, Parameters
 from heliotrope.mechanism.board_items import Wanted, items_of, packed, tables_with
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.audit import read
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.store.records import Kind, Lockout

@@ -31,9 +31,10 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.field.aims import BeamCheck, _disc
 from heliotrope.plant.field.assigned import rest_on
-from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
-from heliotrope.plant.motion.defocusing import defocused, turned_away, way_out
+from heliotrope.plant.motion.defocusing import defocused, order_out
 from heliotrope.plant.motion.paths import Paths
+from heliotrope.plant.motion.proofs import BeamError, PathProofs
+from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.orders import joining
 from heliotrope.plant.orders.authority import RefusedError
@@ -171,10 +172,9 @@ def test_an_order_that_was_long_under_way_counts_from_its_acknowledgement(tmp_pa
         ticket = plant.command(ENGINEER, token, "TRACK", ("P5A",))
         await bench.until(lambda: ticket.stage("P5A") is Stage.DONE, 10.0)
         taken = plant.now()
-        refused = plant._ways.ordered.unshown(np.array([row]))
-        assert refused == {"P5A": refusals.PLACE_UNKNOWN.text}
+        assert not plant.ledger.reported()[row]
         await bench.until(lambda: bool(plant.field.heard[row] > taken), 5.0)
-        assert not plant._ways.ordered.unshown(np.array([row]))
+        assert plant.ledger.reported()[row]
 
     play(tmp_path, scene)
 
@@ -198,12 +198,12 @@ def test_a_mirror_that_moves_or_is_silent_does_not_come_to_standby(tmp_path: Pat
         ages[cluster.names.index("P5A")] = 5000
         await bench.wait(2.0)
         with pytest.raises(BeamError, match="no report shows where it is now"):
-            plant._ways.clear("IDLE", (), ("P5A",), plant.now())
-        wrong = plant._ways.joining("TRACK", (), ("P5A",), plant.now())
+            plant._proofs.clear("IDLE", (), ("P5A",), plant.now())
+        wrong = plant._proofs.joining("TRACK", (), ("P5A",), plant.now())
         assert wrong["P5A"] == refusals.PLACE_UNKNOWN.text
         ages[:] = 0
         await bench.wait(2.0)
-        assert plant._ways.clear("IDLE", (), ("P5A",), plant.now()) == (("P5A",), {})
+        assert plant._proofs.clear("IDLE", (), ("P5A",), plant.now()) == (("P5A",), {})
 
     play(tmp_path, scene)
 
@@ -272,17 +272,17 @@ def test_no_mirror_joins_before_it_shows_where_it_is_since_its_defocus(tmp_path:
 
 def test_one_that_moves_joins_only_if_its_way_is_free_from_wherever_it_is(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
-        plant, ways = bench.plant, bench.plant._ways
+        plant, proofs = bench.plant, bench.plant._proofs
         row = plant.field.place("P5A")
         west, east = counts(plant, "P5A", WEST), counts(plant, "P5A", EAST)
         await stands(bench, "P5A", states.IDLE, east)
         plant.aims[row] = EAST
-        assert not ways.joining("TRACK", (), ("P5A",), plant.now())
+        assert not proofs.joining("TRACK", (), ("P5A",), plant.now())
         cluster = bench.cluster_of("P5A")
         for end, value in zip(("primary_goal", "secondary_goal"), west, strict=True):
             cluster.rows[end][cluster.names.index("P5A")] = value
         await bench.wait(2.0)
-        wrong = ways.joining("TRACK", (), ("P5A",), plant.now())
+        wrong = proofs.joining("TRACK", (), ("P5A",), plant.now())
         assert "the beam enters walkway" in wrong["P5A"]
 
     play(tmp_path, scene)
@@ -334,7 +334,7 @@ def test_standby_points_that_were_not_taken_count_as_long_as_the_mirror_may_go_t
 
     async def scene(bench: Bench) -> None:
         plant, other = bench.plant, (-12.0, 0.0, 8.0)
-        token, points = await bench.commanded(), plant._ways.points
+        token, points = await bench.commanded(), plant._proofs.points
         row = np.array([plant.field.place("P5A")])
         points.assign("STANDBY", row, np.array([EAST]))
         points.assign("STANDBY", row, np.array([other]))
@@ -521,7 +521,7 @@ def test_a_mirror_that_has_turned_into_a_volume_is_stowed_although_it_was_just_s
         for name, where in (("P5A", inside), ("P5B", outside)):
             reports(bench, name, states.DEFOCUSED, where, where)
         await bench.wait(4.0)
-        assert [name for name in ("P5A", "P5B") if bench.plant._ways.turned(name)] == ["P5A"]
+        assert [name for name in ("P5A", "P5B") if bench.plant._watch.turned(name)] == ["P5A"]
 
     sent = play(tmp_path, scene).cluster_of("P5A").of(Emergency)
     assert [m.heliostats for m in sent if m.name == "STOW"] == [("P5A",)]
@@ -633,7 +633,7 @@ def test_an_approach_is_known_to_turn_azimuth_first(tmp_path: Path) -> None:
     play(tmp_path, scene)
 
 
-def test_the_way_out_is_the_one_that_ends_outside_and_is_inside_for_less() -> None:
+def test_the_order_out_is_the_one_that_ends_outside_and_is_inside_for_less() -> None:
     sun = np.array([0.3, -0.4, 0.866])
     sun /= np.linalg.norm(sun)
     row = DESIGN.names.index("P5A")
@@ -645,64 +645,44 @@ def test_the_way_out_is_the_one_that_ends_outside_and_is_inside_for_less() -> No
     far = tuple(round(x) for x in drives.counts(begin + np.array([0.8, 0.3])))
     machine = Machine(limits, (far[0], far[1]), (0.1, 0.1))
     check = BeamCheck(DESIGN, DESIGN.names)
-    assert way_out(check, machine, row, here, sun) is Act.DEFOCUS
-    assert way_out(check, None, row, here, sun) is Act.DEFOCUS
-    # Along the walkway it would stay inside for longer than on the way to stow.
-    along = Machine(limits, (far[0], far[1]), (0.5, 0.02))
-    assert way_out(check, along, row, here, sun) is Act.STOW
+
+    def ordered(machine: Machine | None) -> Act:
+        check.machines = {} if machine is None else {"P5A": machine}
+        return order_out(Paths(check), row, here, sun)
+
+    assert ordered(machine) is Act.DEFOCUS
+    assert ordered(None) is Act.DEFOCUS
+    # Along the walkway it would stay inside for longer than on the path to stow.
+    assert ordered(Machine(limits, (far[0], far[1]), (0.5, 0.02))) is Act.STOW
     # Where the defocus ends, another volume begins.
-    end = group.mechanism[place].armature.pose(turned_away(begin, machine, drives))
+    end = group.mechanism[place].armature.pose(begin + 0.1)
     normal, vertex = end[0], end[1]
     ball = Sphere("ball", vertex + 20.0 * (2.0 * (sun @ normal) * normal - sun), 1.0)
     check = BeamCheck(DESIGN, DESIGN.names, [WALKWAY, ball])
-    assert way_out(check, machine, row, here, sun) is Act.STOW
+    assert ordered(machine) is Act.STOW
     assert check.inside(row, begin[None], np.array([0.0, 0.6, -0.8])).tolist() == [False]
-
-
-def test_a_defocus_turns_the_other_way_before_a_stop() -> None:
-    group, place = DESIGN.find("P5A")
-    drives = group.mechanism[place].drives
-    low, high = drives.counts(np.array([0.0, 0.0])), drives.counts(np.array([1.0, 1.0]))
-    ends = np.sort(np.stack([low, high]), axis=0)
-    limits = tuple(AxisLimits(int(ends[0, i]), int(ends[1, i]), 1000, 1000, 0) for i in (0, 1))
-    stow = (int(ends[0, 0]), int(ends[0, 1]))
-    machine = Machine((limits[0], limits[1]), stow, (0.1, 0.1))
-    narrow = Machine((limits[0], limits[1]), stow, (0.9, 0.9))
-    places = ((0.5, False, 0.6), (0.95, False, 0.85), (0.4, True, 1.0), (0.6, True, 0.0))
-    for at, wide, expected in places:
-        found = turned_away(np.array([at, at]), narrow if wide else machine, drives)
-        assert np.allclose(found, expected, atol=1e-3)
-    # From standby it turns away from the aim.
-    aimed, at = np.array([0.6, 0.4]), np.array([0.5, 0.5])
-    assert np.allclose(turned_away(at, machine, drives, aimed), [0.4, 0.6])
-    # From an aim it does not turn nearer to standby: from below, and from beside it.
-    standby = np.array([0.6, 0.52])
-    assert np.allclose(turned_away(at, machine, drives, None, standby), [0.4, 0.6])
 
 
 def test_from_standby_and_an_approach_no_defocus_lights_the_receiver_whatever_the_aim() -> None:
     """In 249 of 1,216 cases it did, where the aim was on the right target: run 980292."""
     design = malan_plant(320)
     check = BeamCheck(design, design.names)
-    machines = {name: design.machine(name) for name in design.names}
-    ways, rows = Paths(check, machines), np.arange(3, 320, 32)
-    standbys = np.array([machines[design.names[row]].standby for row in rows], dtype=np.float64)
-    points, length = ways.points(rows, standbys)
+    paths, rows = Paths(check), np.arange(3, 320, 32)
+    own = [design.machine(design.names[row]).standby for row in rows]
+    standbys, aims = np.array(own, dtype=np.float64), np.tile((45.0, 0.0, 36.0), (len(rows), 1))
+    points, length = paths.points(rows, standbys)
     late = 0.5 * (points[np.arange(len(rows)), length - 2] + standbys)
-    right = np.array([45.0, 0.0, 36.0])
     held = 0
     for hour in (9, 12, 15):
         moment = datetime(2026, 3, 21, hour, tzinfo=UTC)
         sun = vector(moment - timedelta(hours=design.site.longitude_deg / 15.0), design.site)
         for state, places in ((states.LOCKED, standbys), (states.APPROACHING, late)):
-            begin = np.round(check.poses(rows, places, sun, ways.stow[rows]).best_counts)
+            begin = np.round(check.poses(rows, places, sun, paths.stow[rows]).best_counts)
             for how in (state, states.FAULT):
-                ends = np.empty_like(begin)
-                for i, row in enumerate(rows):
-                    machine, point = machines[design.names[row]], standbys[i]
-                    end = defocused(check, machine, int(row), begin[i], sun, how, right, point)
-                    ends[i] = Drive(check.drives.table[row]).counts(end)
-                lit = check.crossing(rows, ways.motion(rows, begin, ends), sun, "now")
+                reported = np.full(len(rows), how)
+                angles = defocused(paths, rows, begin, sun, reported, aims, standbys)
+                ends = Drive(check.drives.table[rows]).counts(angles)
+                lit = check.crossing(rows, paths.motion(rows, begin, ends), sun, "now")
                 held += len(lit) if how == states.FAULT else 0
                 assert how == states.FAULT or not lit
     assert held > 0  # turned off the aim
@@ -772,8 +752,8 @@ def test_who_would_cross_a_volume_on_the_way_from_stow_is_known_beforehand() -> 
 
     rows = np.arange(96)
     stow, standby = (np.tile(np.array(x, dtype=float), (96, 1)) for x in _rest(machine))
-    ways = Paths(check, dict.fromkeys(design.names, machine))
-    found = ways.approach(rows, stow, standby, sun)
+    paths = Paths(check)
+    found = paths.approach(rows, stow, standby, sun)
     assert all("gate" in text and "from stow to standby" in text for text in found.values())
     refused = np.array([name in found for name in design.names])
 
@@ -816,7 +796,7 @@ def test_who_would_cross_the_receiver_on_the_way_from_stow_is_known_beforehand()
 
     check, rows = BeamCheck(design, design.names), np.arange(96)
     stow, standby = (np.tile(np.array(x, dtype=float), (96, 1)) for x in _rest(machine))
-    found = Paths(check, dict.fromkeys(design.names, machine)).approach(rows, stow, standby, sun)
+    found = Paths(check).approach(rows, stow, standby, sun)
     text = "the beam crosses the receiver on its way from stow to standby; try again"
     assert all(text in each for each in found.values())
     refused = np.array([name in found for name in design.names])
@@ -844,7 +824,8 @@ def test_a_way_is_the_one_that_the_motors_go() -> None:
     limits = (AxisLimits(-200_000, 200_000, 8000, 16_000, 40), AxisLimits(0, 99_000, 3000, 9000, 0))
     machine = replace(design.machine(name), axes=limits, stow=(0, 90_000))
     check = BeamCheck(design, design.names)
-    ways = Paths(check, {name: machine})
+    check.machines[name] = machine
+    paths = Paths(check)
     drives = Drive(check.drives.table[0])
     worst = 0.0
     for case in range(40):
@@ -858,14 +839,14 @@ def test_a_way_is_the_one_that_the_motors_go() -> None:
         stepper = Stepper(axes, 50, 100)
         turns = case % 2 == 0
         stepper.go(int(end[0]), int(end[1]), PRIMARY_FIRST if turns else BOTH)
-        path = (ways.turns if turns else ways.motion)(row, begin[None] * 1.0, end[None])[0]
+        path = (paths.turns if turns else paths.motion)(row, begin[None] * 1.0, end[None])[0]
         ticks = 0
         while ticks == 0 or not stepper.still():
             stepper.advance(50, [], 0)
             ticks += 1
             at = drives.angles(np.array([axis.count for axis in axes], dtype=float))
             worst = max(worst, _apart(at, path))
-        took = float(ways.lasts(row, begin[None] * 1.0, end[None], turns=turns)[0])
+        took = float(paths.lasts(row, begin[None] * 1.0, end[None], turns=turns)[0])
         assert abs(took - 0.05 * ticks) < 0.3 + 0.02 * took
     assert worst < 1.5e-3
 
@@ -878,12 +859,13 @@ def test_a_path_without_ramps_is_that_of_two_axes_at_their_rates() -> None:
     limits = (AxisLimits(-200_000, 200_000, 8000, 16_000, 40), AxisLimits(0, 99_000, 3000, 9000, 0))
     machine = replace(design.machine(name), axes=limits, stow=(0, 90_000))
     check = BeamCheck(design, design.names)
-    ways, drives = Paths(check, {name: machine}), Drive(check.drives.table[0])
+    check.machines[name] = machine
+    paths, drives = Paths(check), Drive(check.drives.table[0])
     rates = np.array([8000.0, 3000.0])
     for _ in range(20):
         begin = rng.uniform((-100_000.0, 20_000.0), (100_000.0, 80_000.0)).round()
         end = (begin + rng.uniform(200.0, 20_000.0, 2) * rng.choice((-1.0, 1.0), 2)).round()
-        path = ways.motion(row, begin[None], end[None], ramps=False)[0]
+        path = paths.motion(row, begin[None], end[None], ramps=False)[0]
         # A goal below is reached from below: the axis goes past it first.
         goal = end - np.where(end < begin, (40.0, 0.0), 0.0)
         lasts = float((np.abs(goal - begin) / rates).max())
@@ -901,7 +883,7 @@ def test_each_leg_of_an_approach_is_proven_in_the_sun_of_its_moment(
     design = gated(6)
     machine = design.machine(design.names[0])
     check, rows = BeamCheck(design, design.names), np.arange(3)
-    ways = Paths(check, dict.fromkeys(design.names, machine))
+    paths = Paths(check)
     stow, standby = (np.tile(np.array(x, dtype=float), (3, 1)) for x in _rest(machine))
     asked: list[tuple[Any, ...]] = []
     poses = check.poses
@@ -914,11 +896,11 @@ def test_each_leg_of_an_approach_is_proven_in_the_sun_of_its_moment(
         return vector(NOON.timestamp() + 10.0 * ahead, design.site)
 
     monkeypatch.setattr(check, "poses", noted)
-    assert not ways.approach(rows, stow, standby, sun)
+    assert not paths.approach(rows, stow, standby, sun)
     time, at = np.zeros(3), stow
     for leg, (_, _, light, begin) in enumerate(asked):
         if leg:
-            time = time + ways.lasts(rows, at, begin, turns=leg == 1)
+            time = time + paths.lasts(rows, at, begin, turns=leg == 1)
         at = begin
         exact = np.array([sun(float(each)) for each in time])
         assert np.linalg.norm(light - exact, axis=-1).max() < 2e-3
@@ -936,8 +918,8 @@ def test_a_diagnosis_passes_a_nudge_of_each_axis_both_ways() -> None:
             return counts
 
     field: Any = Standing(design.names)
-    watch = BeamWatch(check, field, field, field, {})
-    path = watch._by_counts("DIAGNOSE", (), rows)
+    proofs = PathProofs(Paths(check), field, field, field, field)
+    path = proofs._by_counts("DIAGNOSE", (), rows)
     begin = Drive(check.drives.table[rows]).angles(counts)
     nudges = [(0, 0), (1, 0), (-1, 0), (0, 0), (0, 1), (0, -1)]
     np.testing.assert_allclose(path, begin[:, None] + NUDGE * np.array(nudges), atol=1e-12)
@@ -955,10 +937,12 @@ def test_an_approach_leaves_stow_as_long_as_its_other_axis_stands_there(azimuth:
     begin[2, 1 - azimuth] -= 5000.0  # and now the other axis has
     end = begin + 40_000.0
     state = np.array([states.APPROACHING] * 3 + [states.STOWING])
-    watch = BeamWatch(check, known, known, known, dict.fromkeys(design.names, machine))
+    check.machines = dict.fromkeys(design.names, machine)
+    watch = BeamWatch(PathProofs(Paths(check), known, known, known, known))
     assert list(watch._leaves_stow(rows, state, begin, end)) == [True, True, False, False]
     # Where the place of stow is not known, a long way tells it.
-    watch = BeamWatch(check, known, known, known, {})
+    check.machines = {}
+    watch = BeamWatch(PathProofs(Paths(check), known, known, known, known))
     near = np.where(np.arange(4)[:, None] == 2, begin + 10.0, begin + 900_000.0)
     assert list(watch._leaves_stow(rows, state, begin, near)) == [True, True, False, False]
 
@@ -979,9 +963,10 @@ def test_the_points_of_a_way_are_those_of_a_board() -> None:
     given = ((3.0, -20.0, 0.0), (3.0, -4.0, 0.5))
     machines = dict.fromkeys(design.names, machine)
     machines[design.names[4]] = replace(machine, way=given)
-    ways = Paths(check, machines)
+    check.machines = machines
+    paths = Paths(check)
     for standby in ((21.0, 0.0, 81.7), (-30.0, 0.0, 60.0)):
-        points, length = ways.points(rows, np.tile(standby, (2, 1)))
+        points, length = paths.points(rows, np.tile(standby, (2, 1)))
         for row, found, count in zip(rows, points, length, strict=True):
             name, mechanism = design.names[row], design.groups["azel"].mechanism[row]
             items = items_of(mechanism, replace(machines[name], standby=standby))
@@ -1038,11 +1023,11 @@ def test_parameters_that_would_lead_the_present_beam_into_a_volume_are_not_writt
             ray = reflect(plant.sun_vector(), pose.normal)
             way = np.array(WALKWAY.center) - pose.vertex
             inside = float(np.linalg.norm(way - ray * (way @ ray))) < WALKWAY.radius
-            why = plant._ways.rewriting("P5A", new.armature.table, new.drives.table)
+            why = plant._proofs.rewriting("P5A", new.armature.table, new.drives.table)
             seen[inside] += 1
             assert not inside or "walkway" in why
         assert min(seen.values()) > 0
-        assert plant._ways.rewriting("P5A", nominal.armature.table, nominal.drives.table) == ""
+        assert plant._proofs.rewriting("P5A", nominal.armature.table, nominal.drives.table) == ""
 
     play(tmp_path, scene)
 
@@ -1055,7 +1040,7 @@ def test_unverified_parameters_lead_no_beam_into_a_volume_if_the_earlier_are_rig
     point = (-3.5, -12.0, 8.0)
 
     async def scene(bench: Bench) -> None:
-        plant, ways = bench.plant, bench.plant._ways
+        plant, proofs = bench.plant, bench.plant._proofs
         place = plant.field.place("P5A")
         (plant.aims if name == "TRACK" else plant.standbys)[place] = point
         state = states.IDLE if name == "TRACK" else states.TRACKING
@@ -1063,8 +1048,8 @@ def test_unverified_parameters_lead_no_beam_into_a_volume_if_the_earlier_are_rig
 
         def why() -> dict[str, str]:
             if name == "TRACK":
-                return ways.joining("TRACK", (), ("P5A",), plant.now())
-            return ways._back_to_standby(np.array([place]), plant.now())
+                return proofs.joining("TRACK", (), ("P5A",), plant.now())
+            return proofs._back_to_standby(np.array([place]), plant.now())
 
         group, row = DESIGN.find("P5A")
         nominal, seen = group.mechanism[row], {True: 0, False: 0}
@@ -1227,7 +1212,7 @@ def test_poses_are_those_within_the_limits_of_the_motors() -> None:
     def first(check: BeamCheck) -> FloatArray:
         """Where the axes are at the first point of the way from stow."""
         standbys = np.tile(np.array(MACHINE.standby, dtype=float), (4, 1))
-        points = Paths(check, {}).points(rows, standbys)[0][:, 0]
+        points = Paths(check).points(rows, standbys)[0][:, 0]
         solved = check.poses(rows, points, sun, stow)
         return np.asarray(solved.chosen(solved.counts))
 

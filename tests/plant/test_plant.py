@@ -347,8 +347,8 @@ def test_of_those_that_join_each_is_proven_by_its_own_way(tmp_path: Path) -> Non
             for name, aim in (("P5A", (0.0, 0.0, 16.5)), ("P5B", (20.0, 0.0, 16.5))):
                 plant.aims[plant.field.place(name)] = aim
             await bench.wait(2.0)
-            wrong = plant._ways.joining("TRACK", (), names, plant.now())
-            alone = plant._ways.joining("TRACK", (), names[1:], plant.now())
+            wrong = plant._proofs.joining("TRACK", (), names, plant.now())
+            alone = plant._proofs.joining("TRACK", (), names[1:], plant.now())
             assert "its aim is not known here" in wrong.pop("P1A")
             assert wrong == alone
 

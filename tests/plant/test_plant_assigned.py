@@ -229,7 +229,7 @@ def test_after_a_restart_the_plant_knows_which_points_were_not_taken(tmp_path: P
         folder.mkdir()
         async with running(Bench(clock, folder, seed=2, assigned=store)) as bench:
             plant, token = bench.plant, await bench.commanded()
-            points = plant._ways.points
+            points = plant._proofs.points
             rows = [plant.field.place(name) for name in names]
             for kind, assigned in (("AIM", plant.aims), ("STANDBY", plant.standbys)):
                 assert assigned[rows].tolist() == [list(p) for p in (more[-1], AIM, more[-1])]

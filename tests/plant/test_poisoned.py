@@ -9,7 +9,7 @@ from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.field.target import Target
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.mechanism.board_items import checksums
-from heliotrope.plant.motion.beam_watch import BeamWatch
+from heliotrope.plant.motion.proofs import PathProofs
 from heliotrope.plant.visits import CalibrationCycle, CycleResult, CycleSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.settings import Centring
@@ -76,10 +76,10 @@ def test_the_same_false_light_on_a_first_visit_changes_nothing(tmp_path: Path, l
 def test_new_parameters_go_back_where_no_way_to_their_photograph_is_free(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def wrong(self: BeamWatch, *_: object) -> dict[str, str]:
+    def blocked(self: PathProofs, *_: object) -> dict[str, str]:
         return dict.fromkeys([NAME] if self._earlier else [], "the beam enters walkway")
 
-    monkeypatch.setattr(BeamWatch, "_by_earlier", wrong)
+    monkeypatch.setattr(PathProofs, "_by_earlier", blocked)
     results: list[CycleResult] = []
 
     async def main(clock: VirtualClock) -> None:
@@ -100,7 +100,7 @@ def test_new_parameters_go_back_where_no_way_to_their_photograph_is_free(
     (result,) = results
     assert result.outcome is CalibrationOutcome.NOT_VERIFIED, result.text
     assert (
-        "no free way to their photograph: the beam enters walkway; the old parameters are"
+        "no free path to their photograph: the beam enters walkway; the old parameters are"
         in result.text
     )
 

@@ -14,13 +14,14 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.orders.authority import RefusedError
-from heliotrope.plant.refusals import NoFreePath
+from heliotrope.plant.orders.guards import Asked
+from heliotrope.plant.refusals import NOT_NOW, NoFreePath
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
@@ -106,7 +107,9 @@ def test_a_cluster_that_may_not_move_keeps_no_other_at_stow(tmp_path: Path) -> N
         for _ in range(15):
             plant.authority.keep(ENGINEER, token)
             await bench.wait(1.0)
-        assert plant.held(plant.field.names).keys() == set(bad.names)
+        assert plant.guards.reasons(Asked("APPROACH", plant.field.names), NOT_NOW).keys() == set(
+            bad.names
+        )
         log = Logbook(bench.clock)
         raising = Raising(plant, log, ENGINEER, most=99, patience=60.0, clearance=0.0, wanted=True)
         await raising.step(token, frozenset, np.zeros(len(plant.field), dtype=np.bool_))
@@ -193,7 +196,7 @@ def test_a_refusal_that_is_no_matter_of_the_path_raises_no_alarm_of_it(
         reasons = ("a reason that was not there before", NoFreePath("enters mast"))
         for reason, named in zip(reasons, (False, True), strict=True):
             with monkeypatch.context() as patch:
-                patch.setattr(plant._ways, "clear", refusing({NAME: reason}))
+                patch.setattr(plant._proofs, "clear", refusing({NAME: reason}))
                 await raising.step(token, frozenset, np.zeros(len(plant.field), dtype=np.bool_))
             assert bool(raising.why_not(NAME)) is named
             assert any(row.condition == "beam_blocked" for row in log.alarms()) is named

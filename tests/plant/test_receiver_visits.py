@@ -27,7 +27,7 @@ from heliotrope.geometry import bisector, reflect
 from heliotrope.imaging.coded import SeparatedBeam, Verdict
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.coded_visits import ReceiverVisits
 from heliotrope.plant.operations.pictures import Pictures

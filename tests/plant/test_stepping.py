@@ -16,6 +16,7 @@ from heliotrope.lcu import names as meanings
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.machine import Stepping as Stepped
+from heliotrope.plant.field.ledger import Ledger
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.orders.stepping import Stepping
 from heliotrope.twin.live.boards import BoardField
@@ -34,6 +35,7 @@ class Field(FieldState):
     def __init__(self) -> None:
         super().__init__({"c": NAMES})
         self.rows["flags"] = [ROUGH, ROUGH, 0]
+        self.ledger = Ledger(self)
 
     def hear(self, now: float, **rough: bool) -> None:
         """Hear all at a time, and some step otherwise since."""
@@ -42,9 +44,15 @@ class Field(FieldState):
         self.heard[:] = now
 
 
+def order(field: Field, modes: Stepping, names: tuple[str, ...], now: float) -> None:
+    """Give heliostats the order that was due."""
+    modes.tried(names, now)
+    field.ledger.sent("ROUGH", names, now)
+
+
 def test_rough_steps_are_left_for_a_visit_and_come_back_after_the_last_one() -> None:
     field = Field()
-    modes = Stepping(field, ())
+    modes = Stepping(field, field.ledger, ())
     with ExitStack() as first, ExitStack() as second:
         first.enter_context(modes.fine(NAMES))
         assert modes.due(0.0, 7) == {}, "nothing is known of them yet"
@@ -53,22 +61,22 @@ def test_rough_steps_are_left_for_a_visit_and_come_back_after_the_last_one() -> 
         assert modes.due(1.0, 0) == {}, "nobody has the command authority"
         assert modes.due(1.0, 7) == {False: ("A", "B")}
         assert modes.coarse(NAMES, 1.0) == ("A", "B")
-        modes.sent(("A", "B"), 1.0)
+        order(field, modes, ("A", "B"), 1.0)
         field.hear(1.5, A=False)
         assert modes.coarse(NAMES, 1.5) == ("A", "B"), "it may be from before the order"
         field.hear(2.5)
         assert modes.coarse(NAMES, 2.5) == ("B",)
         assert modes.due(3.9, 7) == {}
         assert modes.due(4.0, 7) == {False: ("B",)}, "it did not obey"
-        modes.sent(("B",), 4.0)
+        order(field, modes, ("B",), 4.0)
         field.hear(6.0, B=False)
         second.enter_context(modes.fine(("B",)))
         first.close()
         assert modes.due(6.0, 7) == {True: ("A",)}, "another visit needs B"
-        modes.sent(("A",), 6.0)
+        order(field, modes, ("A",), 6.0)
         second.close()
         assert modes.due(7.5, 7) == {True: ("B",)}
-        modes.sent(("B",), 7.5)
+        order(field, modes, ("B",), 7.5)
         field.hear(10.0, A=True, B=True)
         assert modes.due(10.0, 7) == {}
     # One that a person lets step finely later is left so.
@@ -78,13 +86,13 @@ def test_rough_steps_are_left_for_a_visit_and_come_back_after_the_last_one() -> 
 
 def test_one_that_restarts_in_a_visit_takes_fine_steps_again() -> None:
     field = Field()
-    modes = Stepping(field, ())
+    modes = Stepping(field, field.ledger, ())
     with modes.fine(("C",)):
         field.hear(1.0)
         assert modes.due(1.0, 7) == {}
         field.hear(2.0, C=True)
         assert modes.due(2.0, 7) == {False: ("C",)}
-        modes.sent(("C",), 2.0)
+        order(field, modes, ("C",), 2.0)
         field.hear(4.0, C=False)
         assert modes.due(4.0, 7) == {}
     assert modes.due(5.0, 7) == {True: ("C",)}
@@ -92,24 +100,41 @@ def test_one_that_restarts_in_a_visit_takes_fine_steps_again() -> None:
 
 def test_what_a_person_orders_during_a_visit_holds_after_it() -> None:
     field = Field()
-    modes = Stepping(field, ())
+    modes = Stepping(field, field.ledger, ())
     with modes.fine(("A", "C")):
         field.hear(1.0)
         assert modes.due(1.0, 7) == {False: ("A",)}
-        modes.sent(("A",), 1.0)
+        order(field, modes, ("A",), 1.0)
         modes.ordered(("A",), rough=False)
         modes.ordered(("C",), rough=True)
         field.hear(4.0, A=False)
     assert modes.due(4.0, 7) == {True: ("C",)}
 
 
+def test_a_report_from_before_a_person_s_order_settles_nothing() -> None:
+    """It showed fine steps, so the plant ordered no rough ones after the board had obeyed."""
+    field = Field()
+    modes = Stepping(field, field.ledger, ("C",))
+    field.hear(1.0, C=True)
+    with modes.fine(("C",)):
+        order(field, modes, ("C",), 1.0)
+        field.hear(3.0, C=False)
+        assert modes.coarse(("C",), 3.0) == ()
+        field.ledger.sent("ROUGH", ("C",), 3.0)
+        assert modes.coarse(("C",), 3.1) == ("C",), "a person has just ordered other steps"
+        field.hear(3.5)
+        assert modes.due(3.5, 7) == {}
+        field.hear(4.5, C=True)
+        assert modes.due(4.5, 7) == {False: ("C",)}
+
+
 def test_drivers_that_rest_are_not_left_on_by_an_earlier_run() -> None:
     field = Field()
-    modes = Stepping(field, ("B", "C"))
+    modes = Stepping(field, field.ledger, ("B", "C"))
     assert modes.due(0.0, 7) == {}
     field.hear(1.0)
     assert modes.due(1.0, 7) == {True: ("C",)}
-    modes.sent(("C",), 1.0)
+    order(field, modes, ("C",), 1.0)
     field.hear(3.0, C=True)
     assert modes.due(3.0, 7) == {}
     # From now on it is a person's matter.

@@ -9,7 +9,7 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.visit import Visit

@@ -18,6 +18,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.field.aims import BeamCheck
 from heliotrope.plant.field.assigned import Points
 from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.motion.paths import Paths
 from heliotrope.plant.motion.stray_beams import StrayBeams
 from heliotrope.safety import Act
 from support.plant_bench import Bench, running
@@ -91,7 +92,7 @@ def test_a_beam_left_on_the_receiver_is_sent_off_in_every_state(state: int, tmp_
     assert sent[-1].name == "STOW"
 
 
-def test_each_mirror_that_stands_is_looked_at_in_turn(tmp_path: Path) -> None:
+def test_each_mirror_that_stands_is_checked_in_turn(tmp_path: Path) -> None:
     names = ("P5A", "P5B", "P5C")
 
     async def scene(bench: Bench) -> None:
@@ -203,16 +204,17 @@ def test_stow_is_ordered_where_defocus_ends_on_the_receiver(share: float, act: A
     field.rows["primary"][row], field.rows["secondary"][row] = counts
     field.rows["state"][row] = states.LOCKED
     points = Points(field.names, None)
-    unsent = StrayBeams(check, field, points, lambda _: SUN, {})
-    assert unsent.way_out("P5A", again=False) is act
-    assert unsent.way_out("P5A", again=True) is Act.STOW
+    check.machines.clear()
+    stray = StrayBeams(Paths(check), field, points, lambda _: SUN)
+    assert stray.order_out("P5A", again=False) is act
+    assert stray.order_out("P5A", again=True) is Act.STOW
     # It has turned since it was locked: DEFOCUS turns it no further.
     field.turned[row] = True
-    assert unsent.way_out("P5A", again=False) is Act.STOW
+    assert stray.order_out("P5A", again=False) is Act.STOW
     field.turned[row] = False
     # Held beside its aim on the receiver, it turns away from that.
     points.aims[row], points.standbys[row] = ON, BESIDE
-    assert unsent.way_out("P5A", again=False) is Act.DEFOCUS
+    assert stray.order_out("P5A", again=False) is Act.DEFOCUS
 
 
 def test_step_counts_from_before_an_order_prove_no_defocus(tmp_path: Path) -> None:

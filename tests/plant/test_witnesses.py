@@ -19,6 +19,8 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.plant.field.witnesses import PHOTOGRAPHS, SatelliteWitness, SunSensorFile, Witnesses
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.orders.authority import RefusedError
+from heliotrope.plant.orders.guards import Asked
+from heliotrope.plant.refusals import NOT_NOW
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Alarm, Severity
 from heliotrope.store.keeper import Keeper
@@ -194,13 +196,16 @@ def test_a_plant_sends_beams_to_targets_only_until_a_witness_agrees(tmp_path: Pa
             ticket = plant.command(OPERATOR, token, "TRACK", ("P5A", "P5B"))
             assert ticket.blocked.keys() == {"P5B"}
             assert "no independent witness confirms the sun" in ticket.blocked["P5B"]
-            assert not plant.held(("P5A",))
+            assert not plant.guards.reasons(Asked("APPROACH", ("P5A",)), NOT_NOW)
             plant.witnesses.take(SENSOR, sun(600.0), 0.0)
-            assert "a clock that is" in plant.held(("P5A",))["P5A"], "nothing leaves stow by it"
+            assert (
+                "a clock that is"
+                in plant.guards.reasons(Asked("APPROACH", ("P5A",)), NOT_NOW)["P5A"]
+            ), "nothing leaves stow by it"
             with pytest.raises(RefusedError, match=r"TRACK P5B.*a clock that is 6\d\d s slow"):
                 plant.command(OPERATOR, token, "TRACK", ("P5B",))
             plant.witnesses.take(SENSOR, sun(0.0), 0.0)
-            assert not plant.held(("P5A",))
+            assert not plant.guards.reasons(Asked("APPROACH", ("P5A",)), NOT_NOW)
             assert await plant.command(OPERATOR, token, "TRACK", ("P5B",)).end(5.0)
 
     run_virtual(main)

@@ -282,8 +282,8 @@ class Motion:
                 return away
         return low if angle - low > high - angle else high
 
-    def _turn(self) -> "Pose | None":
-        """Choose by how much a defocus turns; return the pose in which one from standby ends.
+    def _turn(self) -> "list[float] | None":
+        """Choose by how much a defocus turns; return the angles in which one from standby ends.
 
         From standby, held there too, it goes down the safe way, and on the way up back as it has
         come, until an axis has turned by its angle or the ground is reached. No other place is
@@ -307,7 +307,8 @@ class Motion:
             first, second = abs(near[0] - pose.angles[0]), abs(near[1] - pose.angles[1])
             if max(first, second) > FAR:
                 break
-            found, self._target, self._offset = pose, point, (0.0, 0.0)
+            # The next pose overwrites this one, even where the beam cannot follow.
+            found, self._target, self._offset = list(pose.angles), point, (0.0, 0.0)
             if first >= one or second >= two or point[2] <= way[0][2]:
                 break
         tracks = kind in (TRACK, SEARCH)
@@ -385,7 +386,7 @@ class Motion:
             away = self._away(i, here)
             # The other way is twice as far: past the place where the first turn began.
             angles[i] = away if sense > 0 else 3.0 * here - 2.0 * away
-        self._go_angles(angles if found is None else found.angles, BOTH)
+        self._go_angles(angles if found is None else found, BOTH)
         self.aside = (self.goal(0), self.goal(1)) if self.known else None
 
     def stow(self) -> None:

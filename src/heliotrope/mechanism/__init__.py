@@ -10,6 +10,7 @@ The names of these modules are used through the module:
 - `guo`: Guo's closed form for azimuth-elevation heliostats, a cross-check of `track`.
 - `parameters`: the parameter table and the models.
 - `board_items`: the bytes that a local controller stores of a mechanism and its machine.
+- `board_motion`: where local controllers send their mirrors, over arrays.
 - `kernels`: the compiled code.
 """
 

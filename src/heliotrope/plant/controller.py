@@ -63,25 +63,29 @@ from heliotrope.plant.field.doubtful_positions import DoubtfulPositions
 from heliotrope.plant.field.drive_checks import DriveChecks
 from heliotrope.plant.field.firmware import Firmware
 from heliotrope.plant.field.identity import Identities
+from heliotrope.plant.field.ledger import Ledger
 from heliotrope.plant.field.lockouts import Lockouts
 from heliotrope.plant.field.locks import Locks
 from heliotrope.plant.field.second_plant import SecondPlant
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.field.witnesses import Witnesses
-from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.motion.paths import Paths
+from heliotrope.plant.motion.proofs import BeamError, PathProofs
+from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.audit import Audit
 from heliotrope.plant.orders.authority import Authority, Grant, Person, Role
 from heliotrope.plant.orders.commands import Commands
+from heliotrope.plant.orders.dispatch import JoinDispatcher
 from heliotrope.plant.orders.giving_back import GivingBack
 from heliotrope.plant.orders.guards import Asked, Guards
-from heliotrope.plant.orders.joining import JoinDispatcher, JoinQueue
+from heliotrope.plant.orders.joining import JoinQueue
 from heliotrope.plant.orders.movements import Movements
 from heliotrope.plant.orders.parameters import ParameterSync, Tables, change_of_beam
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.stepping import Stepping
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.orders.unacknowledged import Unacknowledged
-from heliotrope.plant.refusals import BEAM_REFUSED, OUT_OF_SERVICE
+from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
 from heliotrope.sun import fast_vector
@@ -130,7 +134,8 @@ class PlantController:
 
     Attributes
     ----------
-    design, settings, field, authority, wanted, counters, beliefs, doubtful, witnesses, drive_checks
+    design, settings, field, ledger, authority, wanted, counters, beliefs, doubtful, witnesses,
+    drive_checks
         See their classes.
     beams
         Mirrors and keep-out volumes; see `BeamCheck`.
@@ -142,8 +147,9 @@ class PlantController:
         Locks of persons; EMERGENCY, DEFOCUS and STOW pass them.
     aims, standbys
         Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
-    commands, sentinel
-        What gives persons' commands; the safety table with the emergencies that stand.
+    commands, guards, sentinel
+        What gives persons' commands, and what stops them whatever the paths are; the safety table
+        with the emergencies that stand.
     movements, locks, stepping
         Aims that visits have moved, heliostats that they have locked, and fine steps that they
         need; the plant gives back what they leave.
@@ -180,6 +186,7 @@ class PlantController:
         self.clock, self._on_alarm = clock, on_alarm
         self.alarms, self.counters = deque[Alarm](maxlen=1000), Counters()
         self.field = FieldState(members, self.settings.stale)
+        self.ledger = Ledger(self.field)
         self.authority = Authority(clock, self.settings.authority, entropy)
         self.wanted = wanted or Wanted()
         self.beams = BeamCheck(design, self.field.names, volumes, eyes)
@@ -190,9 +197,12 @@ class PlantController:
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
         resting = (name for name, each in self.beams.machines.items() if each.rests)
-        self.stepping = Stepping(self.field, resting, points.held["ROUGH"])
-        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, self.beams.machines)
-        self.locks = Locks(self.field, self._ways.ordered, lambda: clock.utc().timestamp())
+        self.stepping = Stepping(self.field, self.ledger, resting, points.held["ROUGH"])
+        self._proofs = PathProofs(
+            Paths(self.beams), self.field, self.ledger, points, self.sun_vector
+        )
+        self._watch = BeamWatch(self._proofs)
+        self.locks = Locks(self.field, self.ledger, lambda: clock.utc().timestamp())
         self.locks.recall(points.held["LOCKED"], clock.monotonic())
         self.movements.recall(points.held["LENT"])
         self._agreement = self._compared(points)
@@ -226,7 +236,7 @@ class PlantController:
         )
         self.sentinel = self._guarded(table, record)
         self._given = Unacknowledged(self.field, points)
-        self._guards = self._guarding()
+        self.guards = self._guarding()
         self.commands = self._directed()
         self._joiner = self._dispatching()
         self._giving_back = self._returning()
@@ -273,7 +283,7 @@ class PlantController:
             self.field,
             self.authority,
             self._orders,
-            self._ways,
+            self._watch,
             self._agreement,
             self.sun_vector,
         )
@@ -289,7 +299,7 @@ class PlantController:
             self.field,
             self._orders,
             self._joining,
-            self._ways,
+            self._watch,
             self.beams.drives,
             self.settings.repeat,
             self._identities,
@@ -318,6 +328,7 @@ class PlantController:
         """Return what compares reports with the plant's own knowledge."""
         return Agreement(
             self.field,
+            self.ledger,
             points,
             self.beams,
             self.design.site,
@@ -332,9 +343,9 @@ class PlantController:
             self.field,
             self._orders,
             self._joining,
-            self._guards,
+            self.guards,
             self._given,
-            self._ways,
+            self._proofs,
             self.design,
             self.wanted,
             self.settings.join_wait,
@@ -350,9 +361,9 @@ class PlantController:
             self.now,
             self._joining,
             self._orders,
-            self._ways,
+            self._proofs,
             self.settings.join_life,
-            self._guards.in_turn,
+            self.guards,
             self.commands.examine,
         )
 
@@ -362,7 +373,7 @@ class PlantController:
             self.field,
             self.authority,
             self._orders,
-            self._guards,
+            self.guards,
             self.commands,
             self.movements,
             self.locks,
@@ -386,7 +397,7 @@ class PlantController:
                 await end.link.close()
             for task in tasks:
                 task.cancel()
-        if work := self._ways.points.settling():
+        if work := self._proofs.points.settling():
             self._orders.owe(work)
         await self._orders.end(self.now())
 
@@ -425,21 +436,25 @@ class PlantController:
                 )
 
     def _sent(
-        self, name: str, values: tuple[float, ...], heliostats: tuple[str, ...], now: float
+        self,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: tuple[str, ...],
+        now: float,
+        again: bool,
     ) -> None:
         """Note what has been sent to heliostats."""
-        self._agreement.sent(name, values, heliostats, now)
-        self._ways.ordered.sent(name, heliostats, now)
+        self._agreement.sent(name, values, heliostats)
+        self.ledger.sent(name, heliostats, now, again=again)
 
     def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
         """Note what some heliostats of a ticket have acknowledged or done."""
         if stage is Stage.DONE and ticket.name == "DIAGNOSE":
             self.drive_checks.ask(part)
         if stage is Stage.ACKNOWLEDGED:
-            self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
-            self._ways.ordered.taken(ticket.name, part, now)
+            self.ledger.acknowledged(ticket.name, ticket.accepted_at, part, now)
         elif stage is Stage.REFUSED:
-            self._ways.ordered.refused(ticket.name, part, now)
+            self.ledger.refused(ticket.name, part, now)
         elif stage is Stage.DONE and ticket.name in KINDS:
             self._given.done(ticket, part)
             for name in self.wanted.missing.keys() & part:
@@ -488,7 +503,7 @@ class PlantController:
             self._slow_at = now
             self.witnesses.beat()
             self._firmware.beat(now)
-            points, held = self._ways.points, self._held()
+            points, held = self._proofs.points, self._held()
             for work in (points.settling(), points.released(held, now)):
                 if work is not None:
                     self._orders.owe(work)
@@ -520,7 +535,7 @@ class PlantController:
     @property
     def standby_unknown(self) -> npt.NDArray[np.bool_]:
         """Which heliostats may have any standby point, (N,); see `Points.unknown`."""
-        return self._ways.points.unknown("STANDBY")
+        return self._proofs.points.unknown("STANDBY")
 
     @property
     def waiting(self) -> int:
@@ -561,16 +576,12 @@ class PlantController:
         """Return why a heliostat that is LOCKED is so, since when and until when, in words."""
         mandate = self.authority.visited().get(heliostat)
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
-        held = self._guards.held("UNLOCK", (heliostat,))
+        held = self.guards.reasons(Asked("UNLOCK", (heliostat,)), NOT_NOW)
         return self.locks.reason(heliostat, visit, held.get(heliostat, ""))
 
     def waits_to_stow(self, heliostat: str) -> bool:
         """Return whether a heliostat waits for its turn to go to stow."""
         return self._orders.to_stow(heliostat)
-
-    def ordered_off(self, seen: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which heliostats were ordered off by anybody, (N,); see `Ordered.off`."""
-        return self._ways.ordered.off(seen, self.now())
 
     def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
         for name in heliostats:
@@ -835,10 +846,10 @@ class PlantController:
         self._agreement.believe(row, armature, drives)
         self._give_up(self._identities.learn(row, armature))
 
-    def _give_up(self, heliostats: Mapping[str, str]) -> None:
+    def _give_up(self, heliostats: tuple[str, ...]) -> None:
         """Let heliostats that are not what they seem wait no longer to join."""
         if heliostats:
-            self._joining.drop(next(iter(heliostats.values())), frozenset(heliostats))
+            self._joining.drop(self._identities.strange[heliostats[0]], frozenset(heliostats))
 
     def _tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
         """Return the tables of a heliostat's mechanism now, and once items are stored."""
@@ -852,40 +863,20 @@ class PlantController:
 
         It may not join the receiver, and its ways are proven with both.
         """
-        with self.doubtful.unverified(heliostat), self._ways.unverified(heliostat):
+        with self.doubtful.unverified(heliostat), self._proofs.unverified(heliostat):
             yield
 
     def misled(self, heliostat: str, point: FloatArray) -> str:
         """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
-        return self._ways.misled(heliostat, point)
-
-    def held(self, heliostats: Sequence[str]) -> Mapping[str, str]:
-        """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
-        return self._guards.held("APPROACH", heliostats)
-
-    def blocked(
-        self, name: str, heliostats: Sequence[str], aims: FloatArray | None = None
-    ) -> dict[str, str]:
-        """Return the heliostats that may not be given a command now, whatever their paths are.
-
-        Parameters
-        ----------
-        name
-            The command.
-        heliostats
-            Names (K).
-        aims
-            Points that they get before they join them, ENU, m, (K, 3); None: no new ones.
-        """
-        return self._guards.reasons(Asked(name, tuple(heliostats), aims))
+        return self._proofs.misled(heliostat, point)
 
     def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
-        return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+        return self._proofs.rewriting(heliostat, *self._tables(heliostat, items)[1])
 
     def _unwritable(self, heliostat: str) -> str | None:
         """Return why nothing may be written to a heliostat, None if it may."""
         asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
-        return self._guards.reasons(asked, *kinds).get(heliostat)
+        return self.guards.reasons(asked, *kinds).get(heliostat)
 
     def _resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
         """Return why a heliostat may not rest at the stow position in items, "" if it may."""

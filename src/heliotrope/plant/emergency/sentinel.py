@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from heliotrope.lcu import messages, states
 from heliotrope.lcu import names as meanings
-from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
@@ -26,7 +26,7 @@ from heliotrope.plant.emergency.table import ORDERED, TableWatch
 from heliotrope.plant.field.drive_checks import DriveChecks
 from heliotrope.plant.field.identity import Identities
 from heliotrope.plant.field.state import FieldState
-from heliotrope.plant.motion.beam_watch import BeamWatch
+from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.joining import JoinQueue
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.tickets import Ticket
@@ -60,7 +60,7 @@ class Sentinel:
         Clock of the plant.
     table
         The plant's rows of the safety table.
-    field, orders, joining, ways
+    field, orders, joining, watch
         Of the plant.
     drives
         Of the heliostats, (N, 2), for the proof.
@@ -93,7 +93,7 @@ class Sentinel:
         field: FieldState,
         orders: PlantOrders,
         joining: JoinQueue,
-        ways: BeamWatch,
+        watch: BeamWatch,
         drives: Drive,
         repeat: float,
         identities: Identities,
@@ -114,12 +114,11 @@ class Sentinel:
         known = {"", *field.names, *field.clusters}
         table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
-        self._orders, self._joining, self._ways = orders, joining, ways
+        self._orders, self._joining, self._watch = orders, joining, watch
         self._drives, self._repeat, self._identities = drives, repeat, identities
         self._drive_checks = drive_checks
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
-        self._sent_off: dict[str, float] = {}
         #: Orders to single heliostats while their rows hold: number, and time of the next.
         self._tries: dict[str, tuple[int, float]] = {}
         self._repeated_at = -math.inf
@@ -174,7 +173,7 @@ class Sentinel:
                 text = self.table.reasons(Act.DEFOCUS, name)
                 self._joining.drop(text, frozenset(members))
                 self.send_safe(_TABLE, act, members, text)
-                self._ways.ordered.follows_loss(members)
+                self._watch.proofs.ledger.follows_loss(members)
 
     def _obey_heliostats(self, now: float) -> None:
         """Send heliostats off, and send them again until their rows release.
@@ -182,18 +181,17 @@ class Sentinel:
         A heliostat that has just been sent off has the time to show it, unless DEFOCUS has turned
         it already: its beam stays where it may not be until it is stowed.
         """
-        self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
         wanted = {**self.table.off(), **self._identities.off(now)}
         self._tries = {name: tried for name, tried in self._tries.items() if name in wanted}
-        order = self.order if self.on else None
+        just_sent = self._watch.proofs.ledger.sent_since(messages.SAFE, now - OFF_SHOWS)
         sent: dict[Act, dict[str, str]] = {}
         for name, (act, text) in wanted.items():
             tries, due = self._tries.get(name, (0, -math.inf))
-            whole = order is not None and now - order.at < OFF_SHOWS
-            if now < due or ((whole or name in self._sent_off) and not self._ways.turned(name)):
+            waits = just_sent[self._field.index[name]] and not self._watch.turned(name)
+            if now < due or waits:
                 continue
             self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
-            best = self._ways.way_out(name, again=tries > 0)
+            best = self._watch.order_out(name, again=tries > 0)
             if self._proving is not None and (self.on or name in self._unproven):
                 best = max(best, self._proving.act)
             sent.setdefault(max(act, best), {})[name] = text
@@ -330,10 +328,9 @@ class Sentinel:
             (*giver, act.name), (), heliostats, note, late=True, fault=giver is _TABLE
         )
         if in_turn and act is Act.STOW and not self.on:
-            heliostats = self._orders.stow_in_turn(ticket, heliostats)
+            self._orders.stow_in_turn(ticket, heliostats)
         else:
             self._orders.emergency(ticket, act, heliostats)
-        self._sent_off.update(dict.fromkeys(heliostats, self._clock.monotonic()))
         return ticket
 
     def greet(self, cluster: str) -> None:
@@ -379,7 +376,7 @@ class Sentinel:
             heliostats = tuple(
                 n for n in heliostats if good[self._field.index[n]] and not self._doubted(n)
             )
-            if self._ways.stray.watches:
+            if self._watch.stray.watches:
                 stage = Stage.ACKNOWLEDGED
         order.take_stage(heliostats, stage, self._clock.monotonic())
 
@@ -395,7 +392,7 @@ class Sentinel:
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
-            lit = self._ways.stray.lit(index)
+            lit = self._watch.stray.lit(index)
             order.take_rows(
                 tuple(self._field.names[r] for r in rows),
                 self._field.rows[index],
@@ -445,7 +442,7 @@ class Sentinel:
 
     def _last_of(self, row: int, now: float) -> str:
         """Return, in words, where a heliostat with unknown step counts was last."""
-        field, points = self._field, self._ways.points
+        field, points = self._field, self._watch.proofs.points
         text = f"{field.names[row]}: step counts unknown, so it is not proven to be off; "
         if not math.isfinite(field.posed_at[row]):
             return text + "nothing is known of its beam"

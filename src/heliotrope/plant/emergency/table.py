@@ -11,7 +11,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.field.agreement import Agreement
 from heliotrope.plant.field.state import FieldState
-from heliotrope.plant.motion.beam_watch import BeamWatch
+from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.authority import Authority
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.safety import (
@@ -293,8 +293,8 @@ class TableWatch:
             if a.scope is Scope.HELIOSTAT and a.act >= Act.DEFOCUS and a.subject and not a.waits
         }
 
-    def barred(self, condition: str = "") -> dict[str, str]:
-        """Return the heliostats that one row, or any, keeps from their aims, by name, and why."""
+    def blocked(self, condition: str = "") -> dict[str, str]:
+        """Return the heliostats that one row, or any, keeps from their aims, and the reasons."""
         return {
             a.subject: a.text
             for a in self.actions

@@ -29,6 +29,7 @@ from heliotrope.mechanism.board_items import packed
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.field.aims import BeamCheck
 from heliotrope.plant.field.assigned import Points, differ, put_before
+from heliotrope.plant.field.ledger import TO_REST, Ledger
 from heliotrope.plant.field.state import FieldState, Mask
 from heliotrope.safety import Reading
 from heliotrope.sun import Site, fast_vector
@@ -69,21 +70,18 @@ class _Points:
         The points before the assigned ones, the latest first, (`assigned.BEFORE`, N, 3); NaN from
         where the beam was found: an assigned point may be refused by the local controller, and
         then the beam goes on to one before.
-    changed_at
-        When each point was seen to change, monotonic s, (N,).
     """
 
     def __init__(self, points: FloatArray, before: FloatArray) -> None:
         self.points, self._last = points, points.copy()
         self.before = before.copy()
-        self.changed_at = np.full(len(points), -np.inf)
 
-    def look(self, now: float) -> Mask:
+    def look(self) -> Mask:
         """Return which points have changed since the last look, (N,)."""
         new, last = self.points, self._last
         changed = differ(new, last)
         put_before(self.before, np.flatnonzero(changed), last[changed])
-        self.changed_at[changed], last[changed] = now, new[changed]
+        last[changed] = new[changed]
         return changed
 
     def beside(self, rows: Rows, beam: FloatArray, vertex: FloatArray) -> FloatArray:
@@ -101,8 +99,8 @@ class Agreement:
 
     Parameters
     ----------
-    field, points
-        State of the field; assigned aims.
+    field, ledger, points
+        State of the field; what was ordered; assigned aims.
     check
         Mirrors as the plant knows them at its start.
     site
@@ -116,13 +114,15 @@ class Agreement:
     def __init__(
         self,
         field: FieldState,
+        ledger: Ledger,
         points: Points,
         check: BeamCheck,
         site: Site,
         utc: Callable[[], float],
         differing: Callable[[str], str | None],
     ) -> None:
-        self._field, self._site, self._utc, self._differing = field, site, utc, differing
+        self._field, self._ledger, self._site, self._utc = field, ledger, site, utc
+        self._differing = differing
         self._aims = _Points(points.aims, points.earlier["AIM"])
         self._standbys = _Points(points.standbys, points.earlier["STANDBY"])
         self._armature, self._drives = check.armature.table.copy(), check.drives.table.copy()
@@ -134,8 +134,8 @@ class Agreement:
         #: States at the last look; those whose beams are sent to aims and to standby points.
         self._states = np.full(count, -1, dtype=np.int64)
         self._on_aim, self._at_rest = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        #: Since when they are; when a command that leaves them still was last sent, monotonic s.
-        self._since, self._stilled_at = np.full(count, np.inf), np.full(count, -np.inf)
+        #: Since when they are, and to the present points, monotonic s.
+        self._since = np.full(count, np.inf)
         #: Radius of the last search, rad.
         self._radius = np.full(count, np.nan)
         self._lag = np.full(count, np.inf)
@@ -148,30 +148,13 @@ class Agreement:
         """Take new parameters, which hold once the local controller reports their checksum."""
         self._pending[row] = crc32(packed("armature", tuple(armature))), armature, drives
 
-    def sent(
-        self, name: str, values: Sequence[float], heliostats: Collection[str], now: float
-    ) -> None:
-        """Note a command that has been sent."""
-        if name != "SEARCH" and name not in messages.STANDS:
-            return
-        rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+    def sent(self, name: str, values: Sequence[float], heliostats: Collection[str]) -> None:
+        """Note how far a command that has been sent lets beams go."""
         if name == "SEARCH":
+            rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
             # One that searches already goes on with its spiral if it refuses the new one.
             searches = self._field.rows["state"][rows] == states.SEARCHING
             self._radius[rows] = np.fmax(values[1], np.where(searches, self._radius[rows], np.nan))
-            return
-        self._stilled_at[rows], self._at_rest[rows] = now, False
-
-    def obeyed(self, name: str, accepted_at: float, heliostats: Sequence[str], now: float) -> None:
-        """Note a command, accepted at a monotonic time, that has been acknowledged.
-
-        IDLE brings back to its standby point one that is IDLE already and stands elsewhere.
-        """
-        if name == "IDLE":
-            rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
-            rows = rows[(self._stilled_at[rows] < accepted_at) & ~self._at_rest[rows]]
-            rows = rows[self._field.rows["state"][rows] == states.IDLE]
-            self._at_rest[rows], self._since[rows] = True, now
 
     def take(self, cluster: str, status: ClusterStatus) -> None:
         """Take a cluster's status that has just arrived."""
@@ -187,8 +170,8 @@ class Agreement:
         A cluster that has fallen silent keeps its last difference: its silence has its own row.
         """
         if now - self._at >= LOOK_PERIOD:
-            self._at = now
             self._look(now)
+            self._at = now
         found = {("pointing_error", name): Reading(x, now) for name, x in self._wrong.items()}
         found["pointing_error", ""] = Reading(0.0, now)
         found["pointing_errors", ""] = Reading(float(len(self._wrong)), now)
@@ -206,15 +189,16 @@ class Agreement:
                 del self._pending[row]
         begins = self._sort(now)
         self._aims.before[:, field.live(now) & ~self._on_aim] = np.nan
-        aims, standbys = self._aims.look(now), self._standbys.look(now)
+        aims, standbys = self._aims.look(), self._standbys.look()
         begins |= np.where(self._on_aim, aims, standbys)
+        self._since[begins] = now
         self._lag[begins], self._stands[begins] = np.inf, False
         kinds = ((self._on_aim, self._aims), (self._at_rest, self._standbys))
         error = np.zeros(len(field))
         for mine, sent in kinds:
             # Counts from before a new point say nothing about it.
-            begun = np.maximum(self._since, sent.changed_at) + _SETTLE
-            known = np.isfinite(sent.points).all(axis=-1) & (field.counted_at >= begun)
+            newer = field.counted_at >= self._since + _SETTLE
+            known = np.isfinite(sent.points).all(axis=-1) & newer
             rows = np.flatnonzero(mine & known & field.sure(now))
             error[rows] = self._errors(rows, sent, now)
         searches = self._on_aim & (self._states == states.SEARCHING)
@@ -228,12 +212,15 @@ class Agreement:
         field = self._field
         live, state = field.live(now), field.rows["state"].astype(np.int64)
         ready = live & (state == states.IDLE) & (field.rows["flags"] & meanings.READY != 0)
-        came = ready & np.isin(self._states, _COMES) & (self._stilled_at < now - _UNDER_WAY)
-        at_rest = np.where(live, ready & (self._at_rest | came), self._at_rest)
+        # IDLE brings back one that is IDLE already and stands elsewhere.
+        came = self._ledger.obeyed_since(TO_REST, self._at, after=messages.STANDS)
+        stilled = self._ledger.sent_since(messages.STANDS, now - _UNDER_WAY)
+        came |= np.isin(self._states, _COMES) & ~stilled
+        stays = self._at_rest & ~self._ledger.sent_since(messages.STANDS, self._at)
+        at_rest = np.where(live, ready & (stays | came), stays)
         on_aim = live & np.isin(state, states.ON_AIM)
         on_aim &= (state == states.TRACKING) | np.isfinite(self._radius)
-        begins = (on_aim & ~self._on_aim) | (at_rest & ~self._at_rest)
-        self._since[begins] = now
+        begins = (on_aim & ~self._on_aim) | (at_rest & ~stays)
         self._on_aim, self._at_rest = on_aim, at_rest
         self._states[live] = state[live]
         return np.asarray(begins | ~(on_aim | at_rest))

@@ -93,10 +93,9 @@ class DoubtfulPositions:
         finally:
             self._unverified.discard(row)
 
-    def verifying(self, heliostats: Iterable[str]) -> dict[str, str]:
-        """Return the heliostats whose new parameters are being verified, and the reasons."""
-        place, text = self._field.place, refusals.NOT_VERIFIED.text
-        return {name: text for name in heliostats if place(name) in self._unverified}
+    def verifying(self, heliostats: Iterable[str]) -> tuple[str, ...]:
+        """Return the heliostats whose new parameters are being verified."""
+        return tuple(name for name in heliostats if self._field.place(name) in self._unverified)
 
     def astray(self, heliostats: Iterable[str]) -> None:
         """Keep heliostats off the receiver that a flight sees far from where they should be.

@@ -78,15 +78,15 @@ class Identities:
             if "armature" in items:
                 self._owners[crc32(items["armature"])].add(field.index[name])
 
-    def learn(self, row: int, armature: FloatArray) -> dict[str, str]:
+    def learn(self, row: int, armature: FloatArray) -> tuple[str, ...]:
         """Add an armature (18,) that a heliostat may store; return as `look`."""
         crc = crc32(np.ascontiguousarray(armature).tobytes())
         if row in self._owners[crc]:
-            return {}
+            return ()
         self._owners[crc].add(row)
         return self._judge(np.flatnonzero(self._stored == crc).tolist())
 
-    def look(self, cluster: str) -> dict[str, str]:
+    def look(self, cluster: str) -> tuple[str, ...]:
         """Judge the heliostats of a cluster by its status; return those newly found strange."""
         self._judged[cluster] = self._connections(cluster)
         self._compare_rows(cluster)
@@ -106,14 +106,14 @@ class Identities:
             self._tell(alarms.UNLISTED.ended(name, cluster=cluster))
         self._unlisted = (self._unlisted - known) | unlisted
 
-    def _judge(self, changed: list[int]) -> dict[str, str]:
+    def _judge(self, changed: list[int]) -> tuple[str, ...]:
         """Judge rows whose checksum, or its owners, have changed, and with them their pairs."""
         for row in changed:
             self._own[row] = row in self._of(row)
             alien = not self._own[row] and bool(self._of(row))
             (self._foreign.add if alien else self._foreign.discard)(row)
         if not changed or not (self._foreign or self.strange):
-            return {}
+            return ()
         names, found = self._field.names, dict[str, str]()
         pairs = [(row, other) for row in sorted(self._foreign) for other in sorted(self._of(row))]
         for row, other in pairs:
@@ -123,9 +123,9 @@ class Identities:
             if not self._own[other]:
                 text = f"its parameters answer at the address of {names[row]}"
                 found.setdefault(names[other], text)
-        new = {name: text for name, text in found.items() if self.strange.get(name) != text}
-        for name, text in new.items():
-            self._tell(alarms.IDENTITY.raised(name, problem=text))
+        new = tuple(name for name, text in found.items() if self.strange.get(name) != text)
+        for name in new:
+            self._tell(alarms.IDENTITY.raised(name, problem=found[name]))
         for name in self.strange.keys() - found.keys():
             self._tell(alarms.IDENTITY.ended(name))
         self.strange = found

@@ -7,7 +7,7 @@ sent; under a locked tower no heliostat leaves stow. EMERGENCY, DEFOCUS and STOW
 """
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -84,10 +84,10 @@ class Lockouts:
                 found[f"{kind} {name} is locked: {self.text(kind, name)}"] = np.asarray(near)
         return found
 
-    def blocked(
-        self, heliostats: Collection[str], points: FloatArray | None = None
-    ) -> dict[str, str]:
-        """Return the heliostats that no command may move, and the reasons.
+    def reasons(
+        self, heliostats: Sequence[str], points: FloatArray | None = None
+    ) -> list[str | None]:
+        """Return why no command may move each of some heliostats, None if one may.
 
         Parameters
         ----------
@@ -96,17 +96,12 @@ class Lockouts:
         points
             Where their beams are to be sent, ENU, m, (K, 3); None: to no surface.
         """
-        if not self._locks:
-            return {}
-        reasons: dict[str, str] = {}
-        if points is not None:
-            names = tuple(heliostats)
-            for text, on in self.closed(points).items():
-                reasons |= {names[i]: text for i in np.flatnonzero(on)}
-        if tower := self.text(Kind.TOWER, TOWER):
-            reasons |= dict.fromkeys(heliostats, f"the tower is locked: {tower}")
-        return reasons | {
-            name: f"out of service: {self.text(Kind.HELIOSTAT, name)}"
-            for name in heliostats
-            if name in self
-        }
+        tower = self.text(Kind.TOWER, TOWER)
+        found = np.full(len(heliostats), f"the tower is locked: {tower}" if tower else None, "O")
+        for text, on in {} if points is None or tower else self.closed(points).items():
+            found[on] = text
+        for i, name in enumerate(heliostats if self.heliostats else ()):
+            if name in self:
+                found[i] = f"out of service: {self.text(Kind.HELIOSTAT, name)}"
+        reasons: list[str | None] = found.tolist()
+        return reasons

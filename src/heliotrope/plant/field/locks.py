@@ -18,11 +18,9 @@ from datetime import UTC, datetime
 from heliotrope.lcu import messages, states
 from heliotrope.lcu import names as meanings
 from heliotrope.plant.field.assigned import Held, Places
-from heliotrope.plant.field.ordered import STOWING, Ordered
+from heliotrope.plant.field.ledger import LOCKING, STOWING, Ledger
 from heliotrope.plant.field.state import FieldState
 
-#: A report from this long after a lock was sent shows it, s.
-_SHOWN = 1.0
 #: Pause before an order is given again, s: it doubles from one to the next, up to the longest.
 _AGAIN, _LONGEST = 3.0, 300.0
 #: A lock that is older when a program starts is left to a person, s.
@@ -33,13 +31,12 @@ _WAIT = "wait"
 
 @dataclass
 class _Lock:
-    """A lock: under which mandate, since when, the next attempt, and whether it was released.
+    """A lock: under which mandate, the next attempt, and whether it was released.
 
     ``at`` is when it was taken, POSIX s; an earlier program took it if it is ``recalled``.
     """
 
     token: int
-    since: float
     due: float
     at: float
     pause: float = _AGAIN
@@ -53,14 +50,14 @@ class Locks:
 
     Parameters
     ----------
-    field, ordered
+    field, ledger
         State of the field, and what was ordered.
     utc
         Returns the time, POSIX s.
     """
 
-    def __init__(self, field: FieldState, ordered: Ordered, utc: Callable[[], float]) -> None:
-        self._field, self._ordered, self._utc = field, ordered, utc
+    def __init__(self, field: FieldState, ledger: Ledger, utc: Callable[[], float]) -> None:
+        self._field, self._ledger, self._utc = field, ledger, utc
         self._locked: dict[str, _Lock] = {}
 
     @property
@@ -71,13 +68,14 @@ class Locks:
     def take(self, heliostats: Iterable[str], token: int, now: float) -> None:
         """Note that heliostats are locked under the mandate of a visit."""
         at = self._utc()
-        self._locked.update({name: _Lock(token, now, now + _SHOWN, at) for name in heliostats})
+        self._locked.update({name: _Lock(token, now, at) for name in heliostats})
 
     def recall(self, held: Places, now: float) -> None:
         """Go on with the locks that an earlier program has left; see `record`."""
+        self._ledger.sent("LOCK", tuple(held), now)  # at the latest
         for name, (at, *_) in held.items():
             sure = 0.0 <= self._utc() - at <= CERTAIN
-            lock = _Lock(0, now, now + _SHOWN, at, recalled=True, uncertain=not sure)
+            lock = _Lock(0, now, at, recalled=True, uncertain=not sure)
             self._locked[name] = lock
 
     def record(self, heliostats: Iterable[str], *, visit: bool) -> Held:
@@ -103,8 +101,7 @@ class Locks:
         if visit:
             return f"{visit} has locked it {since}, until its parameters are written and read back"
         left = "a visit that the plant's program did not survive" if lock.recalled else "a visit"
-        off = lock.recalled or self._ordered.since(heliostat, messages.SAFE, lock.since)
-        there = "at stow, " if off else ""
+        there = "at stow, " if self._off(heliostat, lock) else ""
         return (
             f"{left} has left it locked ({since}); the plant unlocks it {there}as soon as motions "
             "are accepted and somebody has the command authority"
@@ -130,10 +127,9 @@ class Locks:
             ordered something else.
         """
         found: dict[str, list[str]] = {}
+        fresh = self._ledger.reported(LOCKING) & self._field.live(now)
         for name, lock in list(self._locked.items()):
-            heard = self._field.heard[self._field.index[name]]
-            fresh = heard >= lock.since + _SHOWN and now - heard <= self._field.limit
-            if not fresh or not left(lock.token, (name,)):
+            if not fresh[self._field.index[name]] or not left(lock.token, (name,)):
                 continue
             what = self._next(name, lock)
             if not what:
@@ -154,8 +150,9 @@ class Locks:
             return "IDLE" if lock.released and node["state"] == states.IDLE else ""
         if lock.uncertain:
             return _WAIT
-        off = lock.recalled or self._ordered.since(name, messages.SAFE, lock.since)
-        return "STOW" if off and not node["flags"] & meanings.AT_STOW else "UNLOCK"
+        return (
+            "STOW" if self._off(name, lock) and not node["flags"] & meanings.AT_STOW else "UNLOCK"
+        )
 
     def sent(self, what: str, heliostats: Iterable[str]) -> None:
         """Note an order that has been given; one that is not obeyed is given again."""
@@ -168,8 +165,10 @@ class Locks:
 
     def under_way(self, heliostats: Iterable[str]) -> frozenset[str]:
         """Return those that were sent to stow since they were locked: nothing more is needed."""
-        return frozenset(
-            name
-            for name in heliostats
-            if self._ordered.since(name, STOWING, self._locked[name].since)
-        )
+        stowing = self._ledger.later(STOWING, LOCKING)
+        return frozenset(name for name in heliostats if stowing[self._field.index[name]])
+
+    def _off(self, name: str, lock: _Lock) -> bool:
+        """Return whether a heliostat may have been ordered off since it was locked."""
+        later = self._ledger.later(messages.SAFE, LOCKING)
+        return lock.recalled or bool(later[self._field.index[name]])

@@ -1,4 +1,4 @@
 """Motion: paths of mirrors past keep-out volumes, their proofs, and the watch over beams.
 
-`BeamWatch` proves a path before it is ordered and watches where beams are afterwards.
+`PathProofs` proves a path before it is ordered, and `BeamWatch` watches where beams are afterwards.
 """

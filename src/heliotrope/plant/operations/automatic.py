@@ -284,7 +284,9 @@ class AutomaticControl:
     ) -> None:
         """Calibrate a heliostat before all others; see `Operations.calibrate`."""
         names = tuple(dict.fromkeys((heliostat, *together)))
-        for name, reason in self._locked(names).items():
+        for name, reason in zip(names, self._locked(names), strict=True):
+            if reason is None:
+                continue
             each = {"what": "calibration of", "heliostat": name, "more": "", "reason": reason}
             raise refusals.OUT_OF_SERVICE.error(**each)
         if target:
@@ -323,10 +325,10 @@ class AutomaticControl:
             if why:
                 raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
 
-    def _locked(self, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return the heliostats that persons' locks keep from their aims, and the reasons."""
+    def _locked(self, heliostats: Sequence[str]) -> list[str | None]:
+        """Return why persons' locks keep each of some heliostats from its aim, None if none do."""
         aims = self._plant.aims[[self._plant.field.place(name) for name in heliostats]]
-        return self._plant.lockouts.blocked(heliostats, aims)
+        return self._plant.lockouts.reasons(heliostats, aims)
 
     # -- progress --------------------------------------------------------------------------
 
@@ -347,13 +349,13 @@ class AutomaticControl:
         """
         idle, visiting = self._why_idle(), self._visiting()
         field, age = self._plant.field, self._plant.now() - since
-        out = self._locked(heliostats)
+        out = dict(zip(heliostats, self._locked(heliostats), strict=True))
         able, state = self._raising.able(), field.rows["state"]
         waits = self._raising.waits(heliostats)
         steps = {}
         for name in heliostats:
-            if name in out:
-                steps[name] = Step(out[name], Stage.REFUSED)
+            if text := out[name]:
+                steps[name] = Step(text, Stage.REFUSED)
             elif not self._raising.wanted[field.place(name)]:
                 text = "automatic control does not have it any more"
                 steps[name] = Step(text, Stage.REFUSED)

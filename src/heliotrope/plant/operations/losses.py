@@ -1,9 +1,9 @@
 """Losses: heliostats that left the receiver or its standby point without an order of the plant.
 
 Whether one was ordered off, by a person, a visit, the safety table or automatic control, is asked
-of what the plant has sent (`plant.field.ordered`). A heliostat that lost its cluster, its sun or
-its supply turns away by itself. Automatic control may raise a few such heliostats again. After a
-loss of many it waits for a person: nobody knows what has happened in the field.
+of what the plant has sent (`plant.field.ledger`). A heliostat that lost its cluster, its sun or its
+supply turns away by itself. Automatic control may raise a few such heliostats again. After a loss
+of many it waits for a person: nobody knows what has happened in the field.
 """
 
 import math
@@ -79,7 +79,7 @@ class Losses:
         held = field.among((states.LOCKED,), now)
         lost = live & ~up & ~held & self._up
         lost |= ~self._seen & field.among(states.LEAVING, now)
-        lost &= wanted & ~self._plant.ordered_off(self._up_at)
+        lost &= wanted & ~self._plant.ledger.off(self._up_at, now)
         # A heliostat that is not heard, or is locked, keeps what was seen of it last.
         self._up = np.where(live & ~held, up, self._up)
         self._up_at[live & up] = field.heard[live & up]

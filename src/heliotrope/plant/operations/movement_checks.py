@@ -12,10 +12,12 @@ import numpy.typing as npt
 
 from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
+from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.authority import Person
+from heliotrope.plant.orders.guards import Asked
 from heliotrope.safety import Alarm, alarms
 
 #: Heliostats that are diagnosed at once: they take the supply of drives, and no light.
@@ -91,7 +93,7 @@ class MovementChecks:
         """
         plant, now = self._plant, self._plant.now()
         free = free & plant.field.among((states.STOWED,), now)
-        held = plant.held(plant.field.names)
+        held = plant.guards.reasons(Asked("APPROACH", plant.field.names), refusals.NOT_NOW)
         names = tuple(
             name
             for name in sorted(plant.drive_checks.due - held.keys())

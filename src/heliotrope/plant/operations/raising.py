@@ -13,9 +13,10 @@ from heliotrope.lcu import states
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, RetryLaw
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.orders.authority import Person
+from heliotrope.plant.orders.guards import Asked
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import alarms
 
@@ -144,14 +145,15 @@ class Raising:
 
     def waits(self, heliostats: Sequence[str]) -> dict[str, str]:
         """Return the wanted heliostats that wait for more than their turn, and for what."""
-        plant, found = self._plant, dict(self._plant.held(heliostats))
+        plant = self._plant
+        found = plant.guards.reasons(Asked("APPROACH", tuple(heliostats)), refusals.NOT_NOW)
         asked = np.zeros(len(plant.field), dtype=np.bool_)
         asked[[plant.field.place(name) for name in heliostats]] = True
         for state, command in _NEXT.items():
             there = asked & plant.field.among((state,), plant.now())
             if command == "TRACK":
                 there &= self._known() & self.able()
-            found |= self._stopped(command, np.flatnonzero(there))
+            found |= plant.guards.reasons(self._asked(command, np.flatnonzero(there)))
         return found
 
     def _known(self) -> Mask:
@@ -159,16 +161,14 @@ class Raising:
         calibrated = [self._plant.beliefs.record(name) is not None for name in self._names]
         return (self._clear | np.array(calibrated, dtype=np.bool_)) & bool(self._aims)
 
-    def _stopped(self, command: str, rows: Rows) -> dict[str, str]:
-        """Return the heliostats of some rows (K,) that may not be given a command, and why.
+    def _asked(self, command: str, rows: Rows) -> Asked:
+        """Return a command to the heliostats of some rows (K,), as guards are asked about it.
 
         Whether their paths are free is shown by the command.
         """
-        names, joins = [self._names[row] for row in rows], command == "TRACK"
-        if not names:
-            return {}
-        aims = np.stack([self._aims[name] for name in names]) if joins else None
-        return self._plant.blocked(command, names, aims)
+        names = tuple(self._names[row] for row in rows)
+        aims = [self._aims[name] for name in names] if command == "TRACK" else []
+        return Asked(command, names, np.stack(aims) if aims else None)
 
     def _first(self, command: str, rows: Rows) -> Rows:
         """Return the first rows (K,) of heliostats that may be given a command.
@@ -176,7 +176,7 @@ class Raising:
         At most `ASKED` are asked; if all of them are blocked, the next step asks those after them.
         """
         asked = np.roll(rows, -int(np.searchsorted(rows, self._next.get(command, 0))))[:ASKED]
-        blocked = self._stopped(command, asked)
+        blocked = self._plant.guards.reasons(self._asked(command, asked))
         free = [row for row in asked if self._names[row] not in blocked]
         self._next[command] = int(asked[-1]) + 1 if len(asked) and not free else 0
         return np.array(free[: self._most], dtype=np.intp)

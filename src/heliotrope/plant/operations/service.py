@@ -1,6 +1,5 @@
 """Locks of persons: taking heliostats, targets, receivers and the tower out of service."""
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -56,10 +55,10 @@ class Service:
     ) -> None:
         self._plant, self._keeping, self.attempts = plant, keeping, Attempts(PARKING, tell)
         plant.lockouts.put(keeping.lockouts())
-        #: Since when locks have sent heliostats to stow that were not seen there yet, monotonic s,
-        #: and what is locked. Their aims do not show it: a visit that ends gives others back.
-        self._unparked: dict[str, tuple[float, frozenset[Place]]] = {}
-        self._send_off(plant.lockouts, -math.inf)
+        #: What is locked, by heliostat that it has sent to stow and that was not seen there yet.
+        #: Their aims do not show it: a visit that ends gives others back.
+        self._unparked: dict[str, frozenset[Place]] = {}
+        self._send_off(plant.lockouts)
 
     @property
     def out(self) -> tuple[Lockout, ...]:
@@ -96,20 +95,20 @@ class Service:
             for kind, name in places
         ]
         self._plant.lockouts.put(locks)
-        concerned = self._send_off(locks, self._plant.now())
+        concerned = self._send_off(locks)
         if concerned:
             self._stow(person.name, concerned)
         self._keeping.lock_out(locks)
         return concerned
 
-    def _send_off(self, locks: Iterable[Lockout], since: float) -> tuple[str, ...]:
+    def _send_off(self, locks: Iterable[Lockout]) -> tuple[str, ...]:
         """Note the heliostats that must go to stow under some locks, and return them."""
         field, found = self._plant.field, np.zeros(len(self._plant.field), dtype=np.bool_)
         for lock in locks:
             rows = self._under(lock)
             for row in np.flatnonzero(rows):
-                _, before = self._unparked.get(field.names[row], (since, frozenset()))
-                self._unparked[field.names[row]] = since, before | {(lock.kind, lock.name)}
+                before = self._unparked.get(field.names[row], frozenset())
+                self._unparked[field.names[row]] = before | {(lock.kind, lock.name)}
             found |= rows
         return tuple(field.names[row] for row in np.flatnonzero(found))
 
@@ -144,7 +143,7 @@ class Service:
             removed += own
         for lock in removed:
             locks.remove(lock.kind, lock.name, lock.who)
-        for name, (_, by) in list(self._unparked.items()):
+        for name, by in list(self._unparked.items()):
             if not any(locks.on(*place) for place in by):
                 self._done(name)
         self._keeping.put_back(removed, person.name, self._utc())
@@ -158,12 +157,11 @@ class Service:
         field, now = self._plant.field, self._plant.now()
         if not self._unparked:
             return
-        there, away = field.among((states.STOWED,), now), field.among(states.UP, now)
-        for name, (since, _) in list(self._unparked.items()):
-            row = field.place(name)
-            # A status from before the order says nothing: it may have been on its way from stow.
-            if there[row] and field.heard[row] > since:
-                self._done(name)
+        # A status from before an order says nothing: it may have been on its way from stow.
+        there = field.among((states.STOWED,), now) & self._plant.ledger.reported()
+        for name in [name for name in self._unparked if there[field.place(name)]]:
+            self._done(name)
+        away = field.among(states.UP, now)
         due = sorted(name for name in self._unparked if self.attempts.due(name, now))
         if left := [name for name in due if away[field.place(name)]]:
             self._stow("out of service", left)

@@ -20,7 +20,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.field.assigned import NOTHING, Held, grouped, points_of
 from heliotrope.plant.field.locks import Locks
 from heliotrope.plant.field.state import FieldState
-from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
+from heliotrope.plant.motion.proofs import BeamError, PathProofs
 from heliotrope.plant.orders.audit import AuditError
 from heliotrope.plant.orders.authority import Authority, Person
 from heliotrope.plant.orders.guards import TO_AIMS, Asked, Guards
@@ -95,7 +95,7 @@ class Commands:
         What stops heliostats; see `GUARDS`.
     given
         Points that were given, and whether they were taken.
-    ways
+    proofs
         Where beams may go.
     design
         Knows the targets and receivers.
@@ -117,7 +117,7 @@ class Commands:
         joining: JoinQueue,
         guards: Guards,
         given: Unacknowledged,
-        ways: BeamWatch,
+        proofs: PathProofs,
         design: Plant,
         wanted: Wanted,
         patience: float,
@@ -127,7 +127,7 @@ class Commands:
         authority: Authority,
     ) -> None:
         self._now, self._field, self._orders, self._joining = now, field, orders, joining
-        self._guards, self._given, self._ways = guards, given, ways
+        self._guards, self._given, self._proofs = guards, given, proofs
         self._design, self._wanted, self._patience = design, wanted, patience
         self._movements, self._locks = movements, locks
         self._stepping, self._authority = stepping, authority
@@ -223,7 +223,8 @@ class Commands:
         if mandate is not None:
             wrong = mandate.refused(heliostats)
         else:
-            wrong = self._guards.doubtful.verifying(heliostats) if name in TO_AIMS else {}
+            verifying = self._guards.doubtful.verifying(heliostats) if name in TO_AIMS else ()
+            wrong = dict.fromkeys(verifying, refusals.NOT_VERIFIED.text)
             if name in wire.JOINING and len(wrong) < len(heliostats):
                 blocked, wrong = {**blocked, **wrong}, {}
         if wrong:
@@ -242,7 +243,7 @@ class Commands:
     def _lock_record(self, heliostats: tuple[str, ...], token: int) -> tuple[Work, Work]:
         """Return work that stores whose lock it is, before it is taken; and its reverse."""
         visit = self._authority.mandate_of(token) is not None
-        return self._ways.points.holding(self._locks.record(heliostats, visit=visit))
+        return self._proofs.points.holding(self._locks.record(heliostats, visit=visit))
 
     def _note_lock(self, heliostats: tuple[str, ...], token: int) -> None:
         """Note whose lock it is: a visit's, which the plant opens in the end, or a person's."""
@@ -265,7 +266,7 @@ class Commands:
         able, wrong = self._guards.passed(asked, NOT_NOW, BEAM_REFUSED)
         if in_slices(name, able):
             return able, wrong  # each slice is examined when its turn comes
-        clear, blocked = self._ways.clear(name, numbers, able, self._now())
+        clear, blocked = self._proofs.clear(name, numbers, able, self._now())
         return clear, wrong | blocked
 
     def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
@@ -360,8 +361,7 @@ class Commands:
         """
         names, rows, wanted, out = self._pointed("AIM", points)
         tracking, aims = self._field.among((states.TRACKING,), self._now())[rows], self._aims(rows)
-        if wrong := self._movements.refused(names, rows, aims, wanted, tracking):
-            raise BeamError("AIM", wrong)
+        self._movements.check(names, rows, aims, wanted, tracking)
         self.prove_points("AIM", names, wanted)
 
         def store(some: tuple[str, ...], places: FloatArray) -> Storing:
@@ -369,8 +369,8 @@ class Commands:
 
         def check(some: tuple[str, ...]) -> None:
             rows, on = self._places(some), np.ones(len(some), dtype=np.bool_)
-            if wrong := self._movements.refused(some, rows, self._aims(rows), new.of(some), on):
-                raise BeamError("AIM", wrong)  # aimed elsewhere while the record was written
+            # One may have been aimed elsewhere while the record was written.
+            self._movements.check(some, rows, self._aims(rows), new.of(some), on)
 
         def note(some: tuple[str, ...], places: FloatArray) -> None:
             del places
@@ -391,13 +391,13 @@ class Commands:
 
     def holding(self, held: Held) -> tuple[Work, Work]:
         """Return work that stores what a visit takes, and its reverse; see `Points.holding`."""
-        return self._ways.points.holding(held)
+        return self._proofs.points.holding(held)
 
     def _places(self, names: Sequence[str]) -> npt.NDArray[np.intp]:
         return np.array([self._field.place(name) for name in names], dtype=np.intp)
 
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
-        return np.asarray(self._ways.points.aims[rows])
+        return np.asarray(self._proofs.points.aims[rows])
 
     def _pointed(
         self, name: str, points: Mapping[str, npt.ArrayLike]
@@ -413,7 +413,7 @@ class Commands:
         self, name: str, names: tuple[str, ...], places: FloatArray, held: Held = NOTHING
     ) -> Storing:
         """Return work that stores points (K, 3) and what visits hold then, and its reverse."""
-        return self._ways.points.storing(name, self._places(names), places, held)
+        return self._proofs.points.storing(name, self._places(names), places, held)
 
     def _lent(self, names: tuple[str, ...], places: FloatArray) -> Held:
         """Return what is to be stored before a visit sends beams to points (K, 3)."""
@@ -486,7 +486,7 @@ class Commands:
         """Assign the points of some heliostats, which are sent now."""
         places = new.of(names)
         new.note(names, places)
-        self._ways.points.assign(new.name, self._places(names), places)
+        self._proofs.points.assign(new.name, self._places(names), places)
         self._given.sent(ticket, names)
 
     def _joins(self, new: NewPoints) -> frozenset[str]:
@@ -518,7 +518,7 @@ class Commands:
         moved = tuple(names[i] for i in np.flatnonzero(moves))
         if wrong := self._guards.reasons(Asked(name, moved, wanted[moves]), BEAM_REFUSED):
             raise BeamError(name, wrong)
-        self._ways.check_points(name, rows, wanted, tracking)
+        self._proofs.check_points(name, rows, wanted, tracking)
 
     def _stays(self, rows: npt.NDArray[np.intp], wanted: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which heliostats bring no light to a receiver by new points (K, 3), (K,).
@@ -526,7 +526,7 @@ class Commands:
         Aim and new point lie on the same target, or near each other and off every receiver: so
         moves a beam that is sent beside a target, because it misses.
         """
-        aims = self._ways.points.aims[rows]
+        aims = self._proofs.points.aims[rows]
         found = np.linalg.norm(wanted - aims, axis=-1) <= _BESIDE
         for receiver in self._design.receivers:
             clear = 0.5 * float(np.hypot(receiver.width, receiver.height)) + _BESIDE

@@ -15,7 +15,7 @@ from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
 from heliotrope.plant.field.locks import Locks
 from heliotrope.plant.field.state import FieldState
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.audit import AuditError
 from heliotrope.plant.orders.authority import Authority, RefusedError
 from heliotrope.plant.orders.commands import Commands, NewPoints
@@ -75,7 +75,7 @@ class GivingBack:
     def _ordered(self, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
         """Give an order to heliostats that were left locked; return those that need no other."""
         if what == "STOW":
-            held = self._guards.held(what, names)
+            held = self._guards.reasons(Asked(what, names), NOT_NOW)
             free = tuple(name for name in names if name not in held)
             if left := tuple(n for n in free if n not in self._locks.under_way(free)):
                 self._stow(left)
@@ -111,7 +111,8 @@ class GivingBack:
 
         def send(again: bool) -> None:
             if again:
-                ticket.block(self._guards.held(what, ticket.waiting(able)))
+                left = Asked(what, ticket.waiting(able))
+                ticket.block(self._guards.reasons(left, NOT_NOW))
             self._orders.command(ticket, what, values, ticket.waiting(able), token)
 
         self._orders.when_recorded(ticket, send)
@@ -172,7 +173,7 @@ class GivingBack:
         """Order heliostats to step finely for a visit, or roughly again."""
         token = self._authority.token
         for rough, due in self._stepping.due(now, token).items():
-            self._stepping.sent(due, now)
+            self._stepping.tried(due, now)
             asked = Asked("ROUGH", tuple(due))
             blocked = self._guards.reasons(asked, NOT_NOW, BEAM_REFUSED)
             names = tuple(name for name in due if name not in blocked)

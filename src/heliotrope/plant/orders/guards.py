@@ -3,7 +3,7 @@
 A row names the refusal, the commands that it stops, and the check that gives each heliostat's
 reason. The table is evaluated when a command is accepted, when its record is written, and when its
 turn comes; of several reasons, the first row's is given. Where the beams may go is proven after
-that: see `BeamWatch`.
+that: see `PathProofs`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -21,7 +21,7 @@ from heliotrope.plant.field.lockouts import Lockouts
 from heliotrope.plant.field.second_plant import SecondPlant
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.field.witnesses import Witnesses
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.authority import Authority
 from heliotrope.plant.orders.parameters import ParameterSync
 from heliotrope.plant.orders.queue import PlantOrders
@@ -91,20 +91,6 @@ class Guards:
             raise self._error(asked, kinds[0], wrong)
         return tuple(name for name in asked.heliostats if name not in wrong), wrong
 
-    def held(self, name: str, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return the heliostats in whose clusters no new motion may begin now, and the reasons."""
-        return self.reasons(Asked(name, tuple(dict.fromkeys(heliostats))), NOT_NOW)
-
-    def in_turn(
-        self, name: str, values: Sequence[float], heliostats: tuple[str, ...]
-    ) -> dict[str, str]:
-        """Return the heliostats whose turn has come and that may not go, and the reasons.
-
-        AIM brings a new aim, its values; every other command leads to those that they have.
-        """
-        points = np.tile(values, (len(heliostats), 1)) if name == "AIM" else None
-        return self.reasons(Asked(name, heliostats, points), BEAM_REFUSED)
-
     def refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
         """Refuse a command where no new motion may begin now.
 
@@ -115,8 +101,9 @@ class Guards:
         RefusedError
             If it may begin in none.
         """
-        if held := self.held(name, heliostats):
-            raise self._error(Asked(name, tuple(dict.fromkeys(heliostats))), NOT_NOW, held)
+        asked = Asked(name, tuple(dict.fromkeys(heliostats)))
+        if held := self.reasons(asked, NOT_NOW):
+            raise self._error(asked, NOT_NOW, held)
 
     def _error(self, asked: Asked, kind: Refusal, wrong: dict[str, str]) -> RefusedError:
         if kind is BEAM_REFUSED or len(self.reasons(asked, kind)) < len(asked.heliostats):
@@ -172,26 +159,16 @@ def _cluster(reason: Callable[[Guards, str], str]) -> Check:
     return check
 
 
-def _among(reasons: Callable[[Guards, Asked], dict[str, str]]) -> Check:
-    """Look the heliostats up among those that have a reason."""
+def _alarm(condition: str = "", among: tuple[int, ...] = tuple(range(len(states.STATES)))) -> Check:
+    """Stop heliostats in some states that a row of the safety table, or any, keeps away."""
 
     def check(plant: Guards, asked: Asked) -> Iterable[str | None]:
-        found = reasons(plant, asked)
+        found = plant.sentinel.table.blocked(condition)
+        state, place = plant.field.rows["state"], plant.field.place
+        found = {name: text for name, text in found.items() if state[place(name)] in among}
         return map(found.get, asked.heliostats) if found else ()
 
     return check
-
-
-def _alarm(condition: str = "") -> Check:
-    """Stop heliostats that a row of the safety table, or any, keeps from their aims."""
-    return _among(lambda plant, _: plant.sentinel.table.barred(condition))
-
-
-def _astray(plant: Guards, _: Asked) -> dict[str, str]:
-    """Stop beams that went astray, and are off: they would go astray again."""
-    state, place = plant.field.rows["state"], plant.field.place
-    astray = plant.sentinel.table.barred("pointing_disagrees")
-    return {name: text for name, text in astray.items() if state[place(name)] in states.AWAY}
 
 
 def _unacknowledged(plant: Guards, asked: Asked) -> Iterable[str | None]:
@@ -209,14 +186,12 @@ def _doubted(plant: Guards, asked: Asked) -> Iterable[str | None]:
     return plant.doubtful.reasons(asked.heliostats, points)
 
 
-def _visited(plant: Guards, asked: Asked) -> dict[str, str]:
+def _visited(plant: Guards, asked: Asked) -> Iterable[str | None]:
     """Stop what would disturb a measurement, unless the visit orders it, or the plant."""
     visited = {} if asked.token is None else plant.authority.visited()
-    return {
-        name: refusals.IN_VISIT.text.format(where=visit.where)
-        for name, visit in visited.items()
-        if visit.token != asked.token
-    }
+    for visit in map(visited.get, asked.heliostats):
+        other = visit is not None and visit.token != asked.token
+        yield refusals.IN_VISIT.text.format(where=visit.where) if visit and other else None
 
 
 #: Commands that need the command authority; DEFOCUS and STOW do not, and nothing stops them.
@@ -230,9 +205,7 @@ GUARDS: tuple[Guard, ...] = (
     Guard(
         OUT_OF_SERVICE,
         _ORDERS - messages.HARMLESS,
-        _among(
-            lambda plant, asked: plant.lockouts.blocked(asked.heliostats, plant.destined(asked))
-        ),
+        lambda plant, asked: plant.lockouts.reasons(asked.heliostats, plant.destined(asked)),
     ),
     # The plant itself gives STOW after a visit, and does not while an emergency holds.
     Guard(
@@ -264,11 +237,12 @@ GUARDS: tuple[Guard, ...] = (
         _each(lambda plant, name: plant.given.unknown("STANDBY", name)),
     ),
     Guard(BEAM_REFUSED, messages.TO_STANDBY, _alarm(UNPROVEN)),
-    Guard(BEAM_REFUSED, messages.TO_STANDBY, _among(_astray)),
+    # Beams that went astray, and are off, would go astray again.
+    Guard(BEAM_REFUSED, messages.TO_STANDBY, _alarm("pointing_disagrees", states.AWAY)),
     # A heliostat that is being sent off is not stopped.
     Guard(BEAM_REFUSED, messages.RELEASES, _alarm("beam_unsent")),
     Guard(BEAM_REFUSED, messages.RELEASES, _alarm("keep_out_predicted")),
-    Guard(BEAM_REFUSED, messages.SETTINGS, _among(_visited)),
+    Guard(BEAM_REFUSED, messages.SETTINGS, _visited),
     Guard(
         BEAM_REFUSED,
         _ORDERS - messages.STOPS,

@@ -6,24 +6,15 @@ lease could be renewed. So they go in slices, one a beat.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 from heliotrope.lcu import messages
 from heliotrope.links.messages import Stage
-from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
-from heliotrope.plant.orders.authority import RefusedError
-from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import JoinLimiter
 
 #: Heliostats of a slice: their proof takes 30 ms.
 SLICE = 500
-#: Returns which of some heliostats may be sent a command with values, and why the others may not.
-Examine = Callable[
-    [str, tuple[float, ...], tuple[str, ...]], tuple[tuple[str, ...], dict[str, str]]
-]
-
 #: Returns which of some heliostats may go now; the ticket ends for the others.
 Clear = Callable[[tuple[str, ...]], tuple[str, ...]]
 #: Assigns the points of some heliostats, as far as they may still go, then sends these.
@@ -128,74 +119,3 @@ class JoinQueue:
         job.ticket.advance(gone, Stage.REFUSED, text)
         left = set(gone)
         job.waiting = deque(name for name in job.waiting if name not in left)
-
-
-class JoinDispatcher:
-    """The sending of heliostats whose turn has come, if the way of their beams is clear now.
-
-    The sun has moved since the aim was accepted, and the heliostat may point anywhere. So the sweep
-    from its present direction to its aim is proven at the moment it begins.
-
-    Parameters
-    ----------
-    now
-        Returns the monotonic time, s.
-    queue, orders, beams
-        Of the plant.
-    life
-        Life of a command whose turn has come, s.
-    blocked
-        Returns the heliostats that guards stop when their turn comes, and the reasons.
-    examine
-        Examines a slice of those that leave stow.
-    """
-
-    def __init__(
-        self,
-        now: Callable[[], float],
-        queue: JoinQueue,
-        orders: PlantOrders,
-        beams: BeamWatch,
-        life: float,
-        blocked: Callable[[str, tuple[float, ...], tuple[str, ...]], dict[str, str]],
-        examine: Examine,
-    ) -> None:
-        self._now, self._queue, self._orders = now, queue, orders
-        self._beams, self._life = beams, life
-        self._blocked, self._examine = blocked, examine
-
-    def beat(self, now: float, lost: Lost, *, held: bool) -> None:
-        """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
-        for job, part in self._queue.admit(now, lost, held=held):
-            clear = self._clear(job, part)
-            if job.assign is None or not clear:
-                self._send(job, clear)
-            else:
-                job.assign(clear, partial(self._clear, job), partial(self._send, job))
-
-    def _send(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
-        again = partial(self._wait_again, job)
-        values, token = job.values, job.token
-        self._orders.command(job.ticket, job.name, values, heliostats, token, self._life, again)
-
-    def _wait_again(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
-        """Let heliostats whose cluster refused an earlier token wait for another turn."""
-        self._queue.put(replace(job, waiting=deque(heliostats)))
-
-    def _clear(self, job: JoiningJob, part: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the heliostats whose turn has come and that may go; end the ticket for others."""
-        wrong = self._wrong(job, part)
-        job.ticket.block(wrong)
-        return tuple(name for name in part if name not in wrong)
-
-    def _wrong(self, job: JoiningJob, part: tuple[str, ...]) -> dict[str, str]:
-        """Return which heliostats whose turn has come may not go, and why."""
-        if job.name not in messages.SLICED:
-            wrong = self._beams.joining(job.name, job.values, part, self._now())
-            return wrong | self._blocked(job.name, job.values, part)
-        try:
-            return self._examine(job.name, job.values, part)[1]
-        except BeamError as error:
-            return dict(error.refusals)
-        except RefusedError as error:
-            return dict.fromkeys(part, str(error))

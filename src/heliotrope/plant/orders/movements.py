@@ -18,6 +18,7 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
 from heliotrope.plant.field.assigned import Held, Places
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.tickets import Ticket
 
 #: Longest distance of a beam from its aim, rad: below that at which `pointing_disagrees` trips.
@@ -73,33 +74,49 @@ class Movements:
         known = self._moved.get(heliostat)
         return present if known is None else known.aim
 
-    def refused(
+    def check(
         self,
         names: Sequence[str],
         rows: npt.NDArray[np.intp],
         aims: FloatArray,
         wanted: FloatArray,
         tracking: npt.NDArray[np.bool_],
-    ) -> dict[str, str]:
-        """Return which heliostats (K,) may not be moved to points (K, 3), and why."""
+    ) -> None:
+        """Check that heliostats (K,) may be moved to points (K, 3).
+
+        Parameters
+        ----------
+        names, rows
+            Names and rows, (K,).
+        aims, wanted
+            Their aims, and the points, ENU, m, (K, 3).
+        tracking
+            Whether they track, (K,).
+
+        Raises
+        ------
+        BeamError
+            If one of them may not.
+        """
         base = np.stack([self.aim(name, aim) for name, aim in zip(names, aims, strict=True)])
         on = np.zeros(len(names), dtype=np.bool_)
         for face in self._faces:
             on |= face.holds(base) & face.holds(wanted)
         away = np.linalg.norm(wanted - base, axis=-1)
         slant = np.linalg.norm(base - self._armature.origin_1[rows], axis=-1)
-        wrong = {}
+        blocked = {}
         for i, name in enumerate(names):
             if not tracking[i]:
-                wrong[name] = "it does not track the receiver"
+                blocked[name] = "it does not track the receiver"
             elif not on[i]:
-                wrong[name] = "its aim, or the point beside it, is not on a planar receiver"
+                blocked[name] = "its aim, or the point beside it, is not on a planar receiver"
             elif not away[i] <= MOST * slant[i]:
-                wrong[name] = (
+                blocked[name] = (
                     f"{1e3 * away[i] / slant[i]:.1f} mrad beside its aim; a movement has "
                     f"{1e3 * MOST:g} mrad at most"
                 )
-        return wrong
+        if blocked:
+            raise BeamError("AIM", blocked)
 
     def take(self, names: Sequence[str], aims: FloatArray, token: int, now: float) -> None:
         """Note that beams are moved; ``aims`` (K, 3) are those of heliostats not moved before."""

@@ -107,7 +107,7 @@ class PlantOrders:
         Heliostats a second that `stow_in_turn` sends; 0: all at once.
     sent
         Called with name, values and heliostats of each command that is sent, DEFOCUS and STOW
-        among them, and the time.
+        among them, the time, and whether it is a repetition.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class PlantOrders:
         lifetime: float,
         patience: float,
         stow_rate: float,
-        sent: Callable[[str, tuple[float, ...], tuple[str, ...], float], None],
+        sent: Callable[[str, tuple[float, ...], tuple[str, ...], float, bool], None],
     ) -> None:
         self._sent, self._authority = sent, authority
         self._clock, self._audit, self._disk, self._clusters = clock, audit, disk, clusters
@@ -406,7 +406,7 @@ class PlantOrders:
         if name == "LOCK":
             for other, names in self._stowing.take(heliostats).items():
                 other.advance(names, Stage.FAILED, "superseded by LOCK")
-        self._sent(name, values, heliostats, self._clock.monotonic())
+        self._sent(name, values, heliostats, self._clock.monotonic(), False)
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)
@@ -438,27 +438,26 @@ class PlantOrders:
             self._supersede(ticket, frozenset(heliostats))
         # Further portions of a STOW must not put off the repetition of the first.
         self._sent_at.setdefault(ticket.identity, self._clock.monotonic())
-        self._sent(act.name, (), tuple(heliostats), self._clock.monotonic())
+        self._sent(act.name, (), tuple(heliostats), self._clock.monotonic(), again)
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part, again=again)
             named = () if len(part) == len(end.members) else part
             end.post(Emergency(identity, act.name, named), None, self._told(identity), urgent=True)
 
-    def stow_in_turn(self, ticket: Ticket, heliostats: Sequence[str]) -> tuple[str, ...]:
-        """Send STOW to heliostats in portions; return those that have been sent it.
+    def stow_in_turn(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
+        """Send STOW to heliostats in portions.
 
         Orders that they were given before are repeated until it is their turn. An order by
         `emergency` meanwhile goes at once and takes the place of this one.
         """
         if not self._stowing.staggers(heliostats):
             self.emergency(ticket, Act.STOW, heliostats)
-            return tuple(heliostats)
+            return
         now = self._clock.monotonic()
         self._sent_at[ticket.identity] = now
         for other, names in self._stowing.put(ticket, heliostats).items():
             other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
         self._stow(self._stowing.due(now))
-        return tuple(name for name in heliostats if name not in self._stowing)
 
     def to_stow(self, heliostat: str) -> bool:
         """Whether a heliostat waits for its turn to go to stow: no motion is for it."""

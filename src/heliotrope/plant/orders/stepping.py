@@ -14,11 +14,10 @@ import numpy as np
 
 from heliotrope.lcu import names as meanings
 from heliotrope.plant.field.assigned import Held
-from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.field.ledger import STEPPING, Ledger
+from heliotrope.plant.field.state import FieldState, Mask
 
-#: From an order to a report that the board may have made before it took the order, s.
-_TAKEN_WITHIN = 1.0
-#: Time after which an order that was not obeyed is given again, s.
+#: Time after which an order that was not obeyed, or could not be given, is given again, s.
 _AGAIN = 3.0
 
 
@@ -27,8 +26,8 @@ class Stepping:
 
     Parameters
     ----------
-    field
-        State of the field.
+    field, ledger
+        State of the field, and what was ordered.
     rests
         Heliostats whose drivers rest by the plant file. One that takes microsteps when it is first
         heard was left so by an earlier run of the plant, and is ordered to step roughly.
@@ -36,14 +35,17 @@ class Stepping:
         Other heliostats that a visit of an earlier program has ordered to take fine steps.
     """
 
-    def __init__(self, field: FieldState, rests: Iterable[str], held: Iterable[str] = ()) -> None:
-        self._field, self._rests = field, frozenset(rests)
+    def __init__(
+        self, field: FieldState, ledger: Ledger, rests: Iterable[str], held: Iterable[str] = ()
+    ) -> None:
+        self._field, self._ledger, self._rests = field, ledger, frozenset(rests)
         #: Visits that need fine steps, by heliostat; heliostats that step roughly without one.
         self._needed = Counter[str]()
         self._rough = {*self._rests, *held}
         #: Heliostats that may not step as they must.
         self._open = set(self._rough)
-        self._sent_at: dict[str, float] = {}
+        #: When each was last due, monotonic s.
+        self._tried: dict[str, float] = {}
 
     @contextmanager
     def fine(self, heliostats: Iterable[str]) -> Iterator[None]:
@@ -78,7 +80,9 @@ class Stepping:
 
     def coarse(self, heliostats: Iterable[str], now: float) -> tuple[str, ...]:
         """Return the heliostats that are not known to take fine steps."""
-        return tuple(name for name in heliostats if self._is_rough(name, now) is not False)
+        known, rough = self._reported(now)
+        unsure = rough | ~known
+        return tuple(name for name in heliostats if unsure[self._field.index[name]])
 
     def due(self, now: float, token: int) -> dict[bool, tuple[str, ...]]:
         """Return the heliostats that must be ordered to step roughly (True), or finely (False).
@@ -86,28 +90,25 @@ class Stepping:
         None are without a command authority (``token`` 0).
         """
         found: dict[bool, list[str]] = {True: [], False: []}
+        known, steps = self._reported(now)
         for name in sorted(self._open) if token else ():
-            needed, rough = self._needed[name] > 0, self._is_rough(name, now)
+            if not known[self._field.index[name]]:
+                continue
+            needed, rough = self._needed[name] > 0, bool(steps[self._field.index[name]])
             if rough and needed:
                 self._rough.add(name)
             wanted = name in self._rough and not needed
             if rough == wanted and not needed:
                 self._open.discard(name)
-            elif rough is not None and rough != wanted and now >= self._sent(name) + _AGAIN:
+            elif rough != wanted and now >= self._tried.get(name, -np.inf) + _AGAIN:
                 found[wanted].append(name)
         return {rough: tuple(names) for rough, names in found.items() if names}
 
-    def sent(self, heliostats: Collection[str], now: float) -> None:
+    def tried(self, heliostats: Collection[str], now: float) -> None:
         """Note that heliostats have been ordered to step as they must, or could not be."""
-        self._sent_at.update(dict.fromkeys(heliostats, now))
+        self._tried.update(dict.fromkeys(heliostats, now))
 
-    def _is_rough(self, name: str, now: float) -> bool | None:
-        """Return whether a heliostat steps roughly by a report from after the last order."""
-        row = self._field.index[name]
-        heard = float(self._field.heard[row])
-        if not now - heard <= self._field.limit or heard < self._sent(name) + _TAKEN_WITHIN:
-            return None
-        return bool(self._field.rows["flags"][row] & meanings.ROUGH)
-
-    def _sent(self, name: str) -> float:
-        return self._sent_at.get(name, -np.inf)
+    def _reported(self, now: float) -> tuple[Mask, Mask]:
+        """Return whose last report is from after the last order, and which step roughly, (N,)."""
+        known = self._field.live(now) & self._ledger.reported(STEPPING)
+        return known, np.asarray(self._field.rows["flags"] & meanings.ROUGH != 0)

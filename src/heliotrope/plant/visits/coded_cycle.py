@@ -181,8 +181,8 @@ class CodedCycle(ABC):
         """Return the face of a surface; raise UnknownNameError if there is none of that name."""
 
     @abstractmethod
-    def _arranged(self, face: Target, names: tuple[str, ...]) -> tuple[Layout, dict[str, str]]:
-        """Return the layout of a visit, and why some heliostats take no part."""
+    def _arranged(self, face: Target, names: tuple[str, ...]) -> Layout:
+        """Return the layout of a visit."""
 
     @abstractmethod
     def _stay(
@@ -244,10 +244,11 @@ class CodedCycle(ABC):
         """
         plant, names = self._plant, tuple(dict.fromkeys(heliostats))
         face = self.face(where)
-        layout, blocked = self._arranged(face, names)
+        layout = self._arranged(face, names)
         moving, light = layout.names, Light()
         with plant.authority.mandate(person, token, moving, face.name) as mandate:
-            results = {name: refused(mandate, name, text) for name, text in blocked.items()}
+            left_out = layout.left_out.items()
+            results = {name: refused(mandate, name, text) for name, text in left_out}
             if moving:
                 async with Returned(plant, mandate, moving if self.comes else (), face):
                     visit = CodedVisit(plant, mandate, moving, face)

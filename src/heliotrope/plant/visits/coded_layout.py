@@ -5,7 +5,7 @@ its drives move it if that is more.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -84,6 +84,8 @@ class Layout:
         None: the expected powers are not compared.
     first
         Whether new parameters are verified by one more series of photographs.
+    left_out
+        Why other heliostats take no part, by name.
     """
 
     target: Target
@@ -93,6 +95,7 @@ class Layout:
     codes: int
     powers: FloatArray | None = None
     first: bool = False
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -119,7 +119,7 @@ class JointCycle(CodedCycle):
 
     def having_place(self, heliostats: Sequence[str], target: str) -> tuple[str, ...]:
         """Return those of some heliostats that have a place in a visit now."""
-        return self._arranged(self.face(target), tuple(heliostats))[0].names
+        return self._arranged(self.face(target), tuple(heliostats)).names
 
     # -- a visit ---------------------------------------------------------------------------
 
@@ -127,7 +127,7 @@ class JointCycle(CodedCycle):
         """Return a target; raise UnknownNameError if there is none of that name."""
         return self._plant.design.target(name)
 
-    def _arranged(self, face: Target, names: tuple[str, ...]) -> tuple[Layout, dict[str, str]]:
+    def _arranged(self, face: Target, names: tuple[str, ...]) -> Layout:
         if not self.first(names, face):
             return arranged(self._plant, face, names, self.settings)
         nominal, cycle = self._plant.beliefs.nominal, self.cycle.settings
@@ -305,11 +305,14 @@ class _Verification:
         plant, target = self._visit.plant, self._visit.target
         sun = plant.sun_vector()
         errors = {name: self._waiting[name].error(sun, target) for name in names}
-        layout, problems, waits = verifying(plant, target, errors, self._coded.settings, own=own)
+        layout, waits = verifying(plant, target, errors, self._coded.settings, own=own)
+        problems = dict(layout.left_out)
         if not layout.names:
             return problems, [], waits
         again = CodedVisit(plant, self._visit.mandate, layout.names, target)
-        again.drop(self._misled(layout.start()))
+        paths = {n: plant.misled(n, point) for n, point in layout.start().items()}
+        text = "the new parameters have no free path to their photograph"
+        again.drop({name: f"{text}: {why}" for name, why in paths.items() if why})
         proven, others = await self._coded.photographed(
             again, layout, self._light, lambda stage: self._tell(f"verification: {stage}")
         )
@@ -324,11 +327,3 @@ class _Verification:
                 self.seen[name] = photographs
         hidden = [name for name, one in others.items() if one.verdict in _AGAIN]
         return problems, hidden, waits
-
-    def _misled(self, points: Mapping[str, FloatArray]) -> dict[str, str]:
-        """Return the heliostats that have no free path to their points, and their reasons."""
-        return {
-            name: f"the new parameters have no free way to their photograph: {why}"
-            for name, point in points.items()
-            if (why := self._visit.plant.misled(name, point))
-        }

@@ -49,8 +49,8 @@ def arranged(
     target: Target,
     heliostats: tuple[str, ...],
     settings: JointSettings,
-) -> tuple[Layout, dict[str, str]]:
-    """Return the layout of a joint visit, and why some of the heliostats have no place in it.
+) -> Layout:
+    """Return the layout of a joint visit.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def arranged(
     too_bright = f"the light on {target.name} would exceed {settings.brightest:g} suns"
     wrong |= dict.fromkeys(dazzling, too_bright)
     code = _shared(known, places, along=None)
-    return coded(target, known, places, code, settings.movement), wrong
+    return replace(coded(target, known, places, code, settings.movement), left_out=wrong)
 
 
 def verifying(
@@ -87,11 +87,10 @@ def verifying(
     settings: JointSettings,
     *,
     own: bool = False,
-) -> tuple[Layout, dict[str, str], tuple[str, ...]]:
-    """Return the layout of a joint verification.
+) -> tuple[Layout, tuple[str, ...]]:
+    """Return the layout of a joint verification, and heliostats that can be verified later.
 
-    With it, why some heliostats have no place on the target, and those that would make it too
-    bright: they can be verified by another stack.
+    These would make the target too bright now.
 
     Parameters
     ----------
@@ -107,7 +106,8 @@ def verifying(
     known, wrong = beams_of(plant, target, all_errors, settings)
     places, dazzling = _darkened(target, known, settings)
     code = np.arange(len(known)) if own else _shared(known, places, along=_UP)
-    return coded(target, known, places, code, settings.movement, along=_UP), wrong, dazzling
+    layout = coded(target, known, places, code, settings.movement, along=_UP)
+    return replace(layout, left_out=wrong), dazzling
 
 
 def _darkened(
@@ -225,8 +225,8 @@ def newcomers(
     settings: JointSettings,
     model: Mapping[str, tuple[str, ...]],
     missed: Mapping[str, int] | None = None,
-) -> tuple[Layout, dict[str, str]]:
-    """Return the layout of a joint first visit, and why some heliostats have no place in it.
+) -> Layout:
+    """Return the layout of a joint first visit.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def newcomers(
     count = [min((missed or {}).get(name, 0), LOOKS - 1) for name in sent]
     places = _first_places(target, sent) + looks[count]
     layout = coded(target, sent, places, code, settings.first_movement, along=_RIGHT)
-    return replace(layout, first=True), wrong
+    return replace(layout, first=True, left_out=wrong)
 
 
 def _first_places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:

@@ -73,7 +73,7 @@ class ReceiverCycle(CodedCycle):
         """Return the face of a receiver; raise UnknownNameError if there is none of that name."""
         return self._plant.design.receiver(name).face
 
-    def _arranged(self, face: Target, names: tuple[str, ...]) -> tuple[Layout, dict[str, str]]:
+    def _arranged(self, face: Target, names: tuple[str, ...]) -> Layout:
         return arranged_on(self._plant, face, names, self.settings)
 
     @contextlib.asynccontextmanager

@@ -26,8 +26,8 @@ def arranged_on(
     face: Target,
     heliostats: tuple[str, ...],
     settings: ReceiverSettings,
-) -> tuple[Layout, dict[str, str]]:
-    """Return the layout of a receiver visit, and why some of the heliostats take no part.
+) -> Layout:
+    """Return the layout of a receiver visit.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def arranged_on(
     where = np.array([places[name] for name in known]).reshape(-1, 2)
     powers = np.array([beam.power for beam in known.values()])
     layout = coded(face, known, where, own, settings.movement)
-    return replace(layout, powers=powers), blocked
+    return replace(layout, powers=powers, left_out=blocked)
 
 
 def sunlight_on(plant: PlantController, face: Target) -> float:

@@ -158,7 +158,7 @@ class Verification:
         self._confirmed.pop(visit.heliostat, None)
         point = apart(visit.target, [shot.point for shot in used], room_of(visit, self._centring))
         if why := visit.plant.misled(visit.heliostat, point):
-            return f"the new parameters have no free way to their photograph: {why}"
+            return f"the new parameters have no free path to their photograph: {why}"
         async with visit:
             tell("verification")
             await visit.go(self._settings.arrival, point)

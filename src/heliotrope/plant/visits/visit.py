@@ -22,7 +22,7 @@ from heliotrope.links.clock import sleep_until
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.motion.beam_watch import BeamError
+from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.authority import Mandate, RefusedError
 from heliotrope.plant.orders.tickets import Ticket
 

@@ -33,12 +33,18 @@ from heliotrope.lcu.motion import (
     STOW,
     TRACK,
 )
+from heliotrope.mechanism.board_motion import (
+    end_down_the_path,
+    offsets,
+    pieces,
+    safe_paths,
+    turned,
+)
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.twin.field import _kernels as kernels
 from heliotrope.twin.field._among import among
 from heliotrope.twin.field._drives import Drives
-from heliotrope.twin.field._ways import pieces
 from heliotrope.twin.field.journals import Journals
 from heliotrope.twin.sensors import light_share
 from heliotrope.twin.wind import Wind
@@ -136,7 +142,7 @@ class Field:
         self.journals = Journals(mechanism if believed is None else believed, machine)
         self._stow = np.zeros((count, 2), dtype=np.int64)
         self._defocus = np.zeros((count, 2))
-        self._senses = np.ones((count, 2))
+        self._offset = np.zeros((count, 2))
         self.axes = np.zeros((count, 2), dtype=AXIS)
         for table, rows in self.journals.machines():
             self._stow[rows], self._defocus[rows] = table.stow, table.defocus
@@ -167,46 +173,19 @@ class Field:
         self._dark = np.zeros(count, dtype=np.int64)
         self._knot, self._renew, self._since = np.zeros((3, count), dtype=np.int64)
         self._start, self._slope = np.zeros((2, count, 2))
-        self._path = np.zeros((count, 1, 3))
+        books = self.journals
+        self._safe_path, self._safe_path_length = safe_paths(
+            books.corners, books.position, books.origin, books.standby
+        )
+        self._path = np.zeros_like(self._safe_path)
         self._length = np.zeros(count, dtype=np.int64)
         self._place = np.zeros(count, dtype=np.int64)
-        self._safe_path, self._safe_path_length = self._all_safe_paths()
         self._sun = np.zeros((2, 3), dtype=np.int64)
         self._sun_ms = 0
         self._sunned = np.full(count, -RECENT_MS)  # when each took it last, ms
 
     def __len__(self) -> int:
         return len(self.state)
-
-    # -- the safe way ----------------------------------------------------------------------
-
-    def _all_safe_paths(self) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-        """Return the points from the ground to standby, (N, P, 3), and how many there are."""
-        made = [
-            (rows, *self._safe_paths(table.way, rows)) for table, rows in self.journals.machines()
-        ]
-        out = np.zeros((len(self), max(points.shape[1] for _, points, _ in made), 3))
-        lengths = np.zeros(len(self), dtype=np.int64)
-        for rows, points, length in made:
-            out[rows, : points.shape[1]] = points
-            lengths[rows] = length
-        return out, lengths
-
-    def _safe_paths(
-        self, configured: tuple[tuple[float, float, float], ...], rows: Rows
-    ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-        books = self.journals
-        origin, position, standby = books.origin[rows], books.position[rows], books.standby[rows]
-        if configured:
-            corners = np.broadcast_to(np.array(configured), (len(position), len(configured), 3))
-            return pieces(np.concatenate([corners, standby[:, None]], axis=1), origin)
-        half = 0.5 * (standby - position)
-        sine, cosine = 0.5, 0.866
-        aside, foot = position.copy(), standby.copy()
-        aside[:, 0] += cosine * half[:, 0] - sine * half[:, 1]
-        aside[:, 1] += sine * half[:, 0] + cosine * half[:, 1]
-        foot[:, 2] = position[:, 2]
-        return pieces(np.stack([aside, foot, standby], axis=1), origin)
 
     # -- poses -----------------------------------------------------------------------------
 
@@ -225,14 +204,8 @@ class Field:
         kernels.go_rows(self.axes, self._order, rows, steps, how)
 
     def _away(self, rows: Rows, angles: FloatArray) -> FloatArray:
-        """Angles turned away by the defocus; the other way where a stop is near."""
-        low, high = self._low[rows], self._high[rows]
-        turn = self._senses[rows] * self._defocus[rows]
-        turned, other = angles + turn, angles - turn
-        stop = np.where(angles - low > high - angles, low, high)
-        inside = (low <= other) & (other <= high)
-        back = np.where(inside, other, stop)
-        return np.asarray(np.where((low <= turned) & (turned <= high), turned, back))
+        """Angles turned away by the defocus."""
+        return turned(angles, self._offset[rows], self._low[rows], self._high[rows])
 
     def still(self, rows: Rows | None = None) -> Bools:
         """Whether each heliostat is at rest, (N,), or (M,) for some rows."""
@@ -282,8 +255,8 @@ class Field:
         rows = rows[~begun]
         points, down = self._down(rows)
         lower = np.isfinite(down[:, 0])
-        self._sense(rows[~lower])
-        self._senses[rows[lower]] = 0.0
+        self._choose_offsets(rows[~lower])
+        self._offset[rows[lower]] = 0.0
         self._target[rows[lower]] = points[lower]
         self._base[rows] = self.kind[rows]
         self.kind[rows] = DEFOCUS
@@ -316,51 +289,38 @@ class Field:
         self._hold(rows[~leaving])
 
     def _down(self, rows: Rows) -> tuple[FloatArray, FloatArray]:
-        """Return points (M, 3) and angles (M, 2) down the safe way, or NaN: `Motion._turn`."""
-        points, angles = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
+        """Return points (M, 3) and angles (M, 2) down the safe path, or NaN: `Motion._turn`."""
         at_standby = (self._target[rows] == self.journals.standby[rows]).all(axis=1)
         held = self._ready[rows] & (self.kind[rows] == HOLD) & at_standby
         stands = held | (self.kind[rows] == STANDBY)
+        goes = self._recent(rows) & (stands | (self.kind[rows] == APPROACH))
         place = np.where(stands, self._safe_path_length[rows] - 1, self._place[rows])
-        recent = self.now_ms - self._sunned[rows] < RECENT_MS
-        remaining = np.flatnonzero(recent & (stands | (self.kind[rows] == APPROACH)))
-        begin = self._angles_at(self.axes["count"][rows], rows)
-        ground = np.where(stands, self._safe_path[rows, 0, 2], self._path[rows, 0, 2])
-        while len(remaining := remaining[place[remaining] > 0]):
-            place[remaining] -= 1
-            chosen, at = rows[remaining], place[remaining]
-            up = self._path[chosen, np.minimum(at, self._path.shape[1] - 1)]
-            tried = np.where(
-                stands[remaining, None], self._safe_path[chosen, at % self._safe_path.shape[1]], up
-            )
-            tried_angles, good = self._pose(chosen, tried, 0)
-            turn = np.abs(tried_angles - begin[remaining])
-            good &= turn.max(axis=1) <= FAR
-            points[remaining[good]], angles[remaining[good]] = tried[good], tried_angles[good]
-            more = (turn < self._defocus[chosen]).all(axis=1) & (tried[:, 2] > ground[remaining])
-            remaining = remaining[good & more]
-        return points, angles
+        # The path of an approach is no longer than the safe path.
+        begun = self._path[rows, : self._safe_path.shape[1]]
+        return end_down_the_path(
+            lambda some, points: self._pose(rows[some], points, 0),
+            np.where(stands[:, None, None], self._safe_path[rows], begun),
+            np.where(goes, place, 0),
+            self._angles_at(self.axes["count"][rows], rows),
+            self._defocus[rows],
+        )
 
-    def _sense(self, rows: Rows) -> None:
-        """Choose in which sense heliostats turn away: `Motion._turn`."""
-        self._senses[rows] = 1.0
-        recent = self.now_ms - self._sunned[rows] < RECENT_MS
-        aims = among(self.kind[rows], TRACK)
-        leaves = rows[~aims & recent & np.isfinite(self.aim[rows, 0])]
-        some, off = self._off(leaves, self.aim[leaves])
-        self._senses[some] = np.copysign(1.0, off * self._defocus[some])
-        tracks = rows[aims]
-        some, off = self._off(tracks, self.journals.standby[tracks])
-        nearer = np.abs(off + self._defocus[some]) < np.abs(off)
-        self._senses[some] = np.where(nearer, -1.0, 1.0)
+    def _choose_offsets(self, rows: Rows) -> None:
+        """Choose by how much heliostats turn away: `Motion._turn`."""
+        tracks = self.kind[rows] == TRACK
+        points = np.where(tracks[:, None], self.journals.standby[rows], self.aim[rows])
+        points[~self._recent(rows)] = np.nan
+        self._offset[rows] = offsets(
+            lambda some, aims: self._pose(rows[some], aims, 0),
+            points,
+            self._angles_at(self.axes["count"][rows], rows),
+            self._defocus[rows],
+            tracks,
+        )
 
-    def _off(self, rows: Rows, points: FloatArray) -> tuple[Rows, FloatArray]:
-        """Return the rows that can reach their points, and their angles less those there, rad."""
-        if not len(rows):
-            return rows, np.empty((0, 2))
-        angles, good = self._pose(rows, points, 0)
-        rows = rows[good]
-        return rows, self._angles_at(self.axes["count"][rows], rows) - angles[good]
+    def _recent(self, rows: Rows) -> Bools:
+        """Return whether heliostats took the sun lately, (M,)."""
+        return np.asarray(self.now_ms - self._sunned[rows] < RECENT_MS)
 
     def _stow_directly(self, rows: Rows) -> None:
         if not len(rows):

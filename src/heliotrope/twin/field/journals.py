@@ -12,6 +12,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu.journal import CODES_OF
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.board_items import DRIVE_NUMBERS, items_of
+from heliotrope.mechanism.board_motion import Corners
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.kernels import slots as slot
@@ -73,6 +74,11 @@ class Journals:
         for row, table in enumerate(self._machines):
             rows.setdefault(table, []).append(row)
         return [(table, np.array(members, dtype=np.intp)) for table, members in rows.items()]
+
+    @property
+    def corners(self) -> list[Corners]:
+        """Points of the safe paths that the plant file gives the N heliostats, ENU, m."""
+        return [table.way for table in self._machines]
 
     @property
     def origin(self) -> FloatArray:

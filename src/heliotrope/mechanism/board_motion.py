@@ -1,0 +1,167 @@
+"""Where local controllers send their mirrors: the safe path to standby, and the end of a DEFOCUS.
+
+The law of `lcu.motion` over arrays, for plant and simulation; boards move by the scalar code.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.lcu.motion import FAR, PIECE
+
+Rows = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+#: Points of a safe path, ENU, m.
+Corners = tuple[tuple[float, float, float], ...]
+#: Gives, for rows (M,) of K heliostats and points (M, 3), the angles of the axes (M, 2) at which
+#: their beams reach these, and whether they do, (M,).
+Pose = Callable[[Rows, FloatArray], tuple[FloatArray, Mask]]
+
+
+def safe_paths(
+    corners: Sequence[Corners], position: FloatArray, origin: FloatArray, standby: FloatArray
+) -> tuple[FloatArray, Rows]:
+    """Return the points of beams from the ground to standby: `Motion.way`.
+
+    Parameters
+    ----------
+    corners
+        Points that the plant file gives each of N heliostats; (): it finds its own.
+    position, origin, standby
+        Places of the heliostats, origins of their beams, and standby points, ENU, m, (N, 3).
+
+    Returns
+    -------
+    Points (N, P, 3), and the number of points of each path, (N,).
+    """
+    members: dict[Corners, list[int]] = {}
+    for row, own in enumerate(corners):
+        members.setdefault(own, []).append(row)
+    made = []
+    for own, rows in members.items():
+        foot, end = position[rows], standby[rows]
+        if own:
+            before = np.broadcast_to(np.array(own), (len(rows), len(own), 3))
+        else:  # beside the tower on the ground, half-way to its foot, then the foot
+            east, north = 0.5 * (end - foot)[:, :2].T
+            sine, cosine = 0.5, 0.866
+            sideways = [cosine * east - sine * north, sine * east + cosine * north, 0.0 * east]
+            under = np.concatenate([end[:, :2], foot[:, 2:]], axis=1)
+            before = np.stack([foot + np.stack(sideways, axis=1), under], axis=1)
+        made.append((rows, *pieces(np.concatenate([before, end[:, None]], axis=1), origin[rows])))
+    points = np.zeros((len(corners), max((p.shape[1] for _, p, _ in made), default=0), 3))
+    length = np.zeros(len(corners), dtype=np.intp)
+    for rows, some, count in made:
+        points[rows, : some.shape[1]], length[rows] = some, count
+    return points, length
+
+
+def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, Rows]:
+    """Return paths with points added between corners; see `lcu.motion.PIECE`.
+
+    Parameters
+    ----------
+    corners
+        (N, C, 3), m.
+    origin
+        Origins of the beams, (N, 3), m.
+
+    Returns
+    -------
+    Points (N, P, 3), and the number of points of each path, (N,).
+    """
+    rays = corners - origin[:, None]
+    cross = np.linalg.norm(np.cross(rays[:, :-1], rays[:, 1:]), axis=-1)
+    turn = np.arctan2(cross, np.einsum("nci,nci->nc", rays[:, :-1], rays[:, 1:]))
+    parts = 1 + (turn / PIECE).astype(np.intp)
+    length = 1 + parts.sum(axis=1)
+    out = np.zeros((len(corners), int(length.max(initial=0)), 3))
+    out[:, :1] = corners[:, :1]
+    place = np.ones(len(corners), dtype=np.intp)
+    for c in range(parts.shape[1]):
+        first, leg = corners[:, c], corners[:, c + 1] - corners[:, c]
+        for k in range(1, int(parts[:, c].max(initial=0)) + 1):
+            rows = np.flatnonzero(k <= parts[:, c])
+            n = parts[rows, c, None]
+            inner = first[rows] + leg[rows] * k / n
+            out[rows, place[rows]] = np.where(k == n, corners[rows, c + 1], inner)
+            place[rows] += 1
+    return out, length
+
+
+def end_down_the_path(
+    pose: Pose, path: FloatArray, place: Rows, begin: FloatArray, defocus: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return where DEFOCUS ends on the safe path, below a place on it: `Motion._turn`.
+
+    A mirror goes back down until an axis has turned by its angle or the ground is reached.
+
+    Parameters
+    ----------
+    pose
+        Poses of the K heliostats; see `Pose`.
+    path
+        Safe paths, (K, P, 3), m.
+    place
+        Points below each heliostat, (K,); 0: it does not go back.
+    begin, defocus
+        Present angles, and angles by which the axes turn, rad, (K, 2).
+
+    Returns
+    -------
+    Points (K, 3) and angles (K, 2); NaN where there is none, and the mirror turns by its angles.
+    """
+    points, angles = np.full((len(place), 3), np.nan), np.full((len(place), 2), np.nan)
+    place, left = place.copy(), np.arange(len(place))
+    while len(left := left[place[left] > 0]):
+        place[left] -= 1
+        tried = path[left, place[left]]
+        found, good = pose(left, tried)
+        turn = np.abs(found - begin[left])
+        good &= turn.max(axis=-1) <= FAR
+        points[left[good]], angles[left[good]] = tried[good], found[good]
+        goes_on = (turn < defocus[left]).all(axis=-1) & (tried[:, 2] > path[left, 0, 2])
+        left = left[good & goes_on]
+    return points, angles
+
+
+def offsets(
+    pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArray, tracks: Mask
+) -> FloatArray:
+    """Return by how much the axes turn where DEFOCUS does not go down the path: `Motion._turn`.
+
+    From an aim, an axis that would come nearer to standby turns the other way. A mirror that is
+    held turns off its aim.
+
+    Parameters
+    ----------
+    pose, begin, defocus
+        As for `end_down_the_path`.
+    points
+        Standby point of a mirror that tracks, of every other its aim, m, (K, 3); NaN: none.
+    tracks
+        Whether each mirror tracks or searches, (K,).
+    """
+    off, known = np.full_like(begin, np.nan), np.flatnonzero(np.isfinite(points).all(axis=-1))
+    if known.size:
+        angles, good = pose(known, points[known])
+        off[known[good]] = (begin[known] - angles)[good]
+    back = np.where(np.abs(off + defocus) < np.abs(off), -defocus, defocus)
+    chosen = np.where(tracks[:, None], back, np.copysign(defocus, off))
+    return as_float(np.where(np.isnan(off), defocus, chosen))
+
+
+def turned(begin: FloatArray, offset: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return angles turned by an offset, the other way where a stop is near: `Motion._away`.
+
+    Parameters
+    ----------
+    begin, offset, low, high
+        Angles, offsets, and the stops, rad, (K, 2).
+    """
+    there, other = begin + offset, begin - offset
+    stop = np.where(begin - low > high - begin, low, high)
+    back = np.where((low <= other) & (other <= high), other, stop)
+    return as_float(np.where((low <= there) & (there <= high), there, back))

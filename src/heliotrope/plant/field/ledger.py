@@ -1,0 +1,188 @@
+"""The ledger: which orders each heliostat was sent and has acknowledged, by kind of order.
+
+A report says nothing of an order that the board had not taken yet when it made the report. A path
+is proven from where a heliostat was last reported: if another order has been sent since, it may
+have left that place, and is somewhere on a path that nobody has proven. Whoever asks whether a
+report counts, or which of two orders came later, asks here.
+
+A heliostat that leaves the receiver was lost, unless it was ordered off, by anybody: `losses` asks
+here for that too.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages, states
+from heliotrope.plant.field.state import FieldState, Mask
+
+#: A kind of order: the names of its commands.
+Kind = frozenset[str]
+#: Orders after which a heliostat may be out again.
+_OUT = messages.MOTIONS | messages.RELEASES
+#: Orders that move. A new point moves only in some states: see `_POINTS`.
+MOVING = messages.MOTIONS | messages.SAFE | messages.POINTS
+#: Single orders.
+STOWING, LOCKING, TO_REST, STEPPING = (frozenset({n}) for n in ("STOW", "LOCK", "IDLE", "ROUGH"))
+#: The kinds that the ledger keeps.
+KINDS = (
+    MOVING, messages.SAFE, messages.JOINING, messages.STANDS, _OUT, STOWING, LOCKING, TO_REST,
+    STEPPING,
+)  # fmt: skip
+#: States in which a new point moves a heliostat.
+_POINTS = {"AIM": states.ON_AIM, "STANDBY": (states.IDLE,)}
+#: From an order to a report that the board may have made before it took the order, s.
+_TAKEN_WITHIN = 1.0
+#: States in which a heliostat is off already: an order does not take it off.
+_GONE = (*states.LEAVING, states.STOWED)
+
+Rows = npt.NDArray[np.intp]
+
+
+class _Column:
+    """The last order of one kind of N heliostats.
+
+    Attributes
+    ----------
+    number
+        Its number in the order of sending, 0 before the first, (N,); a repetition keeps it.
+    sent
+        When it was first sent, monotonic s, (N,).
+    acknowledged, accepted
+        When the last acknowledged order was acknowledged, and accepted by the plant, (N,).
+    shown
+        From when on a report shows it, (N,).
+    """
+
+    def __init__(self, count: int) -> None:
+        self.number = np.zeros(count, dtype=np.int64)
+        self.sent, self.acknowledged, self.accepted, self.shown = np.full((4, count), -np.inf)
+
+
+class Ledger:
+    """The last orders of each kind that N heliostats were sent and have acknowledged.
+
+    Parameters
+    ----------
+    field
+        State of the field, with the time of each report.
+    """
+
+    def __init__(self, field: FieldState) -> None:
+        self._field, self._number = field, 0
+        self._kinds = {kind: _Column(len(field)) for kind in KINDS}
+        #: When heliostats that were out were ordered off, monotonic s, (N,).
+        self._off_at = np.full(len(field), -np.inf)
+        #: When they last refused a command, monotonic s, (N,).
+        self._refused_at = np.full(len(field), -np.inf)
+        #: Whether the order off was acknowledged, (N,).
+        self._obeyed = np.zeros(len(field), dtype=np.bool_)
+
+    # -- what happens ----------------------------------------------------------------------
+
+    def sent(
+        self, name: str, heliostats: Sequence[str], now: float, *, again: bool = False
+    ) -> None:
+        """Note an order that has been sent, or repeated (``again``)."""
+        rows = self._rows(heliostats)
+        if name in messages.SAFE:
+            # One that is silent, off already, or has refused a command since it was last heard, may
+            # have left before: then the order is no cause.
+            out_at = self._kinds[_OUT].sent
+            gone = np.isin(self._field.rows["state"][rows], _GONE)
+            gone &= out_at[rows] + _TAKEN_WITHIN <= self._field.heard[rows]
+            gone |= self._refused_at[rows] > self._field.heard[rows]
+            gone |= ~self._field.live(now)[rows] | (self._off_at[rows] > out_at[rows])
+            self._off_at[rows[~gone]], self._obeyed[rows[~gone]] = now, False
+        self._number += 1
+        for kind, column in self._of(name):
+            mine = self._moved(kind, name, rows)
+            column.shown[mine] = np.maximum(column.shown[mine], now + _TAKEN_WITHIN)
+            if not again:
+                column.sent[mine], column.number[mine] = now, self._number
+
+    def acknowledged(
+        self, name: str, accepted_at: float, heliostats: Sequence[str], now: float
+    ) -> None:
+        """Note that an order has been acknowledged: it may have been long under way.
+
+        The plant accepted it at ``accepted_at``, monotonic s.
+        """
+        rows = self._rows(heliostats)
+        if name in messages.SAFE:
+            heard = rows[self._field.live(now)[rows]]
+            last = heard[self._off_at[heard] > self._kinds[_OUT].sent[heard]]
+            self._off_at[last], self._obeyed[last] = now, True
+        for kind, column in self._of(name):
+            mine = self._moved(kind, name, rows)
+            column.shown[mine] = np.maximum(column.shown[mine], now)
+            column.acknowledged[mine], column.accepted[mine] = now, accepted_at
+
+    def refused(self, name: str, heliostats: Sequence[str], now: float) -> None:
+        """Note that heliostats have refused a command: they may no longer be where they seem.
+
+        A refusal that the reported state explains, such as of APPROACH in TRACKING, says nothing.
+        """
+        state = self._field.rows["state"]
+        leads_on = f" {name} " in states.TABLE
+        rows = self._rows(heliostats)
+        odd = [r for r in rows if not leads_on or states.transition(int(state[r]), name)]
+        self._refused_at[odd] = now
+
+    def follows_loss(self, heliostats: Sequence[str]) -> None:
+        """Note that heliostats were ordered off because something was lost: see `off`."""
+        self._off_at[self._rows(heliostats)] = -np.inf
+
+    def _rows(self, heliostats: Sequence[str]) -> Rows:
+        return np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+
+    def _of(self, name: str) -> list[tuple[Kind, _Column]]:
+        return [(kind, column) for kind, column in self._kinds.items() if name in kind]
+
+    def _moved(self, kind: Kind, name: str, rows: Rows) -> Rows:
+        """Return the rows (K,) for which an order is of a kind: some points move nothing."""
+        if kind is not MOVING or name not in _POINTS:
+            return rows
+        return rows[np.isin(self._field.rows["state"][rows], _POINTS[name])]
+
+    # -- questions -------------------------------------------------------------------------
+
+    def reported(self, kind: Kind = MOVING) -> Mask:
+        """Return whose last report is from after their last order of a kind, (N,)."""
+        return np.asarray(self._field.heard >= self._kinds[kind].shown)
+
+    def sent_since(self, kind: Kind, at: float) -> Mask:
+        """Return which heliostats were first sent their last order of a kind since a time, (N,).
+
+        ``at`` is in monotonic s; a repetition does not count.
+        """
+        return np.asarray(self._kinds[kind].sent >= at)
+
+    def later(self, kind: Kind, other: Kind) -> Mask:
+        """Return which heliostats were sent an order of a kind after all of another kind, (N,)."""
+        return np.asarray(self._kinds[kind].number > self._kinds[other].number)
+
+    def obeyed_since(self, kind: Kind, at: float, after: Kind) -> Mask:
+        """Return which heliostats have acknowledged an order of a kind since a time, (N,).
+
+        It counts only if it was accepted after the last order of the kind ``after`` was sent.
+        """
+        column = self._kinds[kind]
+        in_order = column.accepted > self._kinds[after].sent
+        return np.asarray(in_order & (column.acknowledged >= at))
+
+    def off(self, seen: FloatArray, now: float) -> Mask:
+        """Return which heliostats were ordered off, by anybody, (N,); to be asked at each check.
+
+        It is the last order that they were sent, or it was sent after they were last ``seen`` out,
+        monotonic s, (N,). An order to one that was silent, or fell silent before it acknowledged
+        it, or was off already, or had refused a command since it was last heard, does not count: it
+        may have left by itself. Nor does an order of the safety table to a whole cluster, which is
+        silent, or has lost the time.
+        """
+        self._off_at[~self._field.live(now) & ~self._obeyed] = -np.inf
+        ordered = np.isfinite(self._off_at)
+        later = self._off_at + _TAKEN_WITHIN > seen
+        return np.asarray(ordered & (later | (self._off_at > self._kinds[_OUT].sent)))

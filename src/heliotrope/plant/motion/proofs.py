@@ -1,0 +1,406 @@
+"""Proof, before a command is sent, that it brings no beam into a keep-out volume.
+
+Where beams are afterwards is watched by `BeamWatch`.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages, states
+from heliotrope.lcu.diagnosis import NUDGE
+from heliotrope.mechanism.tracking import TrackingStatus
+from heliotrope.plant.field.assigned import BEFORE, KINDS, Points
+from heliotrope.plant.field.ledger import MOVING, Kind, Ledger
+from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.motion.paths import Paths
+from heliotrope.plant.orders.parameters import Tables
+from heliotrope.plant.refusals import (
+    BEAM_REFUSED,
+    PLACE_UNKNOWN,
+    SOON,
+    STILL_MOVING,
+    NoFreePath,
+    RefusedError,
+)
+
+Rows = npt.NDArray[np.intp]
+
+#: A heliostat moves if its counts and goals differ by more steps than this.
+_MOVES = 200
+#: Commands whose whole motion is proven before they are sent.
+_PROVEN = messages.TO_STANDBY | messages.BY_COUNTS
+#: States from which IDLE moves a heliostat straight to its standby point; from the last two it
+#: does so once the heliostat has been unlocked, or its fault cleared, which no report may show yet.
+_TO_STANDBY = (
+    states.TRACKING,
+    states.SEARCHING,
+    states.DEFOCUSED,
+    states.IDLE,
+    states.LOCKED,
+    states.FAULT,
+)
+
+
+class BeamError(RefusedError):
+    """The refusal of a command that would bring beams where none may be.
+
+    Attributes
+    ----------
+    refusals
+        Reasons, by name of the heliostat.
+    """
+
+    def __init__(self, command: str, refusals: dict[str, str]) -> None:
+        self.refusals = refusals
+        first, text = next(iter(refusals.items()))
+        more = f" (and {len(refusals) - 1} more)" if len(refusals) > 1 else ""
+        super().__init__(
+            BEAM_REFUSED.text.format(what=command, heliostat=first, more=more, reason=text)
+        )
+
+
+class PathProofs:
+    """Proofs that commands bring no beam into a keep-out volume.
+
+    Parameters
+    ----------
+    paths
+        Paths of the heliostats past the keep-out volumes.
+    field, ledger
+        State of the field, with the positions of the axes; what was ordered.
+    points
+        Assigned aims and standby points.
+    sun
+        Returns the unit vector to the sun, (3,), some seconds from now.
+
+    Attributes
+    ----------
+    paths, field, ledger, points, sun
+        As given.
+    """
+
+    def __init__(
+        self,
+        paths: Paths,
+        field: FieldState,
+        ledger: Ledger,
+        points: Points,
+        sun: Callable[[float], FloatArray],
+    ) -> None:
+        self.paths, self._check = paths, paths.check
+        self.field, self.ledger, self.points, self.sun = field, ledger, points, sun
+        #: Tables that unverified ones have replaced, by row.
+        self._earlier: dict[int, Tables] = {}
+
+    def check_points(
+        self, name: str, rows: Rows, wanted: FloatArray, tracking: npt.NDArray[np.bool_]
+    ) -> None:
+        """Prove that heliostats (K,) may be given points (K, 3) by AIM or STANDBY.
+
+        Raises
+        ------
+        BeamError
+            If one of the beams may not go there.
+        """
+        stopped, light = name == "AIM", self.sun(0.0)
+        blocked = self._early(name, rows)
+        for start, among in self._starts(rows, tracking):
+            of = rows[among], wanted[among], light
+            blocked |= self._check.problems(*of, start=start, stopped=stopped)
+        if not stopped:
+            every = self.points.possible("STANDBY", np.arange(len(self.field)))
+            blocked |= self._check.glare(rows, wanted, every, light)
+        if blocked:
+            raise BeamError(name, _refusals(blocked))
+
+    def _early(self, name: str, rows: Rows) -> dict[str, str]:
+        """Return which heliostats may not have a new point before they are heard again, and why.
+
+        The path to it is proven from the point before. One that goes there, or may by an order
+        that no report shows yet, would go to the new point from elsewhere.
+        """
+        if not self._check.volumes:
+            return {}
+        if name == "AIM":  # those that track join it, and are examined then
+            return self._unplaced(rows, messages.JOINING)
+        state = self.field.rows["state"][rows]
+        found = self._unplaced(rows[np.isin(state, _TO_STANDBY)])
+        return found | self._unsettled(rows[state == states.IDLE])
+
+    def _starts(
+        self, rows: Rows, tracking: npt.NDArray[np.bool_]
+    ) -> list[tuple[FloatArray, npt.NDArray[np.intp]]]:
+        """Return points (M, 3) where the beams of some of K heliostats may be, and which, (M,).
+
+        All are among the first, NaN where no point is known.
+        """
+        points = self.points
+        start = np.where(tracking[:, None], points.aims[rows], points.standbys[rows])
+        found = [(start, np.arange(len(rows)))]
+        for k in range(BEFORE):
+            aims, standbys = (points.earlier[kind][k, rows] for kind in KINDS)
+            before = np.where(tracking[:, None], aims, standbys)
+            among = np.flatnonzero(np.isfinite(before).all(axis=-1))
+            if among.size:
+                found.append((before[among], among))
+        return found
+
+    def clear(
+        self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
+    ) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Return the heliostats that may be sent a command, and why the others may not.
+
+        Raises
+        ------
+        BeamError
+            If none may.
+        """
+        solids = self._check.solids if name == "APPROACH" else ()
+        if name not in _PROVEN or not (self._check.volumes or solids):
+            return heliostats, {}
+        rows = np.array([self.field.place(n) for n in heliostats], dtype=np.intp)
+        # A heliostat without known counts is left to its local controller.
+        rows = rows[np.isfinite(self.field.counted_at[rows])]
+        if name == "APPROACH":
+            blocked = self._from_stow(rows)
+        elif name == "IDLE":
+            mine = np.isin(self.field.rows["state"][rows], _TO_STANDBY)
+            blocked = self._back_to_standby(rows[mine], now)
+        else:
+            path = self._by_counts(name, values, rows)
+            blocked = self._check.moving(rows, path, self.sun(0.0)) | self._unplaced(rows)
+        blocked = _refusals(blocked)
+        if blocked and len(blocked) == len(heliostats):
+            raise BeamError(name, blocked)
+        return tuple(n for n in heliostats if n not in blocked), blocked
+
+    def _from_stow(self, rows: Rows) -> dict[str, str]:
+        """Return the heliostats whose path from stow to standby is blocked, and the reasons."""
+        early = self._unplaced(rows, messages.SAFE)
+        rows, blocked = self._resting(rows)
+        if not self._check.volumes:
+            blocked = {}  # a path to a point that is not known here is not proven
+        stow, counts = self.paths.stow[rows], self.field.counts(rows)
+        begin = dict(zip(rows.tolist(), np.where(np.isfinite(stow), stow, counts), strict=True))
+        for some, standbys in self.points.possible("STANDBY", rows):
+            here = np.array([begin[row] for row in some.tolist()])
+            blocked |= self.paths.approach(some, here, standbys, self.sun)
+        return blocked | early
+
+    def _back_to_standby(self, rows: Rows, now: float) -> dict[str, str]:
+        """Return the heliostats whose straight path to standby is blocked, and the reasons.
+
+        A path is proven from where a heliostat stands. One that moves is no longer there, and does
+        not turn at once.
+        """
+        early = self._unsettled(rows) | self._unplaced(rows, now=now)
+        rows, blocked = self._resting(rows)
+        light = self.sun(0.0)
+        for some, standbys in self.points.possible("STANDBY", rows):
+            blocked |= self._by_earlier(some, standbys)
+            good, path = self._to_standby(some, standbys, light)
+            blocked |= self._check.moving(good, path, light)
+        return blocked | early
+
+    def _unsettled(self, rows: Rows) -> dict[str, str]:
+        """Return the heliostats that move, or were ordered to since their last report."""
+        found = {self.field.names[row]: STILL_MOVING.text for row in rows[self.moving(rows)]}
+        return found | self._unplaced(rows)
+
+    def _unplaced(
+        self, rows: Rows, kind: Kind = MOVING, now: float | None = None
+    ) -> dict[str, str]:
+        """Return the heliostats (K,) without a report from after an order of a kind.
+
+        With ``now`` (monotonic s) those that are not live are among them. Others wait for them.
+        """
+        placed = self.ledger.reported(kind)
+        if now is not None:
+            placed &= self.field.live(now)
+        late = rows[~placed[rows]]
+        return {self.field.names[row]: PLACE_UNKNOWN.text for row in late}
+
+    def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
+        """Return the heliostats whose standby points are known, and why the others do not go."""
+        known = np.isfinite(self.points.standbys[rows]).all(axis=-1)
+        return rows[known], {
+            self.field.names[row]: "its standby point is not known here; give it one "
+            "(STANDBY) first, or stow it"
+            for row in rows[~known]
+        }
+
+    def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str:
+        """Return why new parameters may not be written where a heliostat stands, "" if they may.
+
+        With the present parameters and with the new ones, its beam must be free where it stands
+        and on the path from there to its standby point; and with the present ones on the path that
+        the new ones will lead it, since the new ones may be false.
+
+        Parameters
+        ----------
+        heliostat
+            Name of the heliostat, which is at rest.
+        armature, drives
+            The new tables, (18,) and (2, 19).
+        """
+        row = self.field.place(heliostat)
+        if not self._check.volumes or not np.isfinite(self.field.posed_at[row]):
+            return ""
+        rows, new, present = np.array([row]), (armature, drives), self._tables(row)
+        for tables in (present, new):
+            with self._believing(row, tables):
+                if blocked := self._from_here(rows):
+                    return blocked[heliostat].partition(";")[0]
+        standbys = self.points.standbys[rows]
+        with self._believing(row, new):
+            blocked = self._misled(rows, standbys, present)
+        return blocked[heliostat].partition(";")[0] if blocked else ""
+
+    @contextmanager
+    def unverified(self, heliostat: str) -> Iterator[None]:
+        """Prove paths with the present parameters too, while others that replace them are verified.
+
+        By those, the heliostat goes to a target and comes back; if they are false, its beam is
+        where the present ones say.
+        """
+        row = self.field.place(heliostat)
+        self._earlier[row] = self._tables(row)
+        try:
+            yield
+        finally:
+            self._earlier.pop(row, None)
+
+    def misled(self, heliostat: str, point: FloatArray) -> str:
+        """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
+        rows = np.array([self.field.place(heliostat)])
+        blocked = self._by_earlier(rows, point[None])
+        return blocked[heliostat].partition(";")[0] if blocked else ""
+
+    def _tables(self, row: int) -> Tables:
+        return self._check.armature.table[row].copy(), self._check.drives.table[row].copy()
+
+    @contextmanager
+    def _believing(self, row: int, tables: Tables) -> Iterator[None]:
+        """Prove with other tables of a heliostat."""
+        present = self._tables(row)
+        self._check.replace(row, *tables)
+        try:
+            yield
+        finally:
+            self._check.replace(row, *present)
+
+    def _misled(self, rows: Rows, point: FloatArray, tables: Tables) -> dict[str, str]:
+        """Return why the path on which one heliostat is led to a point (1, 3) is blocked.
+
+        The parameters of the check lead it, and the beam goes by ``tables``.
+        """
+        if not np.isfinite(point).all():
+            return {}
+        counts, light = self.field.counts(rows), self.sun(0.0)
+        ends = self._check.poses(rows, point, light, counts).best_counts
+        with self._believing(int(rows[0]), tables):
+            return self._check.moving(rows, self.paths.motion(rows, counts, ends), light)
+
+    def _by_earlier(self, rows: Rows, points: FloatArray) -> dict[str, str]:
+        """Return the paths to points (K, 3) that are blocked by parameters that were replaced."""
+        found: dict[str, str] = {}
+        for i, row in enumerate(rows.tolist()):
+            if row in self._earlier:
+                found |= self._misled(rows[i : i + 1], points[i : i + 1], self._earlier[row])
+        return found
+
+    def _from_here(self, rows: Rows) -> dict[str, str]:
+        """Return which heliostats may not go from where they stand to standby, and why."""
+        light = self.sun(0.0)
+        here = self.paths.angles(rows, self.field.posed[rows])
+        blocked = self._check.moving(rows, np.repeat(here[:, None], 2, axis=1), light)
+        known = rows[np.isfinite(self.points.standbys[rows]).all(axis=-1)]
+        good, path = self._to_standby(known, self.points.standbys[known], light)
+        blocked |= {
+            self.field.names[row]: "its standby point cannot be reached"
+            for row in np.setdiff1d(known, good)
+        }
+        return blocked | self._check.moving(good, path, light)
+
+    def joining(
+        self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
+    ) -> dict[str, str]:
+        """Return which heliostats may not join their aims now, and why.
+
+        AIM brings a new aim, its values; every other command leads to those that they may have.
+        """
+        if not self._check.volumes:
+            return {}
+        rows = np.array([self.field.index[n] for n in heliostats], dtype=np.intp)
+        new = name == "AIM"
+        aims = np.tile(values, (len(rows), 1)) if new else self.points.aims[rows]
+        unknown = ~np.isfinite(aims).all(axis=-1)
+        found = {
+            heliostats[i]: f"{name}: its aim is not known here; give it one (AIM) first"
+            for i in np.flatnonzero(unknown)
+        }
+        if not unknown.all():
+            light = self.sun(0.0)
+            found |= self._unplaced(rows, messages.SAFE, now)
+            possible = self.points.possible("AIM", rows[~unknown])
+            for known, places in [(rows, aims)] if new else possible:
+                found |= self._by_earlier(known, places)
+                for some, begin in self._begins(known):
+                    to = known[some], begin, places[some], light, self.paths.motion
+                    found |= self._check.on_the_way(*to)
+                if name == "SEARCH":
+                    found |= self._check.around(known, places, values[1], light)
+        return _refusals(found)
+
+    def _begins(self, rows: Rows) -> list[tuple[npt.NDArray[np.bool_], FloatArray]]:
+        """Return where motions of heliostats (K,) may begin: which, (K,), and their counts (M, 2).
+
+        One that moves may be anywhere between its counts and its goals.
+        """
+        counts, goals = self.field.counts(rows), self.field.goals(rows)
+        moving = self.moving(rows)
+        found = [(np.ones(len(rows), dtype=np.bool_), counts)]
+        if moving.any():
+            found += [
+                (moving, counts[moving] + share * (goals - counts)[moving]) for share in (0.5, 1.0)
+            ]
+        return found
+
+    def _to_standby(
+        self, rows: Rows, standbys: FloatArray, light: FloatArray
+    ) -> tuple[Rows, FloatArray]:
+        """Return the heliostats that reach their standby points (K, 3), and their paths there."""
+        counts = self.field.counts(rows)
+        found = self._check.poses(rows, standbys, light, counts)
+        good = found.chosen(found.status) == TrackingStatus.OK
+        rows, ends = rows[good], found.best_counts[good]
+        return rows, self.paths.motion(rows, counts[good], ends)
+
+    def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:
+        """Return the angles that a command passes, from where the axes stand, (K, W, 2)."""
+        counts = self.field.counts(rows)
+        if name == "DIAGNOSE":
+            begin = self.paths.angles(rows, counts)
+            nudges = NUDGE * np.array([(1, 0), (-1, 0), (0, 0), (0, 1), (0, -1)])
+            return np.stack([begin, *(begin + nudge for nudge in nudges)], axis=-2)
+        ends = np.broadcast_to(np.asarray(values, dtype=np.float64), (len(rows), 2))
+        if name == "JOG":
+            axis, steps = int(values[0]), values[1]
+            ends = self.field.goals(rows)
+            if axis < 2:  # the local controller refuses any other axis
+                ends[:, axis] += steps
+        return self.paths.motion(rows, counts, ends)
+
+    def moving(self, rows: Rows) -> npt.NDArray[np.bool_]:
+        """Return which heliostats move to their goals, (K,)."""
+        left = np.abs(self.field.goals(rows) - self.field.posed[rows])
+        return np.asarray((left > _MOVES).any(axis=-1))
+
+
+def _refusals(reasons: Mapping[str, str]) -> dict[str, str]:
+    """Mark the reasons of heliostats whose paths are not free; the others only wait for reports."""
+    return {n: text if text in SOON else NoFreePath(text) for n, text in reasons.items()}

@@ -1,0 +1,91 @@
+"""The sending of heliostats that wait in a queue, once their turn has come."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from heliotrope.lcu import messages
+from heliotrope.plant.motion.proofs import BeamError, PathProofs
+from heliotrope.plant.orders.authority import RefusedError
+from heliotrope.plant.orders.guards import Asked, Guards
+from heliotrope.plant.orders.joining import JoiningJob, JoinQueue, Lost
+from heliotrope.plant.orders.queue import PlantOrders
+from heliotrope.plant.refusals import BEAM_REFUSED
+
+#: Returns which of some heliostats may be sent a command with values, and why the others may not.
+Examine = Callable[
+    [str, tuple[float, ...], tuple[str, ...]], tuple[tuple[str, ...], dict[str, str]]
+]
+
+
+class JoinDispatcher:
+    """The sending of heliostats whose turn has come, if the path of their beams is clear now.
+
+    The sun has moved since the aim was accepted, and the heliostat may point anywhere. So the sweep
+    from its present direction to its aim is proven at the moment it begins.
+
+    Parameters
+    ----------
+    now
+        Returns the monotonic time, s.
+    queue, orders, proofs
+        Of the plant.
+    life
+        Life of a command whose turn has come, s.
+    guards
+        What stops heliostats when their turn comes.
+    examine
+        Examines a slice of those that leave stow.
+    """
+
+    def __init__(
+        self,
+        now: Callable[[], float],
+        queue: JoinQueue,
+        orders: PlantOrders,
+        proofs: PathProofs,
+        life: float,
+        guards: Guards,
+        examine: Examine,
+    ) -> None:
+        self._now, self._queue, self._orders = now, queue, orders
+        self._proofs, self._life = proofs, life
+        self._guards, self._examine = guards, examine
+
+    def beat(self, now: float, lost: Lost, *, held: bool) -> None:
+        """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
+        for job, part in self._queue.admit(now, lost, held=held):
+            clear = self._clear(job, part)
+            if job.assign is None or not clear:
+                self._send(job, clear)
+            else:
+                job.assign(clear, partial(self._clear, job), partial(self._send, job))
+
+    def _send(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
+        again = partial(self._wait_again, job)
+        values, token = job.values, job.token
+        self._orders.command(job.ticket, job.name, values, heliostats, token, self._life, again)
+
+    def _wait_again(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
+        """Let heliostats whose cluster refused an earlier token wait for another turn."""
+        self._queue.put(replace(job, waiting=deque(heliostats)))
+
+    def _clear(self, job: JoiningJob, part: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the heliostats whose turn has come and that may go; end the ticket for others."""
+        try:
+            if job.name in messages.SLICED:
+                blocked = self._examine(job.name, job.values, part)[1]
+            else:
+                # AIM brings a new aim; every other command leads to those that they have.
+                points = np.tile(job.values, (len(part), 1)) if job.name == "AIM" else None
+                blocked = self._proofs.joining(job.name, job.values, part, self._now())
+                blocked |= self._guards.reasons(Asked(job.name, part, points), BEAM_REFUSED)
+        except BeamError as error:
+            blocked = error.refusals
+        except RefusedError as error:
+            blocked = dict.fromkeys(part, str(error))
+        job.ticket.block(blocked)
+        return tuple(name for name in part if name not in blocked)
