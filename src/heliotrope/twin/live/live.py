@@ -126,7 +126,8 @@ class World:
     ----------
     design
         The plant: groups of any kind of mechanism with two drives and a machine table, each
-        heliostat on a cluster; its mechanisms count as nominal.
+        heliostat on a cluster. Its mechanisms count as nominal, and its local controllers store
+        them with the parameters of its heliostats.
     clock
         Clock of the loop that it will run in.
     options
@@ -165,7 +166,7 @@ class World:
         self.design, self.clock, self.options = design, clock, chosen
         groups = design.groups.values()
         self.names = design.names
-        self.truth = together([_installed(g, chosen, i) for i, g in enumerate(groups)])
+        self.truth = true_mechanisms(design, chosen)
         believed, machines = together([g.calibrated for g in groups]), machines_of(design)
         self.field: Field | BoardField = (
             BoardField(clock, self.names, self.truth, believed, machines, chosen.seed)
@@ -349,6 +350,21 @@ class World:
 def steps_every(heliostats: int) -> int:
     """Return the time between requests for the step counts of a plant's heliostats, s."""
     return 1 if heliostats <= _SMALL else _STEPS_EVERY
+
+
+def true_mechanisms(design: Plant, options: WorldOptions) -> Mechanism:
+    """Return the true mechanisms of a world, in the order of the design, (N,).
+
+    They do not depend on the parameters of the design's heliostats, which the local controllers of
+    the world store.
+
+    Raises
+    ------
+    InputError
+        A mechanism with one drive.
+    """
+    groups = design.groups.values()
+    return together([_installed(group, options, i) for i, group in enumerate(groups)])
 
 
 def _installed(group: Heliostats, options: WorldOptions, number: int) -> Mechanism:
