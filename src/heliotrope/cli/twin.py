@@ -80,7 +80,7 @@ def twin(
         _free(_address(serve, "--serve")),
         steps_every=steps_every(len(design)),
     )
-    options = TwinOptions(begins, speed, seed, boards or prototype, up)
+    options = TwinOptions(begins, speed, seed, boards or prototype, up, waits=child)
     program = TwinProgram(design, files, options)
     if child:
         print(READY, flush=True)

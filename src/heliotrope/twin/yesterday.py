@@ -105,7 +105,7 @@ class Yesterday:
 
 
 @dataclass(frozen=True)
-class _Stored:
+class StoredParameters:
     """Parameters of K heliostats by name, each (K,); a `mechanism.chain.Calibrated`."""
 
     heliostats: tuple[str, ...]
@@ -149,16 +149,23 @@ async def begin_second_day(
 
 def with_records(design: Plant, records: Sequence[HeliostatCalibration]) -> Plant:
     """Return a plant whose heliostats have the parameters of calibrations, at most one for each."""
+    for stored in by_model(records):
+        design = design.with_calibration(stored)
+    return design
+
+
+def by_model(records: Sequence[HeliostatCalibration]) -> list[StoredParameters]:
+    """Return the parameters of calibrations, those with the same parameters together."""
     models: dict[tuple[str, ...], list[HeliostatCalibration]] = {}
     for record in records:
         models.setdefault(record.names, []).append(record)
-    for names, members in models.items():
-        values = np.stack([record.values for record in members], axis=1)
-        stored = _Stored(
-            tuple(record.heliostat for record in members), dict(zip(names, values, strict=True))
+    return [
+        StoredParameters(
+            tuple(record.heliostat for record in members),
+            dict(zip(names, np.stack([r.values for r in members], axis=1), strict=True)),
         )
-        design = design.with_calibration(stored)
-    return design
+        for names, members in models.items()
+    ]
 
 
 def measure_yesterday(

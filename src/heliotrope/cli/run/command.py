@@ -1,5 +1,6 @@
 """``heliotrope run``: a plant at work with its console until Ctrl-C, simulated or real."""
 
+from enum import StrEnum
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +13,18 @@ from heliotrope.cli._plants import design_of, one_plant, start_of
 
 _TWIN, _REAL, _WORK = "Simulation", "A real plant", "Work"
 _CONSOLE, _KEPT = "Console", "Records"
+
+
+class Begin(StrEnum):
+    """How a simulated field begins."""
+
+    SECOND_DAY = "second-day"
+    NEW = "new"
+    STOW = "stow"
+
+
+#: Most mirrors that were measured yesterday, of at most 15 % of the field.
+_MEASURED = 1500
 
 
 class GroupedCommand(TyperCommand):
@@ -77,12 +90,15 @@ def run(
             rich_help_panel=_TWIN,
         ),
     ] = 0,
-    stowed: Annotated[
-        bool,
+    begin: Annotated[
+        Begin,
         typer.Option(
-            "--stowed", help="Begin with the field at stow, in the morning.", rich_help_panel=_TWIN
+            "--from",
+            help="second-day: the field tracks, and a part of it was measured yesterday; new: "
+            "nobody has measured it; stow: as second-day, in the morning at stow.",
+            rich_help_panel=_TWIN,
         ),
-    ] = False,
+    ] = Begin.SECOND_DAY,
     clusters: Annotated[
         Path | None,
         typer.Option(
@@ -308,12 +324,15 @@ def run(
         from heliotrope.cli.run.twin_process import twin_process
         from heliotrope.twin.program import LINKS, PLANT
 
-        begins = start_of("run", start, design_of(field, heliostats, prototype=prototype))
+        design = design_of(field, heliostats, prototype=prototype)
+        begins = start_of("run", start, design)
         options = _options(field, heliostats, prototype=prototype)
-        options += ["--seed", str(seed), "--speed", str(speed), "--start", begins.isoformat()]
-        with twin_process([*options, *([] if stowed or prototype else ["--up"])]) as folder:
-            choice = PlantChoice(folder, folder / LINKS, bool(idle))
-            run_plant(open_plant(folder / PLANT), choice, shown)
+        options += ["--speed", str(speed), "--start", begins.isoformat()]
+        options += ["--up"] if begin is not Begin.STOW and not prototype else []
+        measured = 0 if begin is Begin.NEW or prototype else min(_MEASURED, len(design) * 3 // 20)
+        with twin_process(options, seed, measured) as twin:
+            choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle))
+            run_plant(open_plant(twin.folder / PLANT), choice, shown, twin.begin)
         return
     if field is None:
         raise InputError("run: --clusters needs the plant file; give it before")

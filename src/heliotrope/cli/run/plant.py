@@ -7,8 +7,9 @@ true errors.
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +59,10 @@ _SIMULATED = replace(CYCLE, sigma=2e-4)
 _CHECKED, _TRUE_EVERY = 0.02, 5.0
 
 
+#: Prepares store and simulated field.
+Prepare = Callable[[Keeper, Plant, datetime], Awaitable[None]]
+
+
 @dataclass(frozen=True)
 class PlantChoice:
     """Options of a plant on the command line; see `cli.run.command`."""
@@ -69,8 +74,12 @@ class PlantChoice:
     check: bool = False
 
 
-def run_plant(design: Plant, choice: PlantChoice, shown: Shown) -> None:
+def run_plant(
+    design: Plant, choice: PlantChoice, shown: Shown, prepare: Prepare | None = None
+) -> None:
     """Run until Ctrl-C, or until the time is over; a real field is stowed at the end.
+
+    ``prepare`` is called with store, plant and present time before a simulated field begins.
 
     Raises
     ------
@@ -88,7 +97,7 @@ def run_plant(design: Plant, choice: PlantChoice, shown: Shown) -> None:
     with contextlib.closing(ClockReader(file.document.twin)) as reader:
         loop = FollowedLoop(reader)
         outside = _outside(design, file, reader.clock(loop), reader)
-        _begin(outside, design, choice, shown, loop)
+        _begin(outside, design, choice, shown, loop, prepare)
 
 
 def _begin(
@@ -97,6 +106,7 @@ def _begin(
     choice: PlantChoice,
     shown: Shown,
     loop: FollowedLoop | None = None,
+    prepare: Prepare | None = None,
 ) -> None:
     """Check everything, and run the plant in its loop."""
     if outside.links.light is not None:
@@ -116,7 +126,7 @@ def _begin(
         )
     factory = None if loop is None else lambda: loop
     with one_error(), asyncio.Runner(loop_factory=factory) as runner:
-        runner.run(_run(design, choice, shown, outside))
+        runner.run(_run(design, choice, shown, outside, prepare))
 
 
 def _papers(outside: "_Outside", shown: Shown) -> "Papers":
@@ -304,9 +314,13 @@ def _cameras(
     )
 
 
-async def _run(design: Plant, choice: PlantChoice, shown: Shown, outside: _Outside) -> None:
+async def _run(
+    design: Plant, choice: PlantChoice, shown: Shown, outside: _Outside, prepare: Prepare | None
+) -> None:
     ending = begin(design, shown)
     with computing() as worker, store(shown) as (keeper, folder):
+        if prepare is not None:
+            await prepare(keeper, design, outside.clock.utc())
         ports = outside.ports(design, choice, shown, keeper, worker)
         kept = pictures(shown, folder, waits=outside.fast)
         ports = replace(ports, pictures=kept, marks=shown.marks)

@@ -7,12 +7,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from heliotrope.errors import FetchError
 from heliotrope.field.plant import Plant
+from heliotrope.imaging.frame import Frame
 from heliotrope.links.clock import Clock, SystemClock, VirtualClock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.link import LinkSettings
 from heliotrope.links.tcp import tcp_link
 from heliotrope.twin.live import PacedLoop, World, WorldOptions
+from heliotrope.twin.program.boards import BOARDS, read_boards
 from heliotrope.twin.program.cameras import TwinCameras
 from heliotrope.twin.program.folder import FLUX, TwinFolder
 from heliotrope.twin.program.server import TwinServer
@@ -43,6 +46,8 @@ class TwinOptions:
         Whether each heliostat is a firmware-true board; for small plants.
     up
         Whether the heliostats track as soon as the plant leads them; else they begin at stow.
+    waits
+        Whether it waits for the file of what its local controllers store; see `write_boards`.
     """
 
     start: datetime | None = None
@@ -50,6 +55,15 @@ class TwinOptions:
     seed: int = 0
     boards: bool = False
     up: bool = False
+    waits: bool = False
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What is made once the local controllers are known."""
+
+    world: World
+    cameras: TwinCameras
 
 
 class TwinProgram:
@@ -68,6 +82,7 @@ class TwinProgram:
     def __init__(self, design: Plant, files: TwinFolder, options: TwinOptions) -> None:
         self._design, self._files, self._options = design, files, options
         self._begun = False
+        self._parts: _Parts | None = None
 
     def loop(self) -> asyncio.AbstractEventLoop:
         """Return a new event loop for it."""
@@ -87,25 +102,27 @@ class TwinProgram:
         def link(name: str) -> CarriedLink:
             return tcp_link(*self._files.plant, name, self._files.keys[name], clock, _LINK)
 
-        options = WorldOptions(
-            self._options.seed,
-            boards=self._options.boards,
-            up=self._options.up,
-            link=link,
-        )
-        world = World(self._design, clock, options)
-        files, cameras = self._files, TwinCameras(world, loop, self._options.seed)
+        files = self._files
         server = TwinServer(
             files.serves,
             files.secret,
             lambda: self._clock(clock, paced),
             loop,
-            cameras.photograph,
-            lambda: world.errors().tobytes(),
+            self._photograph,
+            lambda: self._built().world.errors().tobytes(),
         )
         server.start()
-        cameras.start()
         try:
+            design = await self._stored(ending)
+            if ending.is_set():
+                return
+            options = WorldOptions(
+                self._options.seed, boards=self._options.boards, up=self._options.up, link=link
+            )
+            world = World(design, clock, options)
+            cameras = TwinCameras(world, loop, self._options.seed)
+            self._parts = _Parts(world, cameras)
+            cameras.start()
             async with world.running(), asyncio.TaskGroup() as group:
                 tasks = [group.create_task(self._sense(world))]
                 self._begun = True
@@ -116,7 +133,25 @@ class TwinProgram:
                     task.cancel()
         finally:
             server.close()
-            cameras.close()
+            if self._parts is not None:
+                self._parts.cameras.close()
+
+    async def _stored(self, ending: asyncio.Event) -> Plant:
+        """Return the plant with what its local controllers store."""
+        path = self._files.folder / BOARDS
+        if not self._options.waits:
+            return self._design
+        while not (ending.is_set() or path.exists()):
+            await asyncio.to_thread(time.sleep, _CHECKED)
+        return self._design if ending.is_set() else read_boards(path, self._design)
+
+    def _photograph(self, camera: str) -> Frame:
+        return self._built().cameras.photograph(camera)
+
+    def _built(self) -> "_Parts":
+        if self._parts is None:
+            raise FetchError("the simulated field has not begun")
+        return self._parts
 
     async def _pace(self, world: World, loop: PacedLoop) -> None:
         """Slow the time down while the plant is late, so that it loses no heliostat by that.
