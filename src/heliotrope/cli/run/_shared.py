@@ -318,13 +318,29 @@ def first_password(password: str, folder: Path) -> str:
     return f"password in {path} (change it, and delete the file)"
 
 
+@dataclass(frozen=True)
+class Entry:
+    """How a person enters the first account.
+
+    Attributes
+    ----------
+    password
+        Words that lead to its new password; "" for none.
+    by_link
+        Whether by a one-time link.
+    """
+
+    password: str = ""
+    by_link: bool = False
+
+
 @contextlib.asynccontextmanager
 async def interface(
     live: PlantAssembly,
     keeper: Keeper,
     shown: Shown,
     folder: Path,
-    password: str | None,
+    entry: Entry,
     lines: Lines,
 ) -> AsyncIterator[None]:
     """Serve the plant's local interface during a block, and the console in a process beside it."""
@@ -337,9 +353,11 @@ async def interface(
     from heliotrope.console.people import FIRST
 
     def tell(address: str) -> None:
+        if entry.by_link:
+            address = served.one_time_link(FIRST, address)
         lines.print(f"console: {address}")
-        if password is not None:
-            lines.print(f"first account: {FIRST}, {password}")
+        if entry.password:
+            lines.print(f"first account: {FIRST}, {entry.password}")
         if shown.browser and sys.stdout.isatty():
             webbrowser.open(address)
 
@@ -348,17 +366,21 @@ async def interface(
         yield
 
 
-def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Path) -> str | None:
-    """Return the text about a new first account's password; None for an account that exists.
+def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Path) -> Entry:
+    """Return how a person enters the first account; nothing to print if they have a password.
 
-    It is written to the store, which may be slow, so this comes before the plant begins.
+    At a simulated plant that only this machine reaches it is a one-time link. The account is
+    written to the store, which may be slow, so this comes before the plant begins.
     """
     if not shown.console:
-        return None
-    from heliotrope.console.people import first_start
+        return Entry()
+    from heliotrope.console.people import first_start, without_password
 
-    password = first_start(keeper.people, live.clock.utc().timestamp())
-    return None if password is None else first_password(password, folder)
+    now = live.clock.utc().timestamp()
+    if live.operations.simulated and shown.settings().for_one:
+        return Entry(by_link=without_password(keeper.people, now))
+    password = first_start(keeper.people, now)
+    return Entry() if password is None else Entry(first_password(password, folder))
 
 
 async def watch(
@@ -472,7 +494,7 @@ async def at_work(
     The sockets of the interface stand in ``folder``. With ``stows`` the field is stowed before the
     end, as every real one is.
     """
-    password = first_account(live, keeper, shown, folder)
+    entry = first_account(live, keeper, shown, folder)
     # Freeze the existing objects: every ten seconds the collector would walk through those of
     # 10,000 heliostats and hold the loop for up to a second.
     gc.freeze()
@@ -483,7 +505,7 @@ async def at_work(
             archive(live, shown),
             live.running(),
             leaving(live, keeper, shown.evidence),
-            interface(live, keeper, shown, folder, password, lines),
+            interface(live, keeper, shown, folder, entry, lines),
         ):
             await watch(live, shown, ending.asked, lines, speed=speed)
             ending.ask()  # or the time was over
