@@ -55,8 +55,9 @@ def plant(tmp_path: Path) -> Iterator[Program]:
     made.close()
 
 
+@pytest.mark.parametrize("emergency", [False, True])
 def test_ctrl_c_ends_a_simulated_plant_with_its_processes_and_a_viewer_at_the_stream(
-    plant: Program, tmp_path: Path
+    plant: Program, tmp_path: Path, emergency: bool
 ) -> None:
     link = plant.says(r"console: (\S+)")[1]
     address = link.partition("enter")[0]
@@ -75,6 +76,9 @@ def test_ctrl_c_ends_a_simulated_plant_with_its_processes_and_a_viewer_at_the_st
     viewer = threading.Thread(target=asyncio.run, args=(follow(),))
     viewer.start()
     assert watching.wait(60.0)
+    if emergency:
+        with Client(token, address) as client:
+            client.ask("POST", "emergency", {"act": "DEFOCUS", "reason": "smoke"})
     started = children(plant.process.pid)
     assert len(started) >= 4, "two of the console, and those that compute and draw"
     plant.process.send_signal(signal.SIGINT)
@@ -99,7 +103,7 @@ def _token(link: str, address: str) -> str:
     with Client(url=address) as client:
         client.sign_in("engineer", PASSWORD)
         made = client.ask(
-            "POST", "tokens", {"label": "viewer", "role": "viewer", "own_password": PASSWORD}
+            "POST", "tokens", {"label": "viewer", "role": "operator", "own_password": PASSWORD}
         )
         return str(made["secret"])
 

@@ -54,8 +54,8 @@ AT_ONCE, _INTERRUPTED = 2.0, 130
 #: up to 0.08 s and finds next to nothing.
 _COLLECTED = (50_000, 10, 1000)
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-#: Time between lines while the field goes to stow, and for visits to a simulated field to end, s.
-_SAID, _HALTED = 10.0, 1.0
+#: Time between lines while the field goes to stow, s.
+_SAID = 10.0
 
 
 @dataclass(frozen=True)
@@ -509,9 +509,7 @@ async def at_work(
         ):
             await watch(live, shown, ending.asked, lines, speed=speed)
             ending.ask()  # or the time was over
-            if not stows:
-                await live.operations.automatic.halt(_HALTED)
-            elif not await stow(live, ending.at_once, lines):
+            if stows and not await stow(live, ending.at_once, lines):
                 lines.print(live.left())
             await live.end()
         lines.print("ended")
