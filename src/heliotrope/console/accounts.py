@@ -36,6 +36,7 @@ def _who(who: Caller) -> models.CallerState:
         csrf=who.csrf,
         owes=who.owes,
         factor=who.factor,
+        no_password=who.no_password,
     )
 
 
@@ -87,8 +88,9 @@ async def sign_out(console: Here, who: Anyone, request: Request, response: Respo
 async def own_password(
     console: Here, who: Anyone, request: Request, response: Response, given: models.OwnPassword
 ) -> None:
-    """Change your own password; your sessions, including this one, and your tokens end."""
-    await confirm(console, who, request, given.old)
+    """Change your own password, or set your first one; your sessions and your tokens end."""
+    if not await _without_password(console, who):
+        await confirm(console, who, request, given.old)
     if given.new == given.old:
         raise HTTPException(422, "this is your password already; give another one")
     await _set_password(console, who.person.name, given.new)
@@ -214,6 +216,12 @@ async def _find(console: Console, name: str, *, password: bool) -> None:
         raise HTTPException(404, f"there is no account {name}")
     if password and found.by_proxy:
         raise HTTPException(409, f"{name} signs in by the proxy, and has no password here")
+
+
+async def _without_password(console: Console, who: Caller) -> bool:
+    """Whether a session's account has no password yet, as the store says now."""
+    found = await console.ask(lambda: console.people.account(who.person.name))
+    return who.by == "session" and found is not None and found.no_password
 
 
 async def _hashed(console: Console, password: str) -> str:

@@ -166,6 +166,8 @@ class Caller:
         Whether the account has a second factor.
     by_proxy
         Whether a trusted proxy has signed that person in.
+    no_password
+        Whether the account has no password yet.
     """
 
     person: Person
@@ -175,6 +177,7 @@ class Caller:
     owes: str = ""
     factor: bool = False
     by_proxy: bool = False
+    no_password: bool = False
 
     @property
     def csrf(self) -> str:
@@ -262,7 +265,9 @@ def signed_in(console: Console, found: Account | Session, secret: str, expires: 
     has_one = found.factor or found.by_proxy  # theirs is the proxy's business
     needs_factor = bool(least) and person.role >= ROLES[least] and not has_one
     owes = "password" if found.password_due else "factor" if needs_factor else ""
-    return Caller(person, "session", secret, expires, owes, found.factor, found.by_proxy)
+    return Caller(
+        person, "session", secret, expires, owes, found.factor, found.by_proxy, found.no_password
+    )
 
 
 def _is_emergency(connection: HTTPConnection) -> bool:
