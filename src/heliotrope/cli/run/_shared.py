@@ -12,9 +12,7 @@ import socket
 import sys
 import tempfile
 import threading
-import time
 import webbrowser
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -60,7 +58,7 @@ AT_ONCE, _INTERRUPTED = 2.0, 130
 _COLLECTED = (50_000, 10, 1000)
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 #: Span of the pace that a line shows, s, and the least difference from real time that it shows.
-_MINUTE, _SLOWER = 60.0, 0.05
+_SLOWER = 0.05
 #: Length of the plan, visits, as the console asks for it: a shorter one would end the plan there.
 _PLANNED = 20
 #: What heliostats of each state do, beside those that track.
@@ -412,16 +410,12 @@ async def watch(
     loop = asyncio.get_running_loop()
     pause = speed * shown.every * (_SELDOM if shown.console and shown.every == EVERY else 1.0)
     until = None if shown.minutes is None else loop.time() + 60.0 * shown.minutes
-    delays = deque([(time.monotonic(), live.operations.summary().lag)])
     while not asked.is_set() and (until is None or loop.time() < until):
         wait = pause if until is None else min(pause, until - loop.time())
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(max(wait, 0.01)):
                 await asked.wait()
-        delays.append((time.monotonic(), live.operations.summary().lag))
-        while len(delays) > 2 and delays[1][0] <= delays[-1][0] - _MINUTE:
-            delays.popleft()
-        lines.print(line(live, pace(delays[0], delays[-1], speed)))
+        lines.print(line(live))
 
 
 async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> bool:
@@ -459,8 +453,8 @@ def _on_the_way(live: PlantAssembly) -> str:
     return f"stowing {sum(by_state.values()):,} heliostats ({counts}), {about}"
 
 
-def line(live: PlantAssembly, at: str = "") -> str:
-    """Return one line about a plant: what it does, what comes next, and at what ``at`` pace."""
+def line(live: PlantAssembly) -> str:
+    """Return one line about a plant: what it does, what comes next, and at what pace."""
     summary, work = live.operations.summary(), live.operations.automatic.view()
     counts = dict(summary.states)
     tracking = counts.pop("TRACKING", 0)
@@ -478,7 +472,9 @@ def line(live: PlantAssembly, at: str = "") -> str:
         parts.append(f"next: {coming[0].heliostat} on target {coming[0].target}")
     if summary.alarms:
         parts.append(f"{summary.alarms:,} alarm{'s' * (summary.alarms > 1)}")
-    return f"{summary.at:%H:%M:%S} UTC: {'; '.join([*parts, at] if at else parts)}"
+    if at := pace(summary.pace):
+        parts.append(at)
+    return f"{summary.at:%H:%M:%S} UTC: {'; '.join(parts)}"
 
 
 def _calibrated_today(live: PlantAssembly) -> int:
@@ -504,18 +500,8 @@ def _mirrors(run: Running) -> str:
     return f"{run.heliostat} and {len(run.others)} more" if run.others else run.heliostat
 
 
-def pace(before: tuple[float, float], now: tuple[float, float], speed: float) -> str:
-    """Return how fast simulated time runs, in words; "" at the pace of real time.
-
-    Parameters
-    ----------
-    before, now
-        Machine's time and the delay of the plant's time at that moment, s.
-    speed
-        Simulated seconds per second, if the machine keeps up.
-    """
-    wall, lost = (end - begin for begin, end in zip(before, now, strict=True))
-    rate = speed - lost / wall if wall > 0.0 else speed
+def pace(rate: float) -> str:
+    """Return how fast simulated time runs, in words; "" at the pace of real time."""
     return "" if abs(rate - 1.0) < _SLOWER else f"simulated at {rate:.2g} × real time"
 
 

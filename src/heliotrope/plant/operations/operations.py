@@ -244,7 +244,7 @@ class Operations:
             self.logbook.open_alarms,
             self.plant.sentinel.on,
             self.automatic.waits,
-            float(extra.pop("lag", 0.0)),
+            float(extra.pop("pace", 1.0)),
             extra,
         )
 
