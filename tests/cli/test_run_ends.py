@@ -12,6 +12,7 @@ import pytest
 
 from heliotrope.console.client import Client
 from heliotrope.console.stream import RemoteError
+from support.one_time_link import set_password
 from support.program import MAIN, Program
 
 #: A plant whose loop hangs: it says when it has begun, and after the first signal.
@@ -54,12 +55,13 @@ def plant(tmp_path: Path) -> Iterator[Program]:
     made.close()
 
 
+@pytest.mark.parametrize("emergency", [False, True])
 def test_ctrl_c_ends_a_simulated_plant_with_its_processes_and_a_viewer_at_the_stream(
-    plant: Program, tmp_path: Path
+    plant: Program, tmp_path: Path, emergency: bool
 ) -> None:
-    address = plant.says(r"console: (\S+)")[1]
-    password = Path(plant.says(r"password in (\S+)")[1]).read_text("utf-8").strip()
-    token, watching, ended = _token(address, password), threading.Event(), list[str]()
+    link = plant.says(r"console: (\S+)")[1]
+    address = link.partition("enter")[0]
+    token, watching, ended = _token(link, address), threading.Event(), list[str]()
 
     async def follow() -> None:
         client = Client(token, address)
@@ -74,6 +76,9 @@ def test_ctrl_c_ends_a_simulated_plant_with_its_processes_and_a_viewer_at_the_st
     viewer = threading.Thread(target=asyncio.run, args=(follow(),))
     viewer.start()
     assert watching.wait(60.0)
+    if emergency:
+        with Client(token, address) as client:
+            client.ask("POST", "emergency", {"act": "DEFOCUS", "reason": "smoke"})
     started = children(plant.process.pid)
     assert len(started) >= 4, "two of the console, and those that compute and draw"
     plant.process.send_signal(signal.SIGINT)
@@ -93,13 +98,12 @@ def test_ctrl_c_ends_a_simulated_plant_with_its_processes_and_a_viewer_at_the_st
     connection.close()
 
 
-def _token(address: str, password: str) -> str:
+def _token(link: str, address: str) -> str:
+    set_password(link, PASSWORD)
     with Client(url=address) as client:
-        client.sign_in("engineer", password)
-        client.change_password(password, PASSWORD)
         client.sign_in("engineer", PASSWORD)
         made = client.ask(
-            "POST", "tokens", {"label": "viewer", "role": "viewer", "own_password": PASSWORD}
+            "POST", "tokens", {"label": "viewer", "role": "operator", "own_password": PASSWORD}
         )
         return str(made["secret"])
 

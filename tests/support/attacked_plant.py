@@ -10,6 +10,7 @@ the lines of the log.
 import contextlib
 import math
 import os
+import re
 import resource
 import signal
 import socket
@@ -112,8 +113,7 @@ def plant(folder: Path, descriptors: int | None) -> Iterator[Target]:
             preexec_fn=few,  # noqa: PLW1509 - no thread runs yet
         )
     try:
-        password = _password(process, log, folder / "data" / "first-password")
-        viewer, operator = _tokens(port, password)
+        viewer, operator = _tokens(port, _link(process, log))
         cluster = int(gauges.with_name(f"{gauges.name}.port").read_text("ascii"))
         data = folder / "data"
         yield Target(port, urgent, cluster, viewer, operator, data, process, log, gauges)
@@ -127,24 +127,24 @@ def plant(folder: Path, descriptors: int | None) -> Iterator[Target]:
             process.kill()
 
 
-def _password(process: "subprocess.Popen[bytes]", log: Path, kept: Path) -> str:
-    """Return the first account's password from its file, once the console answers."""
+def _link(process: "subprocess.Popen[bytes]", log: Path) -> str:
+    """Return the one-time link, once the console answers."""
     until = time.monotonic() + 180.0
     while time.monotonic() < until and process.poll() is None:
-        if "console: http" in log.read_text("utf-8") and kept.exists():
-            return kept.read_text("utf-8").split()[-1]
+        if found := re.search(r"console: (http\S+)\n", log.read_text("utf-8")):
+            return found[1]
         time.sleep(0.2)
     raise RuntimeError(f"the plant has not started:\n{log.read_text('utf-8')[-2000:]}")
 
 
-def _tokens(port: int, password: str) -> list[str]:
-    """Change the first password; return tokens of a viewer and of an operator."""
+def _tokens(port: int, link: str) -> list[str]:
+    """Set the first password; return tokens of a viewer and of an operator."""
     from heliotrope.console.client import Client
+    from support.one_time_link import set_password
 
-    own = f"{password}-own"
+    own = "a password of one's own"
+    set_password(link, own)
     with Client(url=f"http://127.0.0.1:{port}/") as client:
-        client.sign_in("engineer", password)
-        client.change_password(password, own)
         client.sign_in("engineer", own)
         given = {"label": "attack", "days": 1, "own_password": own}
         made = [client.ask("POST", "tokens", {"role": r, **given}) for r in ("viewer", "operator")]

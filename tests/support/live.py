@@ -87,13 +87,15 @@ class LivePlant:
         pictures: Pictures | None = None,
         marks: Path | None = None,
         learner: Learner | None = None,
+        stored: Plant | None = None,
     ) -> None:
+        """``stored``: the plant whose parameters the boards store; None: the design."""
         chosen = options or LiveOptions()
         if design.joint_visits is not None and not chosen.together:
             alone = replace(design.joint_visits, first=0)
             design = replace(design, joint_visits=alone)
         self.design, self.clock = design, clock
-        self.world = World(design, clock, chosen.world())
+        self.world = World(stored or design, clock, chosen.world())
         ports = self.world.ports(
             audit=audit, disk=disk, records=records, assigned=assigned, facts=extra
         )

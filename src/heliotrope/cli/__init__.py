@@ -32,6 +32,7 @@ from heliotrope.cli.run.command import GroupedCommand, run
 from heliotrope.cli.simulate import simulate
 from heliotrope.cli.sun import sun
 from heliotrope.cli.track import track
+from heliotrope.cli.twin import twin
 from heliotrope.cli.view import view
 from heliotrope.errors import HeliotropeError
 
@@ -82,6 +83,7 @@ app.command()(cluster)
 app.add_typer(keys_app, name="keys")
 app.command()(simulate)
 app.command()(fetch)
+app.command()(twin)
 app.command()(demo)
 
 

@@ -152,6 +152,11 @@ class Cluster:
         self.cycle = 0.0
 
     @property
+    def lease_left(self) -> float:
+        """Remaining time of the plant's lease, s; below 0: no plant leads it."""
+        return self._watch.lease_left(self._clock.monotonic())
+
+    @property
     def overruns(self) -> int:
         """Rounds of polling that did not end within their second."""
         return self._polling.overruns

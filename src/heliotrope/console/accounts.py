@@ -36,6 +36,7 @@ def _who(who: Caller) -> models.CallerState:
         csrf=who.csrf,
         owes=who.owes,
         factor=who.factor,
+        no_password=who.no_password,
     )
 
 
@@ -85,8 +86,9 @@ async def sign_out(console: AppConsole, who: Anyone, request: Request, response:
 async def own_password(
     console: AppConsole, who: Anyone, request: Request, response: Response, body: models.OwnPassword
 ) -> None:
-    """Change your own password; your sessions, including this one, and your tokens end."""
-    await confirm(console, who, request, body.old)
+    """Change your own password, or set your first one; your sessions and your tokens end."""
+    if not await _without_password(console, who):
+        await confirm(console, who, request, body.old)
     if body.new == body.old:
         raise HTTPException(422, "this is your password already; give another one")
     await _set_password(console, who.person.name, body.new)
@@ -212,6 +214,12 @@ async def _find(console: Console, name: str, *, password: bool) -> None:
         raise HTTPException(404, f"there is no account {name}")
     if password and account.by_proxy:
         raise HTTPException(409, f"{name} signs in by the proxy, and has no password here")
+
+
+async def _without_password(console: Console, who: Caller) -> bool:
+    """Whether a session's account has no password yet, as the store says now."""
+    found = await console.ask(lambda: console.people.account(who.person.name))
+    return who.by == "session" and found is not None and found.no_password
 
 
 async def _hashed(console: Console, password: str) -> str:

@@ -10,7 +10,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from html import escape
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
@@ -27,7 +27,7 @@ from heliotrope.console.live import Stream
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.routes import Routes
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.console.sign_in import enter, set_cookie
+from heliotrope.console.sign_in import enter, enter_once, set_cookie
 from heliotrope.errors import HeliotropeError, UnknownNameError
 from heliotrope.local import AwayError
 from heliotrope.plant.interface import BusyError
@@ -44,6 +44,8 @@ ABOUT = (
 ROUTERS = (api.router, accounts.router, factor.router)
 #: Address and file of each page but the sign-in's.
 PAGES = {"/": "console", "/emergency": "emergency", "/account": "account"}
+#: Address of the one-time link.
+ENTER = "/enter"
 #: Errors of a request that the answer lists, and their longest texts, characters.
 MOST_ERRORS, LONGEST_TEXT, LONGEST_WORD = 5, 200, 64
 
@@ -135,7 +137,7 @@ def _invalid(request: Request, error: Exception) -> Response:
 def _routes() -> Routes:
     """Return the routes that the guard admits."""
     own = {"/api/v1/openapi.json": Role.VIEWER}
-    return Routes(ROUTERS, [*Files.paths, *PAGES, "/login"], own)
+    return Routes(ROUTERS, [*Files.paths, *PAGES, "/login", ENTER], own)
 
 
 def _pages(app: FastAPI) -> None:
@@ -164,6 +166,19 @@ def _pages(app: FastAPI) -> None:
             return answer
         return HTMLResponse(page("login"))
 
+    async def follow_link(request: Request) -> Response:
+        console: Console = request.scope["heliotrope"]
+        if request.method == "HEAD" or "prefetch" in request.headers.get("sec-purpose", ""):
+            return Response(status_code=503)  # only a person who opens the link uses it up
+        try:
+            secret = await enter_once(console, request.query_params.get("once", ""), request)
+        except HTTPException as refusal:
+            return HTMLResponse(page("enter"), refusal.status_code)
+        answer = RedirectResponse("/", 303)
+        set_cookie(console, answer, secret)
+        return answer
+
     for path in PAGES:
         app.add_route(path, show, include_in_schema=False)
     app.add_route("/login", login, include_in_schema=False)
+    app.add_route(ENTER, follow_link, include_in_schema=False)

@@ -168,6 +168,8 @@ class Caller:
         Whether the account has a second factor.
     by_proxy
         Whether a trusted proxy has signed that person in.
+    no_password
+        Whether the account has no password yet.
     """
 
     person: Person
@@ -177,6 +179,7 @@ class Caller:
     owes: str = ""
     factor: bool = False
     by_proxy: bool = False
+    no_password: bool = False
 
     @property
     def csrf(self) -> str:
@@ -264,7 +267,16 @@ def signed_in(console: Console, account: Account | Session, secret: str, expires
     has_one = account.factor or account.by_proxy  # theirs is the proxy's business
     needs_factor = bool(least) and person.role >= ROLES[least] and not has_one
     owes = "password" if account.password_due else "factor" if needs_factor else ""
-    return Caller(person, "session", secret, expires, owes, account.factor, account.by_proxy)
+    return Caller(
+        person,
+        "session",
+        secret,
+        expires,
+        owes,
+        account.factor,
+        account.by_proxy,
+        account.no_password,
+    )
 
 
 def _is_emergency(connection: HTTPConnection) -> bool:

@@ -149,7 +149,7 @@ class Guard:
         headers["Cross-Origin-Opener-Policy"] = "same-origin"
         headers["Cross-Origin-Resource-Policy"] = "same-origin"
         headers["Permissions-Policy"] = "camera=(), microphone=(), geolocation=()"
-        if path.startswith("/api/") or path in ("/", "/login", "/emergency", "/account"):
+        if path.startswith("/api/") or path in ("/", "/login", "/enter", "/emergency", "/account"):
             headers.setdefault("Cache-Control", "no-store")
         if console.settings.tls:
             headers["Strict-Transport-Security"] = "max-age=31536000"

@@ -79,6 +79,7 @@ class CallerState(BaseModel):
         "", description='What is due before anything else: "password", "factor" or ""'
     )
     factor: bool = Field(False, description="Whether the account has a second factor")
+    no_password: bool = Field(False, description="Whether the account has no password yet")
 
 
 class Confirmed(Strict):
@@ -130,9 +131,9 @@ class AccountChange(Confirmed):
 
 
 class OwnPassword(Strict):
-    """Your password, and the new one."""
+    """Your password ("" if your account has none yet), and the new one."""
 
-    old: Annotated[str, Field(min_length=1, max_length=200)]
+    old: Annotated[str, Field(max_length=200)]
     new: Annotated[str, Field(min_length=10, max_length=200)]
 
 

@@ -2,7 +2,7 @@
 
 from heliotrope.console import _secrets
 from heliotrope.plant.orders.authority import Person, Role
-from heliotrope.store.people import People
+from heliotrope.store.people import UNSET, People
 
 ROLES = {"viewer": Role.VIEWER, "operator": Role.OPERATOR, "engineer": Role.ENGINEER}
 #: Name of the first account.
@@ -10,7 +10,7 @@ FIRST = "engineer"
 
 
 def first_start(people: People, now: float) -> str | None:
-    """Create the first account if there is none.
+    """Create the first account if there is none, and give it a password if it has none.
 
     Parameters
     ----------
@@ -21,14 +21,33 @@ def first_start(people: People, now: float) -> str | None:
 
     Returns
     -------
-    The account's password, to be printed once and changed at first use; None if there are accounts
-    already.
+    The account's password, to be printed once and changed at first use; None if its person has one.
     """
-    if not people.empty():
+    if not without_password(people, now):
         return None
     password = _secrets.new_password()
-    people.add(FIRST, _secrets.hash_password(password), "engineer", now, due=True)
+    people.change(FIRST, now, password_hash=_secrets.hash_password(password), due=True)
     return password
+
+
+def without_password(people: People, now: float) -> bool:
+    """Create the first account, without a password, if there is none.
+
+    Parameters
+    ----------
+    people
+        Accounts of the store.
+    now
+        POSIX s.
+
+    Returns
+    -------
+    Whether the first account has no password.
+    """
+    if people.empty():
+        people.add(FIRST, UNSET, "engineer", now)
+    first = people.account(FIRST)
+    return first is not None and first.no_password
 
 
 def person_of(name: str, role: str) -> Person:

@@ -139,6 +139,11 @@ class RemotePeople:
             )
         )
 
+    def enter(self, secret: str) -> str | None:
+        """Use the one-time link; see `OneTimeLink.use`."""
+        found = self._ask("enter", secret=secret)
+        return None if found is None else str(found)
+
     def open_session(self, name: str, now: float, lifetime: float, note: str = "") -> str:
         """Return the secret of a new session; see `People.open_session`."""
         return str(self._ask("open_session", name=name, now=now, lifetime=lifetime, note=note))

@@ -119,12 +119,17 @@ class ConsoleSettings:
     @property
     def local(self) -> bool:
         """Whether only this machine can connect."""
-        if self.host == "localhost":
-            return True
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return False
+        return self.host == "localhost" or is_loopback(self.host)
+
+    @property
+    def for_one(self) -> bool:
+        """Whether a one-time link may sign in: only browsers of this machine come here.
+
+        There is no TLS, no proxy that hides where a request comes from, and no second factor is
+        due.
+        """
+        asks = self.tls or self.plain or self.proxies or self.second_factor
+        return self.local and not asks
 
     @property
     def hosts(self) -> frozenset[str]:
@@ -135,6 +140,16 @@ class ConsoleSettings:
         """Return the address for a browser."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.tls else 'http'}://{host}:{port}/"
+
+
+def is_loopback(address: str) -> bool:
+    """Whether an address is this machine's own."""
+    try:
+        found = ipaddress.ip_address(address)
+    except ValueError:
+        return False
+    mapped = getattr(found, "ipv4_mapped", None)
+    return (mapped or found).is_loopback
 
 
 def _check_address(text: str) -> None:

@@ -11,9 +11,11 @@ from heliotrope.console import _secrets
 from heliotrope.console.auth import Caller, Console
 from heliotrope.console.by_proxy import Introduced, check_account
 from heliotrope.console.headers import COOKIE, address_of, network_of
+from heliotrope.console.settings import is_loopback
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import BY_PROXY, Account
 
+_BY_LINK = "by the one-time link"
 _WRONG_CODE = "the code is wrong or was used already; wait for the next one"
 
 
@@ -34,14 +36,7 @@ async def log_in(
     """
     failure = SecurityEvent.SIGN_IN_FAILED
     account = await checked(console, name, password, connection, failure, code)
-    now, lifetime = console.now(), console.settings.session_s
-    secret = await console.ask(
-        lambda: console.people.open_session(
-            account.name, now, lifetime, address_of(console.settings, connection)
-        )
-    )
-    await console.note(SecurityEvent.SIGNED_IN, connection, name)
-    return account, secret, now + lifetime
+    return account, *await _begin(console, account.name, connection)
 
 
 async def enter(console: Console, person: Introduced, connection: HTTPConnection) -> str:
@@ -65,10 +60,39 @@ async def enter(console: Console, person: Introduced, connection: HTTPConnection
         await console.ask(lambda: people.change(name, now, role=role))
         detail = f"{name}, role {role}, as the proxy says"
         await console.note(SecurityEvent.ACCOUNT_CHANGED, connection, name, detail)
-    lifetime, address = console.settings.session_s, address_of(console.settings, connection)
-    secret = await console.ask(lambda: people.open_session(name, now, lifetime, address))
-    await console.note(SecurityEvent.SIGNED_IN, connection, name, "by the proxy")
-    return secret
+    return (await _begin(console, name, connection, "by the proxy"))[0]
+
+
+async def enter_once(console: Console, secret: str, connection: HTTPConnection) -> str:
+    """Return the secret of a new session of the person whom the one-time link signs in.
+
+    Raises
+    ------
+    HTTPException
+        403 for a caller on another machine, who leaves the link valid; 410 if the link is not valid
+        any more.
+    """
+    if not is_loopback(address_of(console.settings, connection)):
+        await console.note(
+            SecurityEvent.SIGN_IN_FAILED, connection, "", f"{_BY_LINK}, from another machine"
+        )
+        raise HTTPException(403, "the one-time link signs in on the plant's machine only")
+    name = await console.ask(lambda: console.people.enter(secret))
+    if name is None:
+        await console.note(SecurityEvent.SIGN_IN_FAILED, connection, "", f"{_BY_LINK}, not valid")
+        raise HTTPException(410, "this one-time link is not valid any more")
+    return (await _begin(console, name, connection, _BY_LINK))[0]
+
+
+async def _begin(
+    console: Console, name: str, connection: HTTPConnection, detail: str = ""
+) -> tuple[str, float]:
+    """Begin a session; return its secret and its end, POSIX s."""
+    now, lifetime = console.now(), console.settings.session_s
+    address = address_of(console.settings, connection)
+    secret = await console.ask(lambda: console.people.open_session(name, now, lifetime, address))
+    await console.note(SecurityEvent.SIGNED_IN, connection, name, detail)
+    return secret, now + lifetime
 
 
 def set_cookie(console: Console, response: Response, secret: str) -> None:
@@ -159,6 +183,12 @@ async def confirm(
     """
     if who.by != "session":
         raise HTTPException(403, "a token cannot change accounts or tokens; sign in to do so")
+    if who.no_password:
+        raise HTTPException(
+            403,
+            f"{who.person.name} has no password yet, which this needs once more; set one on the "
+            "page /account",
+        )
     if who.by_proxy:
         raise HTTPException(
             403,

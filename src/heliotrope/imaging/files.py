@@ -609,11 +609,20 @@ def write_image(image: Frame | Pixels, path: str | Path, *, quality: int = 95) -
         written.
     """
     file = Path(path)
-    data = _encode(image, file.suffix.lower(), quality, str(file))
+    data = encode_image(image, file.suffix.lower(), quality, str(file))
     write_file(file, lambda stream: stream.write(data))
 
 
-def _encode(image: Frame | Pixels, suffix: str, quality: int, name: str) -> bytes:
+def encode_image(
+    image: Frame | Pixels, suffix: str, quality: int = 95, name: str = "image"
+) -> bytes:
+    """Return what `write_image` writes into a file of a suffix; ``name`` is for errors.
+
+    Raises
+    ------
+    InputError
+        See `write_image`.
+    """
     import cv2
 
     frame = image if isinstance(image, Frame) else Frame(image, name)

@@ -410,7 +410,7 @@ class Runnable(Protocol):
 
 @contextlib.asynccontextmanager
 async def running(*parts: Runnable) -> AsyncIterator[None]:
-    """Run links, buses and servers during a block, and close them at its end."""
+    """Run links, buses and servers during a block, and close them together at its end."""
     failure: Exception | None = None
     async with asyncio.TaskGroup() as group:
         for part in parts:
@@ -420,7 +420,6 @@ async def running(*parts: Runnable) -> AsyncIterator[None]:
         except Exception as error:  # noqa: BLE001 (it goes on as it came, not in a group)
             failure = error
         finally:
-            for part in parts:
-                await part.close()
+            await asyncio.gather(*(part.close() for part in parts))
     if failure is not None:
         raise failure

@@ -27,10 +27,13 @@ _ACCOUNT, _SESSION, _TOKEN = tables.account, tables.session, tables.api_token
 _DUE, _FACTOR = tables.password_due, tables.second_factor
 #: In the place of a password's hash: a trusted proxy signs that person in.
 BY_PROXY = "by the proxy"
+#: In the same place: nobody has set a password yet.
+UNSET = "none yet"
 _STATE = (
     _DUE.c.name.is_not(None).label("password_due"),
     _FACTOR.c.name.is_not(None).label("factor"),
     (_ACCOUNT.c.password_hash == BY_PROXY).label("by_proxy"),
+    (_ACCOUNT.c.password_hash == UNSET).label("no_password"),
 )
 ROLES = ("viewer", "operator", "engineer")
 
@@ -57,6 +60,8 @@ class Account:
         Whether it has a second factor.
     by_proxy
         Whether it has no password, and a trusted proxy signs that person in.
+    no_password
+        Whether nobody has set its password yet: its person enters by a one-time link.
     """
 
     name: str
@@ -68,6 +73,7 @@ class Account:
     password_due: bool = False
     factor: bool = False
     by_proxy: bool = False
+    no_password: bool = False
 
 
 @dataclass(frozen=True)
@@ -86,6 +92,7 @@ class Session:
     password_due: bool = False
     factor: bool = False
     by_proxy: bool = False
+    no_password: bool = False
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@
 - `cameras`, `wind`: cameras that see the simulated beams, and wind that turns the mirrors.
 - `live`: a world for a plant at work; begin with `live.World`.
 - `records`: command records on a simulated disk.
+- `yesterday`: calibrations of the day before, with which a simulated plant may begin.
 - `world`, `invariants`: the deterministic simulation with its faults, and the safety invariants
   that it checks at every step.
 
@@ -12,4 +13,4 @@ Each room shows its own public names. The modules below are imported by name, be
 the reading of photographs, which boards and buses do not need.
 """
 
-__all__ = ["cameras", "records", "wind"]
+__all__ = ["cameras", "records", "wind", "yesterday"]

@@ -62,7 +62,7 @@ class Exposure:
     Attributes
     ----------
     scene
-        One target, without beams.
+        Its targets, without beams.
     mirrors, sun
         True mirrors whose light may be on it, and the unit vector to the sun, (3,).
     optics
@@ -83,10 +83,12 @@ class Exposure:
 
     def draw(self) -> Frame:
         """Return the frame; the brightest of paint and beams sets the exposure."""
-        target = self.scene.targets[0]
-        beams = [spot.beam for spot in thrown(target, self.mirrors, self.sun, self.optics)]
-        light = (Thrown(target.name, Beam.together(beams)),) if beams else ()
-        scene = exposed(replace(self.scene, beams=light), PEAK)
+        light = []
+        for target in self.scene.targets:
+            beams = [spot.beam for spot in thrown(target, self.mirrors, self.sun, self.optics)]
+            if beams:
+                light.append(Thrown(target.name, Beam.together(beams)))
+        scene = exposed(replace(self.scene, beams=tuple(light)), PEAK)
         return render(scene, self.seed, name=self.title, time=self.time).frame
 
 

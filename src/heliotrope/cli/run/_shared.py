@@ -15,6 +15,7 @@ import threading
 import webbrowser
 from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -31,11 +32,13 @@ from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations.pictures import Pictures, PictureSettings
+from heliotrope.plant.operations.views import CalibrationView, Running
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.workers import WorkerProcesses
 from heliotrope.store.database import make_private, tighten
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
+from heliotrope.sun import solar_day
 
 #: Factor on the time between lines while a console is served: people look at the console.
 _SELDOM = 6.0
@@ -54,8 +57,25 @@ AT_ONCE, _INTERRUPTED = 2.0, 130
 #: up to 0.08 s and finds next to nothing.
 _COLLECTED = (50_000, 10, 1000)
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-#: Time between lines while the field goes to stow, and for visits to a simulated field to end, s.
-_SAID, _HALTED = 10.0, 1.0
+#: Span of the pace that a line shows, s, and the least difference from real time that it shows.
+_SLOWER = 0.05
+#: Length of the plan, visits, as the console asks for it: a shorter one would end the plan there.
+_PLANNED = 20
+#: What heliostats of each state do, beside those that track.
+_WORDS = {
+    "UNCONFIGURED": "without parameters",
+    "STOWED": "in stow",
+    "STOWING": "go to stow",
+    "APPROACHING": "move to their aims",
+    "IDLE": "at standby",
+    "DEFOCUSED": "defocused",
+    "LOCKED": "locked",
+    "SEARCHING": "search",
+    "FAULT": "with a fault",
+    "stale": "silent",
+}
+#: Time between lines while the field goes to stow, s.
+_SAID = 10.0
 
 
 @dataclass(frozen=True)
@@ -318,13 +338,29 @@ def first_password(password: str, folder: Path) -> str:
     return f"password in {path} (change it, and delete the file)"
 
 
+@dataclass(frozen=True)
+class Entry:
+    """How a person enters the first account.
+
+    Attributes
+    ----------
+    password
+        Words that lead to its new password; "" for none.
+    by_link
+        Whether by a one-time link.
+    """
+
+    password: str = ""
+    by_link: bool = False
+
+
 @contextlib.asynccontextmanager
 async def interface(
     live: PlantAssembly,
     keeper: Keeper,
     shown: Shown,
     folder: Path,
-    password: str | None,
+    entry: Entry,
     lines: Lines,
 ) -> AsyncIterator[None]:
     """Serve the plant's local interface during a block, and the console in a process beside it."""
@@ -337,9 +373,11 @@ async def interface(
     from heliotrope.console.people import FIRST
 
     def tell(address: str) -> None:
+        if entry.by_link:
+            address = served.one_time_link(FIRST, address)
         lines.print(f"console: {address}")
-        if password is not None:
-            lines.print(f"first account: {FIRST}, {password}")
+        if entry.password:
+            lines.print(f"first account: {FIRST}, {entry.password}")
         if shown.browser and sys.stdout.isatty():
             webbrowser.open(address)
 
@@ -348,17 +386,21 @@ async def interface(
         yield
 
 
-def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Path) -> str | None:
-    """Return the text about a new first account's password; None for an account that exists.
+def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Path) -> Entry:
+    """Return how a person enters the first account; nothing to print if they have a password.
 
-    It is written to the store, which may be slow, so this comes before the plant begins.
+    At a simulated plant that only this machine reaches it is a one-time link. The account is
+    written to the store, which may be slow, so this comes before the plant begins.
     """
     if not shown.console:
-        return None
-    from heliotrope.console.people import first_start
+        return Entry()
+    from heliotrope.console.people import first_start, without_password
 
-    password = first_start(keeper.people, live.clock.utc().timestamp())
-    return None if password is None else first_password(password, folder)
+    now = live.clock.utc().timestamp()
+    if live.operations.simulated and shown.settings().for_one:
+        return Entry(by_link=without_password(keeper.people, now))
+    password = first_start(keeper.people, now)
+    return Entry() if password is None else Entry(first_password(password, folder))
 
 
 async def watch(
@@ -412,26 +454,55 @@ def _on_the_way(live: PlantAssembly) -> str:
 
 
 def line(live: PlantAssembly) -> str:
-    """Return one line about a plant."""
+    """Return one line about a plant: what it does, what comes next, and at what pace."""
     summary, work = live.operations.summary(), live.operations.automatic.view()
-    counts = ", ".join(f"{count:,} {name.lower()}" for name, count in summary.states.items())
-    parts = [f"{summary.at:%H:%M:%S} UTC", counts, f"{work.done} calibrated"]
+    counts = dict(summary.states)
+    tracking = counts.pop("TRACKING", 0)
+    others = sorted(counts.items(), key=lambda one: -one[1])
+    field = [f"{tracking:,} of {summary.heliostats:,} track"]
+    field += [f"{count:,} {_WORDS[state]}" for state, count in others]
+    parts = ["EMERGENCY"] if summary.emergency else []
+    parts += [", ".join(field), f"{_calibrated_today(live):,} calibrated today{_error(work)}"]
     if summary.clusters_alive < summary.clusters:
         parts.append(_silent(live))
-    if work.quality:
-        last = work.quality[-1]
-        true = np.isfinite(last.truth_median)
-        said = f"{1e3 * (last.truth_median if true else last.median):.2f} mrad"
-        parts.append(f"median error {said}" if true else f"predicted error {said}")
-    if work.running:
-        parts.append("; ".join(f"{r.heliostat} at {r.target}: {r.stage}" for r in work.running))
-    elif work.reason:
-        parts.append(work.reason)
+    parts += [f"{_mirrors(run)} on target {run.target}: {run.stage}" for run in work.running]
+    if work.reason:
+        parts.append(f"no calibration: {work.reason}")
+    elif coming := live.operations.automatic.plan(_PLANNED):
+        parts.append(f"next: {coming[0].heliostat} on target {coming[0].target}")
     if summary.alarms:
-        parts.append(f"{summary.alarms} alarms")
-    if summary.lag > 1.0:
-        parts.append(f"simulated time {summary.lag:.0f} s late: this machine is too slow")
-    return " | ".join(parts)
+        parts.append(f"{summary.alarms:,} alarm{'s' * (summary.alarms > 1)}")
+    if at := pace(summary.pace):
+        parts.append(at)
+    return f"{summary.at:%H:%M:%S} UTC: {'; '.join(parts)}"
+
+
+def _calibrated_today(live: PlantAssembly) -> int:
+    """Return the number of heliostats calibrated since local midnight, by the mean sun."""
+    site, now = live.design.site, live.clock.utc()
+    midnight = datetime.combine(solar_day(now, site), datetime.min.time(), UTC)
+    begun = midnight - timedelta(hours=site.longitude_deg / 15.0)
+    return int((live.operations.viewer.frame().calibrated_at >= begun.timestamp()).sum())
+
+
+def _error(work: CalibrationView) -> str:
+    """Return the median error of the calibrated heliostats: the true one, where it is known."""
+    if not work.quality:
+        return ""
+    last = work.quality[-1]
+    true = np.isfinite(last.truth_median)
+    kind, value = ("true", last.truth_median) if true else ("predicted", last.median)
+    return f" (median {kind} error {1e3 * value:.2f} mrad)" if np.isfinite(value) else ""
+
+
+def _mirrors(run: Running) -> str:
+    """Return the heliostats of a visit."""
+    return f"{run.heliostat} and {len(run.others)} more" if run.others else run.heliostat
+
+
+def pace(rate: float) -> str:
+    """Return how fast simulated time runs, in words; "" at the pace of real time."""
+    return "" if abs(rate - 1.0) < _SLOWER else f"simulated at {rate:.2g} × real time"
 
 
 def _silent(live: PlantAssembly) -> str:
@@ -472,7 +543,7 @@ async def at_work(
     The sockets of the interface stand in ``folder``. With ``stows`` the field is stowed before the
     end, as every real one is.
     """
-    password = first_account(live, keeper, shown, folder)
+    entry = first_account(live, keeper, shown, folder)
     # Freeze the existing objects: every ten seconds the collector would walk through those of
     # 10,000 heliostats and hold the loop for up to a second.
     gc.freeze()
@@ -483,13 +554,11 @@ async def at_work(
             archive(live, shown),
             live.running(),
             leaving(live, keeper, shown.evidence),
-            interface(live, keeper, shown, folder, password, lines),
+            interface(live, keeper, shown, folder, entry, lines),
         ):
             await watch(live, shown, ending.asked, lines, speed=speed)
             ending.ask()  # or the time was over
-            if not stows:
-                await live.operations.automatic.halt(_HALTED)
-            elif not await stow(live, ending.at_once, lines):
+            if stows and not await stow(live, ending.at_once, lines):
                 lines.print(live.left())
             await live.end()
         lines.print("ended")

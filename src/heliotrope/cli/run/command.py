@@ -1,21 +1,30 @@
 """``heliotrope run``: a plant at work with its console until Ctrl-C, simulated or real."""
 
+from enum import StrEnum
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-from heliotrope.cli._common import open_plant, parse_time
-
-if TYPE_CHECKING:
-    from datetime import datetime
-
-    from heliotrope.field.plant import Plant
+from heliotrope.cli._common import open_plant
+from heliotrope.cli._plants import design_of, one_plant, start_of
 
 _TWIN, _REAL, _WORK = "Simulation", "A real plant", "Work"
 _CONSOLE, _KEPT = "Console", "Records"
+
+
+class Begin(StrEnum):
+    """How a simulated field begins."""
+
+    SECOND_DAY = "second-day"
+    NEW = "new"
+    STOW = "stow"
+
+
+#: Most mirrors that were measured yesterday, of at most 15 % of the field.
+_MEASURED = 1500
 
 
 class GroupedCommand(TyperCommand):
@@ -81,14 +90,15 @@ def run(
             rich_help_panel=_TWIN,
         ),
     ] = 0,
-    exact: Annotated[
-        bool,
+    begin: Annotated[
+        Begin,
         typer.Option(
-            "--exact",
-            help="Take centroids with noise instead of photographs.",
+            "--from",
+            help="second-day: the field tracks, and a part of it was measured yesterday; new: "
+            "nobody has measured it; stow: as second-day, in the morning at stow.",
             rich_help_panel=_TWIN,
         ),
-    ] = False,
+    ] = Begin.SECOND_DAY,
     clusters: Annotated[
         Path | None,
         typer.Option(
@@ -282,7 +292,7 @@ def run(
     from heliotrope.plant.operations.pictures import PictureSettings
     from heliotrope.plant.settings import PlantSettings
 
-    _one_plant(field, heliostats, prototype=prototype)
+    one_plant("run", field, heliostats, prototype=prototype)
     shown = Shown(
         host=host,
         port=port,
@@ -306,43 +316,39 @@ def run(
             min(30.0, photographs_days), photographs_days, 1e9 * photographs_gb
         ),
     )
+    from heliotrope.cli.run.plant import PlantChoice, run_plant
+
     if clusters is None:
         if configure or check:
             raise InputError("run: --configure and --check need a real plant; give --clusters")
-        design = _design(field, heliostats, prototype=prototype)
-        from heliotrope.cli.run.simulated import SimulationOptions, run_plant
+        from heliotrope.cli.run.twin_process import twin_process
+        from heliotrope.twin.program import LINKS, PLANT
 
-        choice = SimulationOptions(
-            speed=speed,
-            start=_start(start, design),
-            seed=seed,
-            exact=exact,
-            idle=bool(idle),
-            boards=prototype,
-        )
-        run_plant(design, choice, shown)
+        design = design_of(field, heliostats, prototype=prototype)
+        begins = start_of("run", start, design)
+        options = _options(field, heliostats, prototype=prototype)
+        options += ["--speed", str(speed), "--start", begins.isoformat()]
+        options += ["--up"] if begin is not Begin.STOW and not prototype else []
+        measured = 0 if begin is Begin.NEW or prototype else min(_MEASURED, len(design) * 3 // 20)
+        with twin_process(options, seed, measured) as twin:
+            choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle))
+            run_plant(open_plant(twin.folder / PLANT), choice, shown, twin.begin)
         return
     if field is None:
         raise InputError("run: --clusters needs the plant file; give it before")
-    _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed), exact=exact)
-    design = open_plant(field)
-    from heliotrope.cli.run.real import RealChoice, run_real
-
+    _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed))
     folder = field if field.is_dir() else field.parent
-    real = RealChoice(folder, clusters, idle is not False, configure, check)
-    run_real(design, real, shown)
+    choice = PlantChoice(folder, clusters, idle is not False, configure, check)
+    run_plant(open_plant(field), choice, shown)
 
 
-def _one_plant(field: Path | None, heliostats: int | None, *, prototype: bool) -> None:
-    """Refuse several plants at once."""
-    from heliotrope.errors import InputError
-
-    if prototype and (field is not None or heliostats is not None):
-        raise InputError(
-            "run: --prototype is a plant of its own; leave out the field and --heliostats"
-        )
-    if field is not None and heliostats is not None:
-        raise InputError("run: --heliostats is for the default plant; leave it out with a field")
+def _options(field: Path | None, heliostats: int | None, *, prototype: bool) -> list[str]:
+    """Return the options of ``heliotrope twin`` for a plant."""
+    if field is not None:
+        return [str(field)]
+    if prototype:
+        return ["--prototype"]
+    return [] if heliostats is None else ["--heliostats", str(heliostats)]
 
 
 def _only_real(**simulated: bool) -> None:
@@ -356,41 +362,3 @@ def _only_real(**simulated: bool) -> None:
             "clocks of their computers: leave it out, or leave out --clusters to simulate this "
             "plant"
         )
-
-
-def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "Plant":
-    if field is not None:
-        return open_plant(field)
-    if prototype:
-        from heliotrope.field.stellenbosch import prototype as malans
-
-        return malans()
-    from heliotrope.field.layouts import malan_plant
-
-    return malan_plant(10_000 if heliostats is None else heliostats)
-
-
-def _start(text: str, design: "Plant") -> "datetime":
-    """Return the simulated start; "morning", or of a day: three hours before noon at the site.
-
-    Raises
-    ------
-    TimeError
-        No time, or one that local controllers cannot count: 32 bits of GPS seconds, from 1980.
-    """
-    from datetime import UTC, date, datetime, timedelta
-    from datetime import time as hour
-
-    from heliotrope.errors import TimeError
-    from heliotrope.sun import solar_day
-
-    try:
-        today = solar_day(datetime.now(UTC), design.site)
-        day = today if text == "morning" else date.fromisoformat(text)
-    except ValueError:
-        start, shift = parse_time(text), 0.0
-    else:
-        start, shift = datetime.combine(day, hour(12), UTC), design.site.longitude_deg / 15.0 + 3.0
-    if not 1981 <= start.year < 2100:
-        raise TimeError(f"run: --start {text}: give a time in the years 1981 to 2099")
-    return start.astimezone(UTC) - timedelta(hours=shift)

@@ -33,7 +33,7 @@
 
   on("password", async (given) => {
     if (given.new !== given.again) throw new Error("the two new passwords differ; nothing was changed");
-    await api("PUT", "session/password", { old: given.old, new: given.new });
+    await api("PUT", "session/password", { old: given.old ?? "", new: given.new });
     location.assign("/login");
   });
   on("begin", async (given) => {
@@ -63,6 +63,7 @@
     const who = await api("GET", "session");
     find("due").textContent = DUE[who.owes] ?? "";
     find("password").hidden = who.owes === "factor";
+    find("old").hidden = find("password").elements.old.disabled = who.no_password;
     find("factor").hidden = who.owes === "password";
     find("begin").hidden = who.factor;
     find("remove").hidden = !who.factor;

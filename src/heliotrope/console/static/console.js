@@ -34,7 +34,7 @@ function head(box) {
     if (!now) return;
     day.textContent = now.at.slice(0, 10);
     time.textContent = `${now.at.slice(11, 19)} UTC`;
-    speed.textContent = now.extra?.speed && now.extra.speed !== 1 ? `×${now.extra.speed}` : now.lag > 2 ? `simulated time ${span(now.lag)} late` : "";
+    speed.textContent = Math.abs(now.pace - 1) > 0.05 ? `simulated at ${now.pace.toPrecision(2)} × real time` : "";
     sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
   };
   const mark = () => { live.textContent = store.live ? "● live" : "✕ NOT LIVE"; live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };

@@ -92,12 +92,14 @@ export const tokens = () => open("API tokens", async (done) => {
 });
 
 export async function password() {
-  const given = await ask("Change your password; you sign in again afterwards", [{ name: "old", label: "Current password", type: "password" },
-    { name: "new", label: "New password (at least 10 characters)", type: "password" }, { name: "again", label: "New password again", type: "password" }], "Change");
+  const { no_password: first } = await api("GET", "session");
+  const old = first ? [] : [{ name: "old", label: "Current password", type: "password" }];
+  const given = await ask(`${first ? "Set" : "Change"} your password; you sign in again afterwards`, [...old,
+    { name: "new", label: "New password (at least 10 characters)", type: "password" }, { name: "again", label: "New password again", type: "password" }], first ? "Set" : "Change");
   if (!given) return;
   if (given.new !== given.again) { say("password: the two new passwords differ; nothing was changed", true); return; }
   try {
-    await api("PUT", "session/password", { old: given.old, new: given.new });
+    await api("PUT", "session/password", { old: given.old ?? "", new: given.new });
     location.assign("/login");
   } catch (error) { say(`password: ${error.message}`, true); }
 }

@@ -39,7 +39,7 @@ class SnapshotSource(Source):
     url
         Address of the image.
     interval
-        Time between requests, s.
+        Time between requests while nobody waits for a frame, s.
     timeout
         For an answer, s.
 
@@ -79,8 +79,9 @@ class SnapshotSource(Source):
         ):
             file = Path(folder) / f"snapshot{Path(urlsplit(self.url).path).suffix.lower()}"
             while not self.stop.is_set():
+                self.wanted.clear()
                 yield self._ask(client, file)
-                self.stop.wait(self.interval)
+                self.wanted.wait(self.interval)
 
     def _ask(self, client: "httpx.Client", file: Path) -> Frame:
         import httpx

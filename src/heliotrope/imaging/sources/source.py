@@ -25,11 +25,14 @@ class Source(ABC):
         Number of frames after which it ends; None: no limit.
     stop
         Ends it when set.
+    wanted
+        Set when somebody waits for a frame: a source that takes frames at intervals takes one now.
     """
 
     name: str = ""
     limit: int | None = None
     stop: threading.Event = field(default_factory=threading.Event, repr=False)
+    wanted: threading.Event = field(default_factory=threading.Event, repr=False)
 
     def __enter__(self) -> Self:
         self._begin()

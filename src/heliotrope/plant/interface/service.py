@@ -33,6 +33,7 @@ from heliotrope.plant.interface.calls import CALLS, Call, Later, WithBlob, asked
 from heliotrope.plant.interface.desk import Desk
 from heliotrope.plant.interface.encoding import plain
 from heliotrope.plant.interface.errors import kind_of
+from heliotrope.plant.interface.one_time_link import OneTimeLink
 from heliotrope.plant.interface.orders import Beat
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.security import SecurityEvent
@@ -104,7 +105,7 @@ class PlantInterface:
         self.heard, self.addresses = dict[str, float](), dict[str, str]()
         self._known: dict[str, tuple[float, Person]] = {}
         self._noted = -math.inf
-        self.admission = Admission()
+        self.admission, self._link = Admission(), OneTimeLink()
         #: Threads that wait for the store; those that hang take no place from others.
         self._threads = ThreadPoolExecutor(4, "plant people")
         self._plant: asyncio.AbstractEventLoop | None = None
@@ -137,6 +138,25 @@ class PlantInterface:
             for thread in threads:
                 await asyncio.to_thread(thread.close)
             self._threads.shutdown(wait=False, cancel_futures=True)
+
+    def one_time_link(self, name: str, address: str) -> str:
+        """Return a link that signs an account in, once and soon, without its password.
+
+        Parameters
+        ----------
+        name
+            The account.
+        address
+            Of the console.
+
+        Raises
+        ------
+        InputError
+            If the plant is real.
+        """
+        if not self._desk.operations.simulated:
+            raise InputError("one-time link: the plant is real; its people sign in by passwords")
+        return f"{address}enter?once={self._link.make(name)}"
 
     def in_plant(self, work: Callable[[], T]) -> "Future[T]":
         """Do work in the plant's loop, from any thread."""
@@ -236,7 +256,7 @@ class PlantInterface:
             beat = _checked(Beat, given)
             self.heard[beat.part], self.addresses[beat.part] = time.monotonic(), beat.address
             return None, b""
-        people = _people_calls(self._people, self._factors)
+        people = _people_calls(self._people, self._factors, self._link)
         if caller.person is None and name in people:
             work = functools.partial(people[name], **given)
             loop = asyncio.get_running_loop()
@@ -357,13 +377,16 @@ def _called(head: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     return name, {**given, **named}
 
 
-def _people_calls(people: People, factors: Factors) -> dict[str, Callable[..., Any]]:
+def _people_calls(
+    people: People, factors: Factors, link: OneTimeLink
+) -> dict[str, Callable[..., Any]]:
     """Return the calls that only a console may make, done in threads and not in the loop."""
     return {
         "people.account": people.account,
         "people.accounts": people.accounts,
         "people.add": people.add,
         "people.change": people.change,
+        "people.enter": link.use,
         "people.open_session": people.open_session,
         "people.session": people.session,
         "people.close_session": people.close_session,

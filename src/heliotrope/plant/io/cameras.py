@@ -108,8 +108,13 @@ class Feed:
     def close(self) -> None:
         """End the thread; a thread that hangs in a driver is left behind."""
         self._source.stop.set()
+        self._source.wanted.set()
         if self._thread.is_alive():
             self._thread.join(2.0)
+
+    def ask(self) -> None:
+        """Take a frame now, if the source takes them at intervals."""
+        self._source.wanted.set()
 
     def _run(self) -> None:
         stop = self._source.stop
@@ -331,6 +336,7 @@ class RealCameras:
     async def _frame(self, eye: _Eye, target: str) -> Frame:
         """Wait for a frame that is exposed from now on."""
         asked, until = self._clock.utc(), self._clock.monotonic() + self._patience
+        eye.feed.ask()
         while self._clock.monotonic() < until:
             frame = eye.feed.newest
             if frame is not None and dated(frame, eye.camera) >= asked:

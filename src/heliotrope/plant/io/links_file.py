@@ -132,6 +132,11 @@ class LinksDocument(Table):
     receiver_light: str = Field(
         "", description='Reference of the receiver\'s camera, beside this file: for `"camera"`.'
     )
+    twin: str = Field(
+        "",
+        description="Address of a simulated field: the plant follows its clock. Every cluster is "
+        "then `tcp`, and there is no witness.",
+    )
     clusters: dict[str, str] = Field(
         min_length=1, description='`"tcp"`, `"mqtt"`, or the cluster file of a local bus, by name.'
     )
@@ -227,6 +232,7 @@ class LinksFile:
         made.given = frozenset(n for n, f in sensors.items() if f == GIVEN)
         self._call(made, clock)
         made.firmware = self.document.firmware
+        made.twin = self.document.twin
         polling = self.document.polling
         made.common = CommonSettings(polling.steps_every_s, polling.silence_s)
         served = {n: self.keys[n] for n, how in self.document.clusters.items() if how == "tcp"}
@@ -325,6 +331,8 @@ class PlantLinks:
         Version that every board should have; None: it is not compared.
     light
         Reference by which the receiver's camera gives its flux; None: it gives none.
+    twin
+        Address of the simulated field; "" for a real one.
     """
 
     papers: Papers
@@ -339,6 +347,7 @@ class PlantLinks:
     witnesses: list[Witness] = field(default_factory=list)
     witnessed: frozenset[str] | None = frozenset()
     firmware: int | None = None
+    twin: str = ""
 
     def facts(self) -> dict[str, str]:
         """Return, by name, why the last connection was refused and whose new key is not used."""
@@ -404,6 +413,8 @@ def _check(found: LinksFile) -> None:
     seen_by = document.witness
     if seen_by.none and (seen_by.gpsd or seen_by.sun_sensor or seen_by.photographs):
         raise FormatError(path, "it names a witness, and accepts that there is none", "witness")
+    if document.twin:
+        _check_simulated(path, document)
     ways = set(document.clusters.values())
     for way, table in (("tcp", document.tcp), ("mqtt", document.mqtt)):
         if way in ways and table is None:
@@ -432,6 +443,22 @@ def _check(found: LinksFile) -> None:
             raise FormatError(path, "give mqtt://host/prefix or mqtts://host/prefix", "mqtt.url")
         encrypted = scheme == "mqtts"
         check_encryption(path, host, "mqtt.url", encrypted or document.mqtt.unencrypted)
+
+
+def _check_simulated(path: Path, document: LinksDocument) -> None:
+    """Refuse links to anything real beside a simulated field, whose clock the plant follows."""
+    for name, how in document.clusters.items():
+        if how != "tcp":
+            raise FormatError(
+                path,
+                f"{how!r} beside twin: a plant that follows the clock of a simulated field leads "
+                'no real heliostats; remove twin, or give "tcp"',
+                f"clusters.{name}",
+            )
+    if not document.witness.none:
+        raise FormatError(
+            path, "no witness sees the sun of a simulated field; give none = true", "witness"
+        )
 
 
 def _keyless(path: Path, name: str) -> FormatError:

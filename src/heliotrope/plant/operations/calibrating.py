@@ -102,6 +102,11 @@ class TrueErrors:
         self._plant, self._truth = plant, truth
         self._known: tuple[float, FloatArray] | None = None
 
+    @property
+    def known(self) -> bool:
+        """Whether the errors are known."""
+        return self._truth is not None
+
     def all(self) -> FloatArray | None:
         """Return the errors of all heliostats, rad, (N,); None if they are unknown."""
         if self._truth is None:

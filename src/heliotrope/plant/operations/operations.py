@@ -220,6 +220,11 @@ class Operations:
         """Names of the receivers."""
         return tuple(receiver.name for receiver in self.plant.design.receivers)
 
+    @property
+    def simulated(self) -> bool:
+        """Whether the field is a twin, whose true errors are known."""
+        return self.automatic.truth.known
+
     def summary(self) -> Summary:
         """Return the state of the whole plant."""
         now, grant = self.plant.now(), self.plant.authority.grant
@@ -239,7 +244,7 @@ class Operations:
             self.logbook.open_alarms,
             self.plant.sentinel.on,
             self.automatic.waits,
-            float(extra.pop("lag", 0.0)),
+            float(extra.pop("pace", 1.0)),
             extra,
         )
 

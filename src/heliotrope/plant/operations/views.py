@@ -671,8 +671,8 @@ class Summary:
         Whether an emergency is active.
     resume
         Why automatic control waits for a person's Resume, "" if it does not.
-    lag
-        Delay of the plant's time, s: 0 unless the machine is too slow for a twin's speed.
+    pace
+        Seconds of the plant's time per second over the last half minute: 1 for a real plant.
     extra
         More rows, such as the speed of a twin.
     """
@@ -689,5 +689,5 @@ class Summary:
     alarms: int
     emergency: bool
     resume: str
-    lag: float
+    pace: float
     extra: Mapping[str, Any]

@@ -396,6 +396,32 @@ class Field:
         self._lease[takes], self._sunned[takes] = LEASE_MS - max(0, delay_ms), self.now_ms
         self.hear(heard)
 
+    def put_up(self, values: tuple[int, ...], aims: npt.ArrayLike) -> Bools:
+        """Let heliostats at stow track, as if they had been raised before; return which do, (N,).
+
+        Those that cannot bring their beams to their aims stay at stow.
+
+        Parameters
+        ----------
+        values
+            SUN of the wire; see `take_sun`.
+        aims
+            Aim points, (N, 3), m.
+        """
+        self.take_sun(values)
+        rows = np.flatnonzero(self.state == states.STOWED)
+        self.aim[rows] = np.asarray(aims)[rows]
+        angles, good = self._pose(rows, self.aim[rows], 0)
+        rows, angles = rows[good], angles[good]
+        counts = np.floor(self.journals.drives(rows).counts(angles) + 0.5).astype(np.int64)
+        for name in ("count", "goal", "leg"):
+            self.axes[name][rows] = counts
+        self.drives.turned[rows], self.drives.joint[rows] = counts, counts
+        self._ready[rows] = True
+        self._begin(rows, TRACK, self.aim[rows])
+        self._enter(rows, states.TRACKING)
+        return np.isin(np.arange(len(self)), rows)
+
     def hear(self, rows: Rows) -> None:
         """Note that heliostats hear their cluster; a position is held only while they do."""
         self._heard[rows] = LEASE_MS

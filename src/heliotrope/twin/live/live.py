@@ -27,7 +27,8 @@ from heliotrope.field.target import Target
 from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.synthetic.scenes import Scene
-from heliotrope.links.clock import Clock
+from heliotrope.links.clock import Clock, gps_seconds
+from heliotrope.links.connection import CarriedLink
 from heliotrope.links.keys import KeyRing
 from heliotrope.links.link import Bus, running
 from heliotrope.mechanism import kinds
@@ -59,6 +60,8 @@ from heliotrope.twin.true_mirrors import TrueMirror, mirrors_near
 _OF_CLUSTERS = frozenset(row.name for row in watched_by(CONDITIONS, Watcher.CLUSTER))
 #: Tick of the field, and period at which the true sun is computed, s.
 _TICK, _SUN_EVERY = 0.05, 5.0
+#: Time in which clusters have sent the orders with which they begin, s.
+_BEGUN = 1.5
 #: Largest number of ticks made up at once after a pause.
 _MOST_TICKS = 20
 #: Step counts of each heliostat are requested each second in plants up to this size, and every few
@@ -88,6 +91,12 @@ class WorldOptions:
         Whether each heliostat is a firmware-true board; for small plants.
     centroid
         Variance of centroids that are not photographed, m².
+    link
+        Returns a cluster's end of the link to its plant, by the name of the cluster; None: both
+        ends are in this process, and `World.links` has the plant's.
+    up
+        Whether the heliostats track when the plant begins, as on a day of work; else they are at
+        stow. Boards begin at stow.
     bus_key
         Key with which the frames of every bus are signed; b"": none is, and a field of arrays
         obeys every frame.
@@ -100,6 +109,8 @@ class WorldOptions:
     boards: bool = False
     centroid: float = 1e-5
     bus_key: bytes = b""
+    up: bool = False
+    link: Callable[[str], CarriedLink] | None = None
 
     def __post_init__(self) -> None:
         if not self.centroid >= 0.0:
@@ -115,7 +126,8 @@ class World:
     ----------
     design
         The plant: groups of any kind of mechanism with two drives and a machine table, each
-        heliostat on a cluster; its mechanisms count as nominal.
+        heliostat on a cluster. Its mechanisms count as nominal, and its local controllers store
+        them with the parameters of its heliostats.
     clock
         Clock of the loop that it will run in.
     options
@@ -133,8 +145,10 @@ class World:
         Plant's end of the link to each cluster.
     buses
         Bus of each cluster.
+    clusters
+        Their programs.
     cameras
-        Cameras of the targets.
+        Cameras of the targets; None where the plant has its own, which are sent photographs.
     flux
         Sensor of the flux on the receivers; None without a receiver.
     beats
@@ -152,7 +166,7 @@ class World:
         self.design, self.clock, self.options = design, clock, chosen
         groups = design.groups.values()
         self.names = design.names
-        self.truth = together([_installed(g, chosen, i) for i, g in enumerate(groups)])
+        self.truth = true_mechanisms(design, chosen)
         believed, machines = together([g.calibrated for g in groups]), machines_of(design)
         self.field: Field | BoardField = (
             BoardField(clock, self.names, self.truth, believed, machines, chosen.seed)
@@ -164,7 +178,7 @@ class World:
         self._sun: tuple[float, FloatArray] | None = None
         self.beats = 0
         self._parts: list[Any] = []
-        self._clusters: list[Cluster] = []
+        self.clusters: list[Cluster] = []
         self.links: dict[str, NearLink] = {}
         self.buses: dict[str, Bus] = {}
         homes = clusters_of(design)
@@ -175,7 +189,7 @@ class World:
         self._rows = np.array([place[name] for members in homes.values() for name in members])
         aims = default_aims(design, self.names, design.position, None)
         self._aims = np.stack([aims[name] for name in self.names])
-        self.cameras = self._new_cameras()
+        self.cameras = self._new_cameras() if chosen.link is None else None
         receivers = design.receivers
         self.flux = FluxSensor(receivers, clock, self.field.stand, self.sun) if receivers else None
 
@@ -189,7 +203,13 @@ class World:
                 "plant file; sort them by cluster"
             )
         span = range(rows[0], rows[0] + len(rows))
-        near, far = near_pair(self.clock, ("plant", name))
+        far: NearLink | CarriedLink
+        if self.options.link is None:
+            near, far = near_pair(self.clock, ("plant", name))
+            self.links[name] = near
+            self._parts.append(near)
+        else:
+            far = self.options.link(name)
         key = self.options.bus_key
         own = [key_of(self.names[row]) for row in span] if key else ()
         bus: Bus = (
@@ -201,24 +221,23 @@ class World:
             Member(self.names[row], i + 1, 1 + row, key_of(self.names[row]))
             for i, row in enumerate(rows)
         )
-        every = 1 if len(self.names) <= _SMALL else _STEPS_EVERY
         config = ClusterConfig(
             name,
             self.design.site,
             members,
-            steps_every=every,
+            steps_every=steps_every(len(self.names)),
             phase=phase,
             limits={k: v for k, v in self.design.safety.items() if k in _OF_CLUSTERS},
         )
         # A computer's clock before its programs were written was never set; simulated time may be.
         time = SimulatedTime(self.clock)
         ring = KeyRing(key) if key else None
-        self._clusters.append(Cluster(config, bus, far, self.clock, time, bus_keys=ring))
-        self._parts += [near, far, bus, time]
-        self.links[name], self.buses[name] = near, bus
+        self.clusters.append(Cluster(config, bus, far, self.clock, time, bus_keys=ring))
+        self._parts += [far, bus, time]
+        self.buses[name] = bus
 
     def _new_cameras(self) -> ExactCamera | RenderedCamera:
-        seed, sight = self.options.seed, FieldSnapshot(self.clock, self._mirrors, self.sun)
+        seed, sight = self.options.seed, FieldSnapshot(self.clock, self.mirrors, self.sun)
         if not self.options.rendered:
             return ExactCamera(sight, self.options.centroid, seed)
         scenes = []
@@ -231,7 +250,7 @@ class World:
                 )
             scenes.append(Scene(cameras[0], (target,)))
         if (visits := self.design.receiver_visits) is not None:
-            scenes += [Scene(self.design.camera(visits.camera), (face,)) for face in self._faces]
+            scenes += [Scene(self.design.camera(visits.camera), (face,)) for face in self.faces]
         # Malan's small mirrors are of one piece.
         optics = Optics(facets=(1, 1))
         return RenderedCamera(sight, scenes, optics=optics, seed=seed, worker=self.options.worker)
@@ -275,11 +294,11 @@ class World:
         mixed = first + (second - first) * (part / _SUN_EVERY)
         return np.asarray(mixed / np.linalg.norm(mixed))
 
-    def _mirrors(self) -> list[TrueMirror]:
+    def mirrors(self) -> list[TrueMirror]:
         """Return the mirrors whose light may be on a target."""
         light, stand = self.sun(), self.field.stand()
         mirrors: dict[str, TrueMirror] = {}
-        for target in (*self.design.targets, *self._faces):
+        for target in (*self.design.targets, *self.faces):
             for mirror in mirrors_near(
                 target, light, stand, self.names, self._sizes, beside=self._beside
             ):
@@ -287,7 +306,7 @@ class World:
         return list(mirrors.values())
 
     @property
-    def _faces(self) -> tuple[Target, ...]:
+    def faces(self) -> tuple[Target, ...]:
         """The face of the receiver on which mirrors are measured."""
         visits = self.design.receiver_visits
         return () if visits is None else (self.design.receiver(visits.receiver).face,)
@@ -307,14 +326,45 @@ class World:
             done += late * _TICK
             self.field.advance(50 * ticks)
 
+    async def _put_up(self) -> None:
+        """Let the field track, once the clusters have sent the DEFOCUS with which they begin."""
+        await asyncio.sleep(_BEGUN)
+        gps = gps_seconds(self.clock.utc())
+        utc = self.clock.utc().timestamp()
+        values = sun.broadcast_values(round(gps), utc, self.design.site)
+        if values is not None and isinstance(self.field, Field):
+            self.field.put_up(values, self._aims)
+
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Run field, buses, links and clusters for the time of a block."""
         async with asyncio.TaskGroup() as group:
             turns = group.create_task(self._turn())
-            async with running(*self._parts), running(*self._clusters):
+            async with running(*self._parts), running(*self.clusters):
+                if self.options.up:
+                    await self._put_up()
                 yield
             turns.cancel()
+
+
+def steps_every(heliostats: int) -> int:
+    """Return the time between requests for the step counts of a plant's heliostats, s."""
+    return 1 if heliostats <= _SMALL else _STEPS_EVERY
+
+
+def true_mechanisms(design: Plant, options: WorldOptions) -> Mechanism:
+    """Return the true mechanisms of a world, in the order of the design, (N,).
+
+    They do not depend on the parameters of the design's heliostats, which the local controllers of
+    the world store.
+
+    Raises
+    ------
+    InputError
+        A mechanism with one drive.
+    """
+    groups = design.groups.values()
+    return together([_installed(group, options, i) for i, group in enumerate(groups)])
 
 
 def _installed(group: Heliostats, options: WorldOptions, number: int) -> Mechanism:

@@ -14,6 +14,8 @@ from heliotrope.errors import InputError
 
 #: Loop time that timers may be late by before the loop's time is held back, s.
 LATE = 0.25
+#: Wall time until a loop looks again whether its speed has changed, s.
+_STILL = 0.05
 #: Loop time that passes in one turn while callbacks are always ready, s.
 _BUSY = 0.005
 
@@ -24,10 +26,14 @@ class _Pace(selectors.DefaultSelector):
     def __init__(self, speed: float, start: float, wall: Callable[[], float]) -> None:
         super().__init__()
         self.speed, self.now, self.lag = speed, start, 0.0
-        self._wall, self._begin, self._start = wall, wall(), start
+        self.wall, self._begin, self._start = wall, wall(), start
 
     def _target(self) -> float:
-        return self._start + self.speed * (self._wall() - self._begin) - self.lag
+        return self._start + self.speed * (self.wall() - self._begin) - self.lag
+
+    def change(self, speed: float) -> None:
+        """Go on from now at another speed; 0 stands still, and files are still served."""
+        self.speed, self._begin, self._start = speed, self.wall(), self.now + self.lag
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         if timeout is None:
@@ -35,7 +41,10 @@ class _Pace(selectors.DefaultSelector):
             self.now = max(self.now, self._target())
             return events
         due = self.now + max(timeout, 0.0)
-        wait = max(0.0, due - self._target()) / self.speed if timeout > 0.0 else 0.0
+        if timeout <= 0.0:
+            wait = 0.0
+        else:
+            wait = max(0.0, due - self._target()) / self.speed if self.speed > 0.0 else _STILL
         events = super().select(wait)
         most = due if timeout > 0.0 else self.now + _BUSY
         target = self._target()
@@ -81,8 +90,12 @@ class PacedLoop(asyncio.SelectorEventLoop):
 
     @property
     def speed(self) -> float:
-        """Loop seconds per second of wall time, if the machine keeps up."""
+        """Loop seconds per second of wall time, if the machine keeps up; 0 stands still."""
         return self._pace.speed
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        self._pace.change(speed)
 
     @property
     def lag(self) -> float:

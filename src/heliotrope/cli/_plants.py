@@ -1,0 +1,64 @@
+"""The plant that a command runs: a plant file, the default plant, or the prototype."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from heliotrope.cli._common import open_plant, parse_time
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from heliotrope.field.plant import Plant
+
+
+def one_plant(command: str, field: Path | None, heliostats: int | None, *, prototype: bool) -> None:
+    """Refuse several plants at once."""
+    from heliotrope.errors import InputError
+
+    if prototype and (field is not None or heliostats is not None):
+        raise InputError(
+            f"{command}: --prototype is a plant of its own; leave out the field and --heliostats"
+        )
+    if field is not None and heliostats is not None:
+        raise InputError(
+            f"{command}: --heliostats is for the default plant; leave it out with a field"
+        )
+
+
+def design_of(field: Path | None, heliostats: int | None, *, prototype: bool) -> "Plant":
+    """Return the plant of a file or folder, the prototype, or the default plant."""
+    if field is not None:
+        return open_plant(field)
+    if prototype:
+        from heliotrope.field.stellenbosch import prototype as malans
+
+        return malans()
+    from heliotrope.field.layouts import malan_plant
+
+    return malan_plant(10_000 if heliostats is None else heliostats)
+
+
+def start_of(command: str, text: str, design: "Plant") -> "datetime":
+    """Return a simulated start; "morning", or of a day: three hours before noon at the site.
+
+    Raises
+    ------
+    TimeError
+        No time, or one that local controllers cannot count: 32 bits of GPS seconds, from 1980.
+    """
+    from datetime import UTC, date, datetime, timedelta
+    from datetime import time as hour
+
+    from heliotrope.errors import TimeError
+    from heliotrope.sun import solar_day
+
+    try:
+        today = solar_day(datetime.now(UTC), design.site)
+        day = today if text == "morning" else date.fromisoformat(text)
+    except ValueError:
+        start, shift = parse_time(text), 0.0
+    else:
+        start, shift = datetime.combine(day, hour(12), UTC), design.site.longitude_deg / 15.0 + 3.0
+    if not 1981 <= start.year < 2100:
+        raise TimeError(f"{command}: --start {text}: give a time in the years 1981 to 2099")
+    return start.astimezone(UTC) - timedelta(hours=shift)

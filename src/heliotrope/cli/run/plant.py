@@ -1,0 +1,339 @@
+"""A plant with its store, its local interface and its console.
+
+There is one path for a real field and a simulated one: both are reached by a links file. The links
+file of a simulated field names its address; the plant then follows its clock, and asks it for the
+true errors.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heliotrope import warm
+from heliotrope.cli.run._shared import (
+    FORESEE,
+    Shown,
+    at_work,
+    begin,
+    computing,
+    one_error,
+    pictures,
+    store,
+)
+from heliotrope.errors import FetchError, InputError
+from heliotrope.field.plant import Plant
+from heliotrope.files.disk import DiskThread
+from heliotrope.geometry import FloatArray
+from heliotrope.links.clock import Clock, SystemClock
+from heliotrope.links.link import running
+from heliotrope.plant.assembly import CYCLE, AssemblySettings, MachineTables, PlantAssembly
+from heliotrope.plant.field.learner import LearnerProcess
+from heliotrope.plant.io.cameras import RealCameras
+from heliotrope.plant.io.followed_clock import ClockReader, FollowedLoop
+from heliotrope.plant.io.receiver_flux import check_reference, flux_by
+from heliotrope.plant.io.sensors import AllSensors, Sensors
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.audit import Forgetful
+from heliotrope.plant.orders.kept_audit import KeptAudit, KeptPoints
+from heliotrope.plant.ports import Ports
+from heliotrope.plant.settings import clusters_of
+from heliotrope.plant.workers import Worker, at_once
+from heliotrope.store.keeper import Keeper
+
+if TYPE_CHECKING:
+    from heliotrope.cluster.program import LocalCluster
+    from heliotrope.imaging.receiver_light import ReceiverReference
+    from heliotrope.links.link import Link
+    from heliotrope.links.papers import Papers
+    from heliotrope.plant.io.links_file import LinksFile, PlantLinks
+
+#: Calibration of a simulated field: how well its beams are known, rad.
+_SIMULATED = replace(CYCLE, sigma=2e-4)
+#: Time between checks whether a simulated field waits for its plant, and between true errors, s.
+_CHECKED, _TRUE_EVERY = 0.02, 5.0
+
+
+#: Prepares store and simulated field.
+Prepare = Callable[[Keeper, Plant, datetime], Awaitable[None]]
+
+
+@dataclass(frozen=True)
+class PlantChoice:
+    """Options of a plant on the command line; see `cli.run.command`."""
+
+    folder: Path
+    clusters: Path
+    idle: bool
+    configure: bool = False
+    check: bool = False
+
+
+def run_plant(
+    design: Plant, choice: PlantChoice, shown: Shown, prepare: Prepare | None = None
+) -> None:
+    """Run until Ctrl-C, or until the time is over; a real field is stowed at the end.
+
+    ``prepare`` is called with store, plant and present time before a simulated field begins.
+
+    Raises
+    ------
+    InputError
+        If files do not fit together, a group lacks the machine table that ``--configure``
+        needs, or there is no place for records.
+    FetchError
+        If the simulated field does not answer.
+    """
+    file = _links_file(choice)
+    if not file.document.twin:
+        _begin(_outside(design, file, SystemClock()), design, choice, shown)
+        return
+    warm.controlling()  # while the simulated field does the same
+    with contextlib.closing(ClockReader(file.document.twin)) as reader:
+        loop = FollowedLoop(reader)
+        outside = _outside(design, file, reader.clock(loop), reader)
+        _begin(outside, design, choice, shown, loop, prepare)
+
+
+def _begin(
+    outside: "_Outside",
+    design: Plant,
+    choice: PlantChoice,
+    shown: Shown,
+    loop: FollowedLoop | None = None,
+    prepare: Prepare | None = None,
+) -> None:
+    """Check everything, and run the plant in its loop."""
+    if outside.links.light is not None:
+        check_reference(design, outside.links.light)
+    if choice.configure:
+        for name in design.names:
+            design.machine(name)
+    if choice.check:
+        settings = _settings(design, choice, shown, outside)
+        _check(design, settings, outside, _cameras(design, choice, shown, outside))
+        for text in _papers(outside, shown).lines():
+            print(text)
+        return
+    if loop is None and shown.data is None and shown.database is None:
+        raise InputError(
+            "run: a real plant keeps its records; give --data FOLDER, or --database URL"
+        )
+    factory = None if loop is None else lambda: loop
+    with one_error(), asyncio.Runner(loop_factory=factory) as runner:
+        runner.run(_run(design, choice, shown, outside, prepare))
+
+
+def _papers(outside: "_Outside", shown: Shown) -> "Papers":
+    """Return keys and certificates of the links, and the certificate of the console."""
+    papers = outside.links.papers
+    if shown.console and shown.certificate is not None:
+        papers.watch_end(shown.certificate)
+    return papers
+
+
+def _settings(
+    design: Plant, choice: PlantChoice, shown: Shown, outside: "_Outside"
+) -> AssemblySettings:
+    common = replace(outside.links.common, delta_t=design.site.delta_t, limits=design.safety)
+    held = MachineTables.UNKNOWN if outside.reader is None else MachineTables.HELD
+    return AssemblySettings(
+        plant=replace(
+            shown.plant,
+            given=outside.links.given,
+            common=common,
+            witnesses=outside.links.witnessed,
+            firmware=outside.links.firmware,
+        ),
+        # A heliostat that a person gives to automatic control is calibrated too.
+        work=AutomaticSettings(wanted=not choice.idle, foresee=FORESEE),
+        cycle=CYCLE if outside.reader is None else _SIMULATED,
+        machines=MachineTables.WRITTEN if choice.configure else held,
+    )
+
+
+def _check(
+    design: Plant, settings: AssemblySettings, outside: "_Outside", cameras: RealCameras | None
+) -> None:
+    """Build the whole plant without starting it, and print what it consists of."""
+    sensors = outside.sensors(cameras)
+    ports = Ports(outside.all_links, outside.clock, Forgetful(), cameras, sensors)
+    PlantAssembly(design, ports, settings)
+    watched = 0 if cameras is None else sum(cameras.sees(t.name) for t in design.targets)
+    print(
+        f"{design.name}: {len(design):,} heliostats on {len(clusters_of(design))} clusters, "
+        f"{watched} of {len(design.targets)} targets with a camera"
+    )
+    bare = [name for name, group in design.groups.items() if not group.machines]
+    if bare:
+        print(f"no machine table, which --configure needs: group {', '.join(bare)}")
+
+
+@dataclass(frozen=True)
+class _Outside:
+    """Links of a plant, its clock, and the clusters that run in its process.
+
+    Attributes
+    ----------
+    reader
+        Of the clock of a simulated field; None for a real one.
+    """
+
+    links: "PlantLinks"
+    local: "list[LocalCluster]"
+    clock: Clock
+    reader: ClockReader | None
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Run servers, links and local clusters for the time of a block."""
+        parts = [
+            *self.links.parts,
+            *(part for local in self.local for part in local.parts),
+        ]
+        while self.reader is not None and not self.reader.state.begun:
+            await asyncio.sleep(_CHECKED)
+        async with running(*parts), running(*(local.cluster for local in self.local)):
+            yield
+
+    @property
+    def all_links(self) -> "dict[str, Link]":
+        """The links to all clusters, by name."""
+        return {
+            **self.links.links,
+            **{local.cluster.config.name: local.link for local in self.local},
+        }
+
+    def sensors(self, cameras: RealCameras | None) -> Sensors:
+        """Return the sensors of the plant."""
+        files, light = self.links.sensors, self.links.light
+        if light is None or cameras is None:
+            return files
+        return AllSensors([files, flux_by(cameras, self.clock, light)])
+
+    def ports(
+        self, design: Plant, choice: PlantChoice, shown: Shown, keeper: Keeper, worker: Worker
+    ) -> Ports:
+        """Return the ports of the plant."""
+        cameras = _cameras(design, choice, shown, self, worker)
+        return Ports(
+            self.all_links,
+            self.clock,
+            KeptAudit(keeper, SystemClock(), self.clock.utc()),
+            cameras,
+            self.sensors(cameras),
+            witnesses=self.links.witnesses,
+            # A record takes long in a time that runs faster, so there the loop waits for it.
+            disk=None if self.fast else DiskThread(),
+            records=keeper,
+            assigned=KeptPoints(keeper),
+            beside=self.running,
+            truth=None if self.reader is None else _TrueErrors(self.reader, design),
+            learner=LearnerProcess(),
+            worker=worker,
+            facts=self.facts,
+        )
+
+    @property
+    def fast(self) -> bool:
+        """Whether the time of a simulated field runs faster than this machine's."""
+        return self.reader is not None and self.reader.state.asked > 1.0
+
+    def facts(self) -> dict[str, Any]:
+        """Return rows of the summary: of the links, and of the clock of a simulated field."""
+        found: dict[str, Any] = dict(self.links.facts())
+        if self.reader is not None:
+            found |= {"speed": self.reader.state.asked, "pace": self.reader.pace}
+        return found
+
+
+class _TrueErrors:
+    """The true tracking errors of a simulated field, asked for beside the loop.
+
+    Calling it returns the last ones, rad, (N,); NaN before the first.
+    """
+
+    def __init__(self, reader: ClockReader, design: Plant) -> None:
+        self._reader = reader
+        self._errors: FloatArray = np.full(len(design), np.nan)
+        self._asking: asyncio.Task[None] | None = None
+        self._asked_at = -np.inf
+
+    def __call__(self) -> FloatArray:
+        """Return the last errors, and ask for others if these are old."""
+        loop = asyncio.get_running_loop()
+        if self._asking is None and loop.time() - self._asked_at > _TRUE_EVERY:
+            self._asked_at = loop.time()
+            self._asking = loop.create_task(self._ask())
+        return self._errors
+
+    async def _ask(self) -> None:
+        with contextlib.suppress(FetchError):
+            data = await asyncio.to_thread(self._reader.fetch, "errors")
+            self._errors = np.frombuffer(data, dtype=np.float64)
+        self._asking = None
+
+
+def _links_file(choice: PlantChoice) -> "LinksFile":
+    try:
+        from heliotrope.plant.io.links_file import read_links
+    except ImportError as error:
+        raise InputError(
+            f"run: {error.name} is not installed; say pip install 'heliotrope[control]'"
+        ) from None
+    return read_links(choice.clusters)
+
+
+def _outside(
+    design: Plant, file: "LinksFile", clock: Clock, reader: ClockReader | None = None
+) -> _Outside:
+    from heliotrope.cluster.program import LocalCluster
+
+    homes = clusters_of(design)
+    links = file.build(homes, clock)
+    local = [LocalCluster(file, name, homes[name], clock) for name, file in links.local.items()]
+    return _Outside(links, local, clock, reader)
+
+
+def _cameras(
+    design: Plant, choice: PlantChoice, shown: Shown, outside: _Outside, worker: Worker = at_once
+) -> RealCameras | None:
+    """Return the cameras; None if the plant has no camera that can work."""
+    light: ReceiverReference | None = outside.links.light
+    watched = {} if light is None else {light.sight.receiver: light.sight.camera}
+    if not design.cameras or not (design.targets or watched):
+        return None
+    memory = None if shown.data is None else shown.data / "targets"
+    return RealCameras(
+        design, choice.folder, outside.clock, watched=watched, memory=memory, worker=worker
+    )
+
+
+async def _run(
+    design: Plant, choice: PlantChoice, shown: Shown, outside: _Outside, prepare: Prepare | None
+) -> None:
+    ending = begin(design, shown)
+    with computing() as worker, store(shown) as (keeper, folder):
+        if prepare is not None:
+            await prepare(keeper, design, outside.clock.utc())
+        ports = outside.ports(design, choice, shown, keeper, worker)
+        kept = pictures(shown, folder, waits=outside.fast)
+        ports = replace(ports, pictures=kept, marks=shown.marks)
+        live = PlantAssembly(design, ports, _settings(design, choice, shown, outside))
+        real = outside.reader is None
+        if real and live.plant.sentinel.table.unwatched:
+            print(f"no readings for: {', '.join(live.plant.sentinel.table.unwatched)}", flush=True)
+        papers = _papers(outside, shown)
+        for local in outside.local:
+            file = local.installation.bus_key_file
+            if file is not None:
+                name = f"key of the bus of {local.installation.config.name}"
+                papers.renew(name, [file], local.installation.take_bus_keys)
+        speed = 1.0 if outside.reader is None else outside.reader.state.asked
+        async with papers.watched(live.logbook.take_alarm):
+            await at_work(live, keeper, shown, folder, ending, stows=real, speed=speed)

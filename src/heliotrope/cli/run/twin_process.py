@@ -1,0 +1,105 @@
+"""The simulated field that `heliotrope run` starts where no links are given."""
+
+import contextlib
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from heliotrope.cli.twin import READY
+from heliotrope.errors import InputError
+from heliotrope.field.plant import Plant
+from heliotrope.store.keeper import Keeper
+from heliotrope.twin.live.live import WorldOptions, true_mechanisms
+from heliotrope.twin.program.boards import BOARDS, write_boards
+from heliotrope.twin.yesterday import begin_second_day
+
+#: Time that it gets to end, s.
+_ENDING = 1.0
+_MAIN = "from heliotrope.cli import main; main()"
+
+
+@dataclass(frozen=True)
+class TwinField:
+    """A simulated field that waits for what its local controllers store.
+
+    Attributes
+    ----------
+    folder
+        Of its plant file and links file.
+    seed, measured
+        See `twin_process`.
+    """
+
+    folder: Path
+    seed: int
+    measured: int
+
+    async def begin(self, keeper: Keeper, design: Plant, start: datetime) -> None:
+        """Let the field store what the plant has kept; a new store gets yesterday's calibrations.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be read or written.
+        """
+        if self.measured:
+            truth = true_mechanisms(design, WorldOptions(self.seed))
+            await begin_second_day(
+                keeper, design, truth, start, count=self.measured, seed=self.seed
+            )
+        known = keeper.latest_calibrations(design.names).values()
+        write_boards(self.folder / BOARDS, list(known))
+
+
+@contextlib.contextmanager
+def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["TwinField"]:
+    """Run a simulated field beside a block; yield it.
+
+    Parameters
+    ----------
+    options
+        Of ``heliotrope twin``, without folder, addresses and seed.
+    seed
+        Of how the mirrors really stand.
+    measured
+        Number of mirrors that were measured yesterday, if the store has no calibration.
+
+    Raises
+    ------
+    InputError
+        If it does not begin.
+    """
+    home = Path(tempfile.mkdtemp(prefix="heliotrope-twin-"))
+    folder = home / "field"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    command = [sys.executable, "-c", _MAIN, "twin", *options, "--folder", str(folder)]
+    command += ["--seed", str(seed), "--plant", f"127.0.0.1:{port}", "--child"]
+    # In a session of its own: Ctrl-C in the terminal is the plant's.
+    process = subprocess.Popen(  # noqa: S603
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        assert process.stdout is not None
+        if process.stdout.readline().strip() != READY:
+            raise InputError("run: the simulated field has not begun; see the line before")
+        yield TwinField(folder, seed, measured)
+    finally:
+        # It ends when its standard input ends.
+        assert process.stdin is not None
+        process.stdin.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_ENDING)
+        process.kill()
+        process.wait()
+        shutil.rmtree(home, ignore_errors=True)

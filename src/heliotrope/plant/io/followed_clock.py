@@ -1,0 +1,182 @@
+"""The clock of a simulated field, which the plant that leads it follows.
+
+A simulated field may begin at another time, run faster, and slow down where its machine is too
+slow. The plant asks for the state of its clock twice a second (`ClockReader`), and its event loop
+has that time (`FollowedLoop`). Both are made from the address in a links file with ``twin``, which
+no other link may stand beside, so a plant with real links has no such clock.
+"""
+
+import asyncio
+import json
+import selectors
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from urllib.error import URLError
+from urllib.request import ProxyHandler, build_opener
+
+from heliotrope.errors import FetchError
+from heliotrope.links.clock import VirtualClock
+
+#: Time between two questions before the field is up, and later; longest wait for an answer, s.
+_SOON, _LATER, _PATIENCE = 0.05, 0.5, 5.0
+#: Time that a simulated field may take to begin, s.
+_STARTING = 30.0
+#: Time over which the true speed is measured, s.
+_SPAN = 30.0
+
+
+@dataclass(frozen=True)
+class ClockState:
+    """State of a simulated field's clock.
+
+    Attributes
+    ----------
+    wall
+        When it was read, by this machine's monotonic clock, s.
+    now, utc
+        Its monotonic time, and its UTC in POSIX seconds.
+    speed, asked
+        Its seconds per second now, and as it was asked for.
+    begun
+        Whether the field waits for its plant, or is led by it.
+    """
+
+    wall: float
+    now: float
+    utc: float
+    speed: float
+    asked: float
+    begun: bool
+
+    def at(self, wall: float) -> float:
+        """Return its monotonic time at another instant of this machine."""
+        return self.now + self.speed * (wall - self.wall)
+
+
+class ClockReader:
+    """Reads the state of a simulated field's clock in a thread.
+
+    Parameters
+    ----------
+    address
+        As the links file names it.
+
+    Attributes
+    ----------
+    state
+        The last one.
+
+    Raises
+    ------
+    FetchError
+        If the simulated field does not answer.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        # A proxy of the environment is for other machines.
+        self._opener = build_opener(ProxyHandler({}))
+        self._states: deque[ClockState] = deque(maxlen=int(_SPAN / _LATER))
+        self._stop = threading.Event()
+        self.state = self._first()
+        self._thread = threading.Thread(target=self._run, name="clock of the field", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._stop.set()
+
+    def clock(self, loop: asyncio.AbstractEventLoop) -> VirtualClock:
+        """Return the field's clock, by the time of a `FollowedLoop`."""
+        now, state = loop.time(), self.state
+        return VirtualClock(loop.time, datetime.fromtimestamp(state.utc + now - state.now, UTC))
+
+    @property
+    def pace(self) -> float:
+        """Simulated seconds per second over the last half minute."""
+        first, last = self._states[0], self.state
+        span = last.wall - first.wall
+        return (last.now - first.now) / span if span > 1.0 else last.speed
+
+    def fetch(self, path: str) -> bytes:
+        """Return what the simulated field serves.
+
+        Raises
+        ------
+        FetchError
+            If it does not answer.
+        """
+        try:
+            with self._opener.open(f"{self._address}/{path}", timeout=_PATIENCE) as answer:
+                return bytes(answer.read())
+        except (OSError, URLError) as error:
+            raise FetchError(
+                f"simulated field: no answer ({error}); start it again with heliotrope twin"
+            ) from None
+
+    def _first(self) -> ClockState:
+        """Return the first state; the simulated field may have just been started."""
+        until = time.monotonic() + _STARTING
+        while True:
+            try:
+                return self._read()
+            except FetchError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(_SOON)
+
+    def _read(self) -> ClockState:
+        begun = time.monotonic()
+        found = json.loads(self.fetch("clock"))
+        state = ClockState(0.5 * (begun + time.monotonic()), **found)
+        self._states.append(state)
+        return state
+
+    def _run(self) -> None:
+        while not self._stop.wait(_LATER if self.state.begun else _SOON):
+            try:
+                self.state = self._read()
+            except (FetchError, ValueError):
+                continue
+
+
+class _Followed(selectors.DefaultSelector):
+    """Waits for files and for the time of another clock."""
+
+    def __init__(self, reader: ClockReader) -> None:
+        super().__init__()
+        self.reader, self.now = reader, reader.state.now
+
+    def turn(self) -> float:
+        """Return the time; it never runs backwards."""
+        self.now = max(self.now, self.reader.state.at(time.monotonic()))
+        return self.now
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout is None:
+            return list(super().select(None))
+        speed = self.reader.state.speed
+        wait = timeout / speed if speed > 0.0 else _SOON
+        # The speed may change while it waits.
+        return list(super().select(max(0.0, min(wait, _LATER)) if timeout > 0.0 else 0.0))
+
+
+class FollowedLoop(asyncio.SelectorEventLoop):
+    """An event loop with the time of a simulated field.
+
+    Parameters
+    ----------
+    reader
+        Of the field's clock.
+    """
+
+    def __init__(self, reader: ClockReader) -> None:
+        self._followed = _Followed(reader)
+        super().__init__(self._followed)
+
+    def time(self) -> float:
+        """Return the field's time, s."""
+        return self._followed.turn()

@@ -1,0 +1,12 @@
+"""A simulated field as a program of its own, reached as a real one is.
+
+`write_folder` writes what a plant needs to reach it: plant file, links file, keys. `TwinProgram`
+runs field, boards and clusters, which connect to the plant over TCP, and serves photographs, the
+state of its clock and the true errors over HTTP. `heliotrope twin` starts it, and `heliotrope run`
+starts one where no links are given.
+"""
+
+from heliotrope.twin.program.folder import LINKS, PLANT, TwinFolder, write_folder
+from heliotrope.twin.program.program import TwinOptions, TwinProgram
+
+__all__ = ["LINKS", "PLANT", "TwinFolder", "TwinOptions", "TwinProgram", "write_folder"]

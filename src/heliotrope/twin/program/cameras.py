@@ -1,0 +1,87 @@
+"""The cameras of a simulated field, which are asked for photographs as real ones are."""
+
+import asyncio
+import itertools
+
+import numpy as np
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.synthetic.scenes import Scene
+from heliotrope.twin.drawing import Drawer, Exposure, Optics
+from heliotrope.twin.live import World
+
+#: Longest wait for the event loop, s.
+_PATIENCE = 10.0
+
+
+class TwinCameras:
+    """Photographs of a world's targets, drawn in a process of their own.
+
+    Parameters
+    ----------
+    world
+        The world.
+    loop
+        Its event loop.
+    seed
+        Of the sensors' noise.
+
+    Raises
+    ------
+    InputError
+        A camera without a position.
+    """
+
+    def __init__(self, world: World, loop: asyncio.AbstractEventLoop, seed: int) -> None:
+        self._world, self._loop = world, loop
+        self._chance, self._numbers = np.random.default_rng(seed), itertools.count(1)
+        self._drawer, self._scenes = Drawer(), dict[str, Scene]()
+        surfaces = {target.name: target for target in (*world.design.targets, *world.faces)}
+        visits = world.design.receiver_visits
+        for camera in world.design.cameras:
+            names = set(camera.targets or (target.name for target in world.design.targets))
+            if visits is not None and visits.camera == camera.name:
+                names.add(visits.receiver)
+            seen = tuple(surface for name, surface in surfaces.items() if name in names)
+            if seen and camera.position is None:
+                raise InputError(f"camera {camera.name}: no position; give it in the plant file")
+            if seen:
+                self._scenes[camera.name] = Scene(camera, seen)
+
+    def start(self) -> None:
+        """Begin the process that draws."""
+        if self._scenes:
+            self._drawer.start()
+
+    def close(self) -> None:
+        """End it."""
+        self._drawer.close()
+
+    def photograph(self, name: str) -> Frame:
+        """Return a photograph by a camera, exposed now; to be called in a thread.
+
+        Raises
+        ------
+        FetchError
+            The process that draws has died.
+        UnknownNameError
+            There is no such camera.
+        """
+        if name not in self._scenes:
+            raise UnknownNameError("camera", name, list(self._scenes))
+        exposing = asyncio.run_coroutine_threadsafe(self._expose(name), self._loop)
+        return self._drawer.draw(exposing.result(_PATIENCE))
+
+    async def _expose(self, name: str) -> Exposure:
+        world, number = self._world, next(self._numbers)
+        return Exposure(
+            self._scenes[name],
+            tuple(world.mirrors()),
+            world.sun(),
+            # Malan's small mirrors are of one piece.
+            Optics(facets=(1, 1)),
+            int(self._chance.integers(1 << 32)),
+            f"{name} {number}",
+            world.clock.utc(),
+        )

@@ -1,0 +1,103 @@
+"""The folder by which a plant reaches a simulated field: plant file, links file, keys, sensors."""
+
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from urllib.parse import quote
+
+import tomli_w
+
+from heliotrope.errors import InputError
+from heliotrope.field.formats.plant_file import write_plant
+from heliotrope.field.plant import Plant
+from heliotrope.links.keys import KeyFile
+from heliotrope.plant.settings import clusters_of
+from heliotrope.safety import FLUX_READING
+
+#: Names of the files in the folder.
+PLANT, LINKS, KEYS, FLUX = "plant.toml", "links.toml", "keys.toml", f"{FLUX_READING}.txt"
+
+
+@dataclass(frozen=True)
+class TwinFolder:
+    """The files of a simulated field, and the addresses in them.
+
+    Attributes
+    ----------
+    folder
+        Where they stand.
+    keys
+        Key of each cluster.
+    plant
+        Host and port at which the plant listens to clusters.
+    serves
+        Host and port of the simulated field's own server.
+    secret
+        Part of the addresses of that server, which others on the machine cannot guess.
+    """
+
+    folder: Path
+    keys: Mapping[str, bytes]
+    plant: tuple[str, int]
+    serves: tuple[str, int]
+    secret: str
+
+
+def write_folder(
+    design: Plant,
+    folder: Path,
+    plant: tuple[str, int],
+    serves: tuple[str, int],
+    *,
+    steps_every: int,
+) -> TwinFolder:
+    """Write plant file, links file and keys of a simulated field into a folder of its own.
+
+    Parameters
+    ----------
+    design
+        The plant; cameras get the addresses of the simulated field.
+    folder
+        It must not hold another simulated field.
+    plant, serves
+        Host and port at which the plant listens to clusters, and of the field's own server.
+    steps_every
+        Time between requests for step counts, s.
+
+    Raises
+    ------
+    InputError
+        If the folder holds such files already, or a plant without clusters.
+    """
+    for name in (PLANT, LINKS, KEYS):
+        if (folder / name).exists():
+            raise InputError(f"{folder / name}: it exists; give another folder, or delete it")
+    homes = clusters_of(design)
+    secret = secrets.token_urlsafe(24)
+    base = _address(serves, secret)
+    cameras = tuple(
+        replace(camera, source=f"{base}/cameras/{quote(camera.name, safe='')}.png")
+        for camera in design.cameras
+    )
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    write_plant(replace(design, cameras=cameras), folder / PLANT, table="parquet")
+    keys = KeyFile(folder / KEYS).new(list(homes))
+    document = {
+        "format": "heliotrope-links",
+        "version": 1,
+        "keys": KEYS,
+        "twin": base,
+        "tcp": {"listen": f"{plant[0]}:{plant[1]}"},
+        "polling": {"steps_every_s": steps_every},
+        "witness": {"none": True},
+        "sensors": {FLUX_READING: FLUX} if design.receivers else {},
+        "clusters": dict.fromkeys(homes, "tcp"),
+    }
+    (folder / LINKS).write_text(tomli_w.dumps(document), encoding="utf-8")
+    return TwinFolder(folder, keys, plant, serves, secret)
+
+
+def _address(serves: tuple[str, int], secret: str) -> str:
+    host = f"[{serves[0]}]" if ":" in serves[0] else serves[0]
+    return f"http://{host}:{serves[1]}/{secret}"

@@ -1,0 +1,198 @@
+"""The program of a simulated field: its clock, its clusters, and what it serves."""
+
+import asyncio
+import time
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from heliotrope.errors import FetchError
+from heliotrope.field.plant import Plant
+from heliotrope.imaging.frame import Frame
+from heliotrope.links.clock import Clock, SystemClock, VirtualClock
+from heliotrope.links.connection import CarriedLink
+from heliotrope.links.link import LinkSettings
+from heliotrope.links.tcp import tcp_link
+from heliotrope.twin.live import PacedLoop, World, WorldOptions
+from heliotrope.twin.program.boards import BOARDS, read_boards
+from heliotrope.twin.program.cameras import TwinCameras
+from heliotrope.twin.program.folder import FLUX, TwinFolder
+from heliotrope.twin.program.server import TwinServer
+
+#: Share of the speed at which time goes on while a lease of the plant is shorter than this, s.
+_SLOW, _SHORT = 0.2, 1.5
+#: Wall time between checks of the leases, s.
+_CHECKED = 0.1
+#: Clusters call a plant that begins beside them soon again.
+_LINK = LinkSettings(longest_pause=0.2)
+#: Time between values of the sensors, s.
+_SENSED = 1.0
+
+
+@dataclass(frozen=True)
+class TwinOptions:
+    """Options of a simulated field as a program.
+
+    Attributes
+    ----------
+    start
+        Its time at the beginning; None: it follows this machine's clock, as a real field does.
+    speed
+        Simulated seconds per second; only with ``start``.
+    seed
+        Of how the mirrors really stand, and of all noise.
+    boards
+        Whether each heliostat is a firmware-true board; for small plants.
+    up
+        Whether the heliostats track as soon as the plant leads them; else they begin at stow.
+    waits
+        Whether it waits for the file of what its local controllers store; see `write_boards`.
+    """
+
+    start: datetime | None = None
+    speed: float = 1.0
+    seed: int = 0
+    boards: bool = False
+    up: bool = False
+    waits: bool = False
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What is made once the local controllers are known."""
+
+    world: World
+    cameras: TwinCameras
+
+
+class TwinProgram:
+    """A simulated field whose clusters connect to a plant over TCP.
+
+    Parameters
+    ----------
+    design
+        The plant; see `twin.live.World`.
+    files
+        Its folder and addresses.
+    options
+        See `TwinOptions`.
+    """
+
+    def __init__(self, design: Plant, files: TwinFolder, options: TwinOptions) -> None:
+        self._design, self._files, self._options = design, files, options
+        self._begun = False
+        self._parts: _Parts | None = None
+
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """Return a new event loop for it."""
+        if self._options.start is None:
+            return asyncio.SelectorEventLoop()
+        return PacedLoop(self._options.speed)
+
+    async def run(self, ending: asyncio.Event) -> None:
+        """Run until ``ending`` is set."""
+        loop = asyncio.get_running_loop()
+        paced = loop if isinstance(loop, PacedLoop) else None
+        start = self._options.start
+        clock: Clock = SystemClock()
+        if start is not None:
+            clock = VirtualClock(loop.time, start)
+
+        def link(name: str) -> CarriedLink:
+            return tcp_link(*self._files.plant, name, self._files.keys[name], clock, _LINK)
+
+        files = self._files
+        server = TwinServer(
+            files.serves,
+            files.secret,
+            lambda: self._clock(clock, paced),
+            loop,
+            self._photograph,
+            lambda: self._built().world.errors().tobytes(),
+        )
+        server.start()
+        try:
+            design = await self._stored(ending)
+            if ending.is_set():
+                return
+            options = WorldOptions(
+                self._options.seed, boards=self._options.boards, up=self._options.up, link=link
+            )
+            world = World(design, clock, options)
+            cameras = TwinCameras(world, loop, self._options.seed)
+            self._parts = _Parts(world, cameras)
+            cameras.start()
+            async with world.running(), asyncio.TaskGroup() as group:
+                tasks = [group.create_task(self._sense(world))]
+                self._begun = True
+                if paced is not None:
+                    tasks.append(group.create_task(self._pace(world, paced)))
+                await ending.wait()
+                for task in tasks:
+                    task.cancel()
+        finally:
+            server.close()
+            if self._parts is not None:
+                self._parts.cameras.close()
+
+    async def _stored(self, ending: asyncio.Event) -> Plant:
+        """Return the plant with what its local controllers store."""
+        path = self._files.folder / BOARDS
+        if not self._options.waits:
+            return self._design
+        while not (ending.is_set() or path.exists()):
+            await asyncio.to_thread(time.sleep, _CHECKED)
+        return self._design if ending.is_set() else read_boards(path, self._design)
+
+    def _photograph(self, camera: str) -> Frame:
+        return self._built().cameras.photograph(camera)
+
+    def _built(self) -> "_Parts":
+        if self._parts is None:
+            raise FetchError("the simulated field has not begun")
+        return self._parts
+
+    async def _pace(self, world: World, loop: PacedLoop) -> None:
+        """Slow the time down while the plant is late, so that it loses no heliostat by that.
+
+        Where the machine is too slow, everything takes longer, and nothing is lost. A plant that
+        leads no cluster any more has ended.
+        """
+        led = False
+        while True:
+            left = [cluster.lease_left for cluster in world.clusters]
+            led |= min(left) > 0.0
+            short = min(left) < _SHORT and (not led or max(left) > 0.0)
+            speed = self._options.speed * (_SLOW if short else 1.0)
+            if speed != loop.speed:
+                loop.speed = speed
+            # Wall time: the loop's own is what is slowed down.
+            await asyncio.to_thread(time.sleep, _CHECKED)
+
+    def _clock(self, clock: Clock, paced: PacedLoop | None) -> dict[str, Any]:
+        """Return the state of the clock: monotonic s, UTC, speed, and whether the field is up."""
+        now = clock.monotonic()
+        return {
+            "now": now,
+            "utc": clock.utc().timestamp(),
+            "speed": 1.0 if paced is None else paced.speed,
+            "asked": self._options.speed,
+            "begun": self._begun,
+        }
+
+    async def _sense(self, world: World) -> None:
+        """Write the values of the sensors into their files."""
+        if world.flux is None:
+            return
+        path = self._files.folder / FLUX
+        while True:
+            share = world.flux.share()
+            await asyncio.to_thread(_replace, path, f"{share:.5f}\n")
+            await asyncio.sleep(_SENSED)
+
+
+def _replace(path: Path, text: str) -> None:
+    new = path.with_suffix(".new")
+    new.write_text(text, encoding="ascii")
+    new.replace(path)

@@ -1,0 +1,108 @@
+"""What a simulated field serves over HTTP: photographs, the state of its clock, true errors.
+
+The standard library's server answers each request in a thread; what concerns the field is asked in
+the field's event loop. Photographs are drawn in a process of their own (`drawing.Drawer`).
+"""
+
+import asyncio
+import json
+import threading
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import unquote
+
+from heliotrope.errors import HeliotropeError
+from heliotrope.imaging.files import encode_image
+from heliotrope.imaging.frame import Frame
+
+#: Longest wait for an answer of the loop, s.
+_PATIENCE = 20.0
+
+
+class _Server(ThreadingHTTPServer):
+    allow_reuse_address = daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing: a plant that ends has asked for what it does not take."""
+
+
+class TwinServer:
+    """The server of a simulated field.
+
+    Parameters
+    ----------
+    serves
+        Host and port.
+    secret
+        First part of every path; other paths are not found.
+    clock
+        Returns the state of the clock; it is called in any thread.
+    loop
+        The field's event loop.
+    photograph
+        Takes a photograph by a camera, by name; called in a thread.
+    errors
+        Returns the true errors; called in the loop.
+    """
+
+    def __init__(
+        self,
+        serves: tuple[str, int],
+        secret: str,
+        clock: Callable[[], dict[str, Any]],
+        loop: asyncio.AbstractEventLoop,
+        photograph: Callable[[str], Frame],
+        errors: Callable[[], bytes],
+    ) -> None:
+        def answer(path: str) -> tuple[int, str, bytes]:
+            parts = path.strip("/").split("/")
+            if parts[0] != secret:
+                return 404, "text/plain", b"there is nothing here\n"
+            match parts[1:]:
+                case ["clock"]:
+                    return 200, "application/json", json.dumps(clock()).encode()
+                case ["errors"]:
+                    return 200, "application/octet-stream", _asked(loop, errors)
+                case ["cameras", name] if name.endswith(".png"):
+                    try:
+                        frame = photograph(unquote(name[: -len(".png")]))
+                    except HeliotropeError as error:
+                        return 503, "text/plain", f"{error}\n".encode()
+                    return 200, "image/png", encode_image(frame, ".png")
+            return 404, "text/plain", b"there is nothing here\n"
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def do_GET(self) -> None:
+                code, kind, body = answer(self.path)
+                self.send_response(code)
+                self.send_header("Content-Type", kind)
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+
+            def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
+                """Write nothing: a camera is asked each second."""
+
+        self._server = _Server(serves, Handler)
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+
+    def start(self) -> None:
+        """Begin to answer."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End."""
+        self._server.shutdown()
+        self._server.server_close()
+
+
+def _asked(loop: asyncio.AbstractEventLoop, function: Callable[[], bytes]) -> bytes:
+    """Return what a function returns that is called in the loop."""
+
+    async def call() -> bytes:
+        return function()
+
+    return asyncio.run_coroutine_threadsafe(call(), loop).result(_PATIENCE)

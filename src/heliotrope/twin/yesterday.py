@@ -1,0 +1,411 @@
+"""Yesterday's calibrations of a simulated field: what its plant would have measured and fitted.
+
+A simulated plant may begin in its second day of commissioning. Here the first day is made in a
+second, without running it: the true mirrors throw the beams of yesterday's suns on the targets,
+centroids have the noise that the visits state, and the plant's estimator fits all mirrors at once.
+The errors of these calibrations are therefore those that their covariances predict, if the true
+mirrors differ from the plant file as the priors say.
+
+The mirrors nearest to a target are visited first, as the schedule does in a new field: a search for
+a beam takes least time there. When all have been visited once, the first of them are visited again.
+Drives do not drift overnight, though the plant allows for it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, time, timedelta
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope import sun as solar
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.fit.estimator import FitOutcome, fit
+from heliotrope.calibration.growth import default_growth
+from heliotrope.calibration.plan.planning import aim_at
+from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
+from heliotrope.calibration.sightings import Sightings, camera_target
+from heliotrope.calibration.uncertainty import expected_error
+from heliotrope.errors import InputError
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, reflect, tangent_axes
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.tracking import track
+from heliotrope.plant.field.aims import default_aims
+from heliotrope.plant.schedule.settings import Settings
+from heliotrope.plant.visits.fitting import first_model
+from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.store.records import CampaignEntry, Records, VisitEntry
+from heliotrope.twin.live.live import CYCLE
+
+#: Default number of mirrors that were measured, and the share of them that was visited twice.
+COUNT, AGAIN = 1500, 0.5
+#: Name of the campaign in the store, and the remark at each calibration.
+CAMPAIGN = "yesterday"
+NOTE = "simulated: computed when the run began, from photographs that nobody took"
+#: Variance of a centroid in the plane of its target, m².
+CENTROID = 1e-5
+#: Share of a target's width and height over which the photographs of a visit spread the beam.
+_SPREAD = 0.5
+
+Rows = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Yesterday:
+    """A day of visits to targets.
+
+    Attributes
+    ----------
+    names
+        The heliostats of the plant, to which the rows of the sightings point.
+    sightings, targets
+        The M sightings, and the name of the target of each, (M,).
+    calibrations
+        One for each visit, older versions before newer ones; their sightings are rows of
+        ``sightings``.
+    visits
+        The visits, by time.
+    """
+
+    names: tuple[str, ...]
+    sightings: Sightings
+    targets: npt.NDArray[np.str_]
+    calibrations: tuple[HeliostatCalibration, ...]
+    visits: tuple[VisitEntry, ...]
+
+    async def keep(self, records: Records) -> None:
+        """Keep the day in a store, as a plant keeps its own.
+
+        Raises
+        ------
+        InputError
+            If the store has calibrations of these heliostats.
+        StoreError
+            If the store cannot be written.
+        """
+        numbers = np.zeros(len(self.sightings), np.int64)
+        for target in np.unique(self.targets).tolist():
+            rows = np.flatnonzero(self.targets == target)
+            some = self.sightings.take(rows)
+            numbers[rows] = records.record_sightings(
+                self.names, some, target=target, campaign=CAMPAIGN
+            )
+        for record in self.calibrations:
+            records.record_calibration(replace(record, sightings=numbers[record.sightings]))
+        for visit in self.visits:
+            records.record_visit(visit)
+        if self.visits:
+            first, last = self.visits[0].begun, self.visits[-1].finished
+            model = self.calibrations[0].model
+            records.record_campaign(CampaignEntry(CAMPAIGN, first, last, model, NOTE))
+        await records.confirm()
+
+
+@dataclass(frozen=True)
+class StoredParameters:
+    """Parameters of K heliostats by name, each (K,); a `mechanism.chain.Calibrated`."""
+
+    heliostats: tuple[str, ...]
+    parameters: Mapping[str, FloatArray]
+
+
+async def begin_second_day(
+    records: Records,
+    design: Plant,
+    truth: Mechanism,
+    start: datetime,
+    *,
+    count: int = COUNT,
+    seed: int = 0,
+) -> Plant:
+    """Keep yesterday in a new store, and return the plant with the calibrations of its store.
+
+    A world of that plant has local controllers that store these calibrations; the plant's program,
+    with the design and the store as they are, recalls the same ones. A store that has calibrations
+    already gets no others.
+
+    Parameters
+    ----------
+    records
+        The store.
+    design, truth, start, count, seed
+        See `measure_yesterday`.
+
+    Raises
+    ------
+    InputError
+        See `measure_yesterday`.
+    StoreError
+        If the store cannot be written.
+    """
+    if not records.latest_calibrations(design.names):
+        day = measure_yesterday(design, truth, start, count=count, seed=seed)
+        await day.keep(records)
+    return with_records(design, list(records.latest_calibrations(design.names).values()))
+
+
+def with_records(design: Plant, records: Sequence[HeliostatCalibration]) -> Plant:
+    """Return a plant whose heliostats have the parameters of calibrations, at most one for each."""
+    for stored in by_model(records):
+        design = design.with_calibration(stored)
+    return design
+
+
+def by_model(records: Sequence[HeliostatCalibration]) -> list[StoredParameters]:
+    """Return the parameters of calibrations, those with the same parameters together."""
+    models: dict[tuple[str, ...], list[HeliostatCalibration]] = {}
+    for record in records:
+        models.setdefault(record.names, []).append(record)
+    return [
+        StoredParameters(
+            tuple(record.heliostat for record in members),
+            dict(zip(names, np.stack([r.values for r in members], axis=1), strict=True)),
+        )
+        for names, members in models.items()
+    ]
+
+
+def measure_yesterday(
+    design: Plant,
+    truth: Mechanism,
+    start: datetime,
+    *,
+    count: int = COUNT,
+    seed: int = 0,
+    cycle: CycleSettings = CYCLE,
+) -> Yesterday:
+    """Return the visits of the day before a start, and the calibrations that they brought.
+
+    Parameters
+    ----------
+    design, truth
+        The plant, and its true mechanisms in the order of ``design.names``, (N,).
+    start
+        Aware time of the present day.
+    count
+        Number of heliostats to be measured. A visit is left out where no target can be served.
+    seed
+        Seed of the noise.
+    cycle
+        Photographs of a visit, their noise and the model.
+
+    Raises
+    ------
+    InputError
+        A count below 0, or a plant without a target.
+    """
+    if count < 0 or not design.targets:
+        raise InputError(
+            f"yesterday: {count} heliostats on {len(design.targets)} targets; give 0 or more "
+            "heliostats, and a plant with a target"
+        )
+    rows, begun = _timetable(design, start, count)
+    made, targets = _photographed(design, truth, rows, begun, cycle, np.random.default_rng(seed))
+    # Rows of the sightings of each visit, (V, shots); first visits come before second ones.
+    shots = np.arange(len(made)).reshape(-1, cycle.shots)
+    visited = made.heliostat[shots[:, 0]]
+    once = np.unique(visited, return_index=True)[1]
+    again = np.setdiff1d(np.arange(len(visited)), once)
+    earlier = once[np.searchsorted(visited[once], visited[again])]
+    passes = (shots[once], np.concatenate([shots[earlier], shots[again]], axis=1))
+    found: list[tuple[HeliostatCalibration, VisitEntry]] = []
+    offset = 0
+    for group in design.groups.values():
+        work, span = _Fits(design, group, offset, cycle), range(offset, offset + len(group))
+        for used in passes:
+            mine = used[np.isin(made.heliostat[used[:, 0]], span)]
+            found += work.fit(made, targets, mine) if len(mine) else []
+        offset += len(group)
+    visits = sorted((visit for _, visit in found), key=lambda visit: visit.begun)
+    records = tuple(record for record, _ in found)
+    return Yesterday(design.names, made, targets, records, tuple(visits))
+
+
+def _timetable(design: Plant, start: datetime, count: int) -> tuple[Rows, FloatArray]:
+    """Return the heliostats of all visits, (V,), and when these begin, POSIX s, (V,)."""
+    centers = np.stack([target.center for target in design.targets])
+    away = np.linalg.norm(design.position[:, None] - centers, axis=-1).min(axis=1)
+    order = np.argsort(away, kind="stable")[:count].astype(np.intp)
+    day = solar.solar_day(start, design.site) - timedelta(days=1)
+    noon = datetime.combine(day, time(12), UTC).timestamp() - 240.0 * design.site.longitude_deg
+    minutes = noon + 60.0 * np.arange(-720, 720)
+    lowest = Settings().limits.min_elevation
+    light = minutes[solar.position(minutes, design.site).elevation >= lowest]
+    if not len(light):
+        return order[:0], np.zeros(0)
+    rows = np.concatenate([order, order[: round(AGAIN * len(order))]])
+    return rows, light[0] + np.ptp(light) * (np.arange(len(rows)) + 0.5) / max(len(rows), 1)
+
+
+def _photographed(
+    design: Plant,
+    truth: Mechanism,
+    rows: Rows,
+    begun: FloatArray,
+    cycle: CycleSettings,
+    rng: np.random.Generator,
+) -> tuple[Sightings, npt.NDArray[np.str_]]:
+    """Return the sightings of those visits that a target allows, visit after visit; their targets.
+
+    Each mirror goes to the target that its beam meets most squarely.
+    """
+    moments = begun[:, None] + cycle.interval * np.arange(1, cycle.shots + 1)
+    suns = solar.vector(moments.ravel(), design.site).reshape(*moments.shape, 3)
+    limits, mirrors = Settings().limits, truth[rows]
+    aimed = [aim_at(mirrors, suns[:, 0], target, limits) for target in design.targets]
+    slope = np.stack([np.where(each.able, each.obliquity, np.inf) for each in aimed])
+    best = np.argmin(slope, axis=0)
+    counts, spots = np.zeros((*moments.shape, 2)), np.full(suns.shape, np.nan)
+    covariance = np.zeros((*moments.shape, 3, 3))
+    for t, target in enumerate(design.targets):
+        here = np.flatnonzero((best == t) & np.isfinite(slope[t]))
+        counts[here], spots[here] = _thrown(mirrors[here], suns[here], target, cycle.sigma, rng)
+        covariance[here] = CENTROID * target.axes.T @ target.axes
+    seen = np.isfinite(spots).all(axis=(1, 2))
+    made = camera_target(
+        np.repeat(rows[seen], cycle.shots),
+        counts[seen].reshape(-1, 2),
+        suns[seen].reshape(-1, 3),
+        spots[seen].reshape(-1, 3),
+        time=moments[seen].ravel(),
+        sigma=cycle.sigma,
+        centroid_covariance=covariance[seen].reshape(-1, 3, 3),
+    )
+    names = np.array([target.name for target in design.targets])
+    return made, np.repeat(names[best[seen]], cycle.shots)
+
+
+def _thrown(
+    truth: Mechanism, suns: FloatArray, target: Target, sigma: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return step counts (V, S, 2) and measured centroids (V, S, 3) of V mirrors on a target.
+
+    Parameters
+    ----------
+    truth
+        True mechanisms, (V,); each is aimed at a place of its own for each photograph.
+    suns
+        Unit vectors to the sun, (V, S, 3).
+    target, sigma, rng
+        The target, the standard deviation of a beam, rad, and the source of the noise.
+    """
+    count, shots = suns.shape[:2]
+    mirrors, sun = truth[np.repeat(np.arange(count), shots)], suns.reshape(-1, 3)
+    plane = rng.uniform(-0.5, 0.5, (len(sun), 2)) * _SPREAD * (target.width, target.height)
+    counts = np.round(track(mirrors, sun, target.point(plane)).best_counts)
+    pose = mirrors.pose(counts)
+    ray = reflect(sun, pose.normal)
+    ray = ray + np.einsum("ma,mak->mk", rng.normal(0.0, sigma, (len(sun), 2)), tangent_axes(ray))
+    spot = target.intersect(pose.vertex, ray)
+    spot = spot + rng.normal(0.0, np.sqrt(CENTROID), (len(sun), 2)) @ target.axes
+    return counts.reshape(count, shots, 2), spot.reshape(count, shots, 3)
+
+
+class _Fits:
+    """Fits of the heliostats of a group, one visit of each after another.
+
+    Parameters
+    ----------
+    design, group, offset
+        The plant, one of its groups, and the row of its first heliostat.
+    cycle
+        Settings of a visit.
+    """
+
+    def __init__(self, design: Plant, group: Heliostats, offset: int, cycle: CycleSettings) -> None:
+        self._design, self._offset, self._cycle = design, offset, cycle
+        self._model = first_model(cycle, group.mechanism)
+        self._growth = default_growth(group.mechanism)
+        #: The group as it is believed, the covariance of its parameters, and the visits of each.
+        size = len(self._model.parameters)
+        self._group, self._visits = group, 0
+        self._covariance = np.full((len(group), size, size), np.nan)
+
+    def fit(
+        self, made: Sightings, targets: npt.NDArray[np.str_], used: Rows
+    ) -> list[tuple[HeliostatCalibration, VisitEntry]]:
+        """Return the calibrations of K heliostats, and the last visit of each.
+
+        A fit that does not converge is left out.
+
+        Parameters
+        ----------
+        made, targets
+            All sightings, and the name of the target of each, (M,).
+        used
+            Rows of the sightings of each heliostat, by time, (K, S).
+        """
+        group, (count, size) = self._group, used.shape
+        rows = made.heliostat[used[:, 0]] - self._offset
+        nominal, names = group.mechanism[rows], tuple(group.names[row] for row in rows)
+        seen = made.take(used.ravel()).renumbered(np.repeat(np.arange(count), size))
+        # The noise is known, and no photograph is a mistake.
+        fitted = fit(nominal, seen, self._model.parameters, loss="square", adapt_scale=False)
+        fitted = replace(fitted, heliostats=names)
+        present, new = group.calibrated[rows], nominal.with_parameters(fitted.parameters)
+        errors = [beam_errors(mechanism, seen) for mechanism in (nominal, present, new)]
+        offsets = [error.offset.reshape(count, size, 2) for error in errors]
+        missed = [
+            np.sqrt(np.mean(error.beam.reshape(count, size) ** 2, axis=1)).tolist()
+            for error in errors
+        ]
+        suns = made.source[used[:, -1]]
+        before = self._predicted(present, rows, self._covariance[rows], suns)
+        after = self._predicted(new, rows, fitted.covariance, suns)
+        self._group, self._covariance[rows] = group.with_calibration(fitted), fitted.covariance
+        self._visits += 1
+        shots, interval = self._cycle.shots, self._cycle.interval
+        found = []
+        for k in np.flatnonzero(fitted.outcome == FitOutcome.CONVERGED).tolist():
+            at = float(made.time[used[k, -1]]) + interval
+            record = HeliostatCalibration(
+                names[k],
+                at,
+                fitted.names,
+                fitted.values[k],
+                fitted.covariance[k],
+                fitted.prior[k],
+                missed[0][k],
+                missed[2][k],
+                float(fitted.scale[k]),
+                sightings=used[k],
+                residual_before=offsets[0][k],
+                residual_after=offsets[2][k],
+                model=self._model.name,
+                campaign=CAMPAIGN,
+                note=NOTE,
+                version=self._visits,
+                growth=self._growth,
+            )
+            better = f"beam error {1e3 * missed[1][k]:.2f} to {1e3 * missed[2][k]:.2f} mrad RMS"
+            visit = VisitEntry(
+                names[k],
+                str(targets[used[k, -1]]),
+                float(made.time[used[k, -shots]]) - interval,
+                at,
+                CalibrationOutcome.CALIBRATED,
+                f"calibrated: {better} over {size} sightings (simulated)",
+                sigma_before=before[k],
+                sigma_after=after[k],
+                error_before=missed[1][k],
+                error_after=missed[2][k],
+                sightings=shots,
+                version=self._visits,
+                campaign=CAMPAIGN,
+            )
+            found.append((record, visit))
+        return found
+
+    def _predicted(
+        self, mechanism: Mechanism, rows: Rows, covariance: FloatArray, suns: FloatArray
+    ) -> list[float]:
+        """Return the predicted errors of K normals at their aims, rad; NaN where none is known."""
+        names = [self._group.names[row] for row in rows]
+        given = default_aims(self._design, names, self._group.position[rows], None)
+        aims = np.stack([given[name] for name in names])
+        expected = expected_error(mechanism, self._model.parameters, covariance, suns, aims)
+        predicted: list[float] = (0.5 * expected.rms).tolist()
+        return predicted
