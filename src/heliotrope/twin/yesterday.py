@@ -96,11 +96,11 @@ class Yesterday:
         for record in self.calibrations:
             records.record_calibration(replace(record, sightings=numbers[record.sightings]))
         for visit in self.visits:
-            records.record_visit(visit)
+            records.record(visit)
         if self.visits:
             first, last = self.visits[0].begun, self.visits[-1].finished
             model = self.calibrations[0].model
-            records.record_campaign(CampaignEntry(CAMPAIGN, first, last, model, NOTE))
+            records.record(CampaignEntry(CAMPAIGN, first, last, model, NOTE))
         await records.confirm()
 
 
