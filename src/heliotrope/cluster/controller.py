@@ -152,6 +152,11 @@ class Cluster:
         self.cycle = 0.0
 
     @property
+    def connected(self) -> bool:
+        """Whether the link to the plant is connected."""
+        return self._plant.connected
+
+    @property
     def lease_left(self) -> float:
         """Remaining time of the plant's lease, s; below 0: no plant leads it."""
         return self._watch.lease_left(self._clock.monotonic())

@@ -121,7 +121,7 @@ class JointSettings(CodedSettings):
     )
     again: float = _number(2.5, "photographs at most, over those that a visit needs", 1)
     brightest: float = _number(10.0, "most light on a target", 0, unit="suns", above=True)
-    first: int = _number(31, "heliostats without a calibration at once; 0: each goes alone", 0, 127)
+    first: int = _number(15, "heliostats without a calibration at once; 0: each goes alone", 0, 127)
     first_movement: float = _number(
         2.0, "coded movement of their beams, either way to the right", 0, 5, "mrad", above=True
     )

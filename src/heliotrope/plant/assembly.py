@@ -243,9 +243,12 @@ class PlantAssembly:
             async with (
                 self.ports.beside(),
                 running(self.plant),
-                running(self.operations),
-                asyncio.TaskGroup() as group,
+                contextlib.AsyncExitStack() as later,
             ):
+                if self.ports.ready is not None:
+                    await self.ports.ready()
+                await later.enter_async_context(running(self.operations))
+                group = await later.enter_async_context(asyncio.TaskGroup())
                 tasks = []
                 if cameras is not None:
                     tasks.append(group.create_task(self._look(cameras)))

@@ -5,7 +5,7 @@ only in the `Ports` that are passed in: links to clusters, cameras, sensors, a c
 records.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -138,6 +138,8 @@ class Ports:
     beside
         Makes the programs that begin before the plant and run beside it: links, clusters of this
         machine, a simulated field.
+    ready
+        Waits until operations may begin: a simulated field is led by then.
     truth
         Returns the true tracking error of each heliostat, rad, (N,), in the order of the plant's
         field; None where it is unknown, as in every real plant.
@@ -163,6 +165,7 @@ class Ports:
     beside: Callable[[], AbstractAsyncContextManager[object]] = field(
         default=nullcontext, kw_only=True
     )
+    ready: Callable[[], Awaitable[None]] | None = field(default=None, kw_only=True)
     truth: Callable[[], FloatArray] | None = field(default=None, kw_only=True)
     learner: Learner | None = field(default=None, kw_only=True)
     worker: Worker = field(default=at_once, kw_only=True)

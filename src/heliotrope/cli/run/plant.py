@@ -55,8 +55,8 @@ if TYPE_CHECKING:
 
 #: Calibration of a simulated field: how well its beams are known, rad.
 _SIMULATED = replace(CYCLE, sigma=2e-4)
-#: Time between checks whether a simulated field waits for its plant, and between true errors, s.
-_CHECKED, _TRUE_EVERY = 0.02, 5.0
+#: Time between true errors of a simulated field, s.
+_TRUE_EVERY = 5.0
 
 
 #: Prepares store and simulated field.
@@ -196,9 +196,9 @@ class _Outside:
             *self.links.parts,
             *(part for local in self.local for part in local.parts),
         ]
-        while self.reader is not None and not self.reader.state.begun:
-            await asyncio.sleep(_CHECKED)
         async with running(*parts), running(*(local.cluster for local in self.local)):
+            if self.reader is not None:
+                await self.reader.begin()
             yield
 
     @property
@@ -233,6 +233,7 @@ class _Outside:
             records=keeper,
             assigned=KeptPoints(keeper),
             beside=self.running,
+            ready=None if self.reader is None else self.reader.led,
             truth=None if self.reader is None else _TrueErrors(self.reader, design),
             learner=LearnerProcess(),
             worker=worker,

@@ -40,8 +40,8 @@ class ClockState:
         Its monotonic time, and its UTC in POSIX seconds.
     speed, asked
         Its seconds per second now, and as it was asked for.
-    begun
-        Whether the field waits for its plant, or is led by it.
+    waits, begun
+        Whether the field waits for its plant; whether the plant leads all of it.
     """
 
     wall: float
@@ -49,6 +49,7 @@ class ClockState:
     utc: float
     speed: float
     asked: float
+    waits: bool
     begun: bool
 
     def at(self, wall: float) -> float:
@@ -100,6 +101,17 @@ class ClockReader:
         first, last = self._states[0], self.state
         span = last.wall - first.wall
         return (last.now - first.now) / span if span > 1.0 else last.speed
+
+    async def begin(self) -> None:
+        """Let the simulated field begin, once it is ready: its time stands still until then."""
+        while not self.state.waits:
+            await asyncio.to_thread(time.sleep, _SOON)
+        await asyncio.to_thread(self.fetch, "begin")
+
+    async def led(self) -> None:
+        """Wait until the plant leads all of the field."""
+        while not self.state.begun:
+            await asyncio.to_thread(time.sleep, _SOON)
 
     def fetch(self, path: str) -> bytes:
         """Return what the simulated field serves.

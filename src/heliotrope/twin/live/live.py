@@ -60,8 +60,6 @@ from heliotrope.twin.true_mirrors import TrueMirror, mirrors_near
 _OF_CLUSTERS = frozenset(row.name for row in watched_by(CONDITIONS, Watcher.CLUSTER))
 #: Tick of the field, and period at which the true sun is computed, s.
 _TICK, _SUN_EVERY = 0.05, 5.0
-#: Time in which clusters have sent the orders with which they begin, s.
-_BEGUN = 1.5
 #: Largest number of ticks made up at once after a pause.
 _MOST_TICKS = 20
 #: Step counts of each heliostat are requested each second in plants up to this size, and every few
@@ -94,9 +92,6 @@ class WorldOptions:
     link
         Returns a cluster's end of the link to its plant, by the name of the cluster; None: both
         ends are in this process, and `World.links` has the plant's.
-    up
-        Whether the heliostats track when the plant begins, as on a day of work; else they are at
-        stow. Boards begin at stow.
     bus_key
         Key with which the frames of every bus are signed; b"": none is, and a field of arrays
         obeys every frame.
@@ -109,7 +104,6 @@ class WorldOptions:
     boards: bool = False
     centroid: float = 1e-5
     bus_key: bytes = b""
-    up: bool = False
     link: Callable[[str], CarriedLink] | None = None
 
     def __post_init__(self) -> None:
@@ -145,8 +139,8 @@ class World:
         Plant's end of the link to each cluster.
     buses
         Bus of each cluster.
-    clusters
-        Their programs.
+    clusters, far
+        Their programs; their ends of the links to a plant elsewhere, to be run within `running`.
     cameras
         Cameras of the targets; None where the plant has its own, which are sent photographs.
     flux
@@ -178,6 +172,7 @@ class World:
         self._sun: tuple[float, FloatArray] | None = None
         self.beats = 0
         self._parts: list[Any] = []
+        self.far: list[CarriedLink] = []
         self.clusters: list[Cluster] = []
         self.links: dict[str, NearLink] = {}
         self.buses: dict[str, Bus] = {}
@@ -207,9 +202,10 @@ class World:
         if self.options.link is None:
             near, far = near_pair(self.clock, ("plant", name))
             self.links[name] = near
-            self._parts.append(near)
+            self._parts += [near, far]
         else:
             far = self.options.link(name)
+            self.far.append(far)
         key = self.options.bus_key
         own = [key_of(self.names[row]) for row in span] if key else ()
         bus: Bus = (
@@ -233,7 +229,7 @@ class World:
         time = SimulatedTime(self.clock)
         ring = KeyRing(key) if key else None
         self.clusters.append(Cluster(config, bus, far, self.clock, time, bus_keys=ring))
-        self._parts += [far, bus, time]
+        self._parts += [bus, time]
         self.buses[name] = bus
 
     def _new_cameras(self) -> ExactCamera | RenderedCamera:
@@ -326,9 +322,8 @@ class World:
             done += late * _TICK
             self.field.advance(50 * ticks)
 
-    async def _put_up(self) -> None:
-        """Let the field track, once the clusters have sent the DEFOCUS with which they begin."""
-        await asyncio.sleep(_BEGUN)
+    def put_up(self) -> None:
+        """Let a field of arrays track, as on a day of work; a plant must lead its clusters."""
         gps = gps_seconds(self.clock.utc())
         utc = self.clock.utc().timestamp()
         values = sun.broadcast_values(round(gps), utc, self.design.site)
@@ -341,8 +336,6 @@ class World:
         async with asyncio.TaskGroup() as group:
             turns = group.create_task(self._turn())
             async with running(*self._parts), running(*self.clusters):
-                if self.options.up:
-                    await self._put_up()
                 yield
             turns.cancel()
 

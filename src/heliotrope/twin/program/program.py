@@ -12,7 +12,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.imaging.frame import Frame
 from heliotrope.links.clock import Clock, SystemClock, VirtualClock
 from heliotrope.links.connection import CarriedLink
-from heliotrope.links.link import LinkSettings
+from heliotrope.links.link import LinkSettings, running
 from heliotrope.links.tcp import tcp_link
 from heliotrope.twin.live import PacedLoop, World, WorldOptions
 from heliotrope.twin.program.boards import BOARDS, read_boards
@@ -20,8 +20,12 @@ from heliotrope.twin.program.cameras import TwinCameras
 from heliotrope.twin.program.folder import FLUX, TwinFolder
 from heliotrope.twin.program.server import TwinServer
 
-#: Share of the speed at which time goes on while a lease of the plant is shorter than this, s.
-_SLOW, _SHORT = 0.2, 1.5
+#: Share of the speed at which time goes on until all clusters are connected; and while a lease of
+#: the plant is shorter than this, s.
+_FIRST, _SLOW, _SHORT = 0.02, 0.2, 1.5
+#: Time in which clusters have sent the orders with which they begin, and in which the plant has heard
+#: of a field that tracks, s.
+_BEGUN, _REPORTED = 0.5, 1.2
 #: Wall time between checks of the leases, s.
 _CHECKED = 0.1
 #: Clusters call a plant that begins beside them soon again.
@@ -47,7 +51,8 @@ class TwinOptions:
     up
         Whether the heliostats track as soon as the plant leads them; else they begin at stow.
     waits
-        Whether it waits for the file of what its local controllers store; see `write_boards`.
+        Whether it waits for the file of what its local controllers store (`write_boards`), and for
+        the plant to begin.
     """
 
     start: datetime | None = None
@@ -81,14 +86,16 @@ class TwinProgram:
 
     def __init__(self, design: Plant, files: TwinFolder, options: TwinOptions) -> None:
         self._design, self._files, self._options = design, files, options
-        self._begun = False
+        self._waits = self._begun = False
         self._parts: _Parts | None = None
 
     def loop(self) -> asyncio.AbstractEventLoop:
-        """Return a new event loop for it."""
+        """Return a new event loop for it; its time stands still until the field begins."""
         if self._options.start is None:
             return asyncio.SelectorEventLoop()
-        return PacedLoop(self._options.speed)
+        loop = PacedLoop(self._options.speed)
+        loop.speed = 0.0
+        return loop
 
     async def run(self, ending: asyncio.Event) -> None:
         """Run until ``ending`` is set."""
@@ -102,7 +109,7 @@ class TwinProgram:
         def link(name: str) -> CarriedLink:
             return tcp_link(*self._files.plant, name, self._files.keys[name], clock, _LINK)
 
-        files = self._files
+        files, go = self._files, _Go()
         server = TwinServer(
             files.serves,
             files.secret,
@@ -110,24 +117,30 @@ class TwinProgram:
             loop,
             self._photograph,
             lambda: self._built().world.errors().tobytes(),
+            go.begin,
         )
         server.start()
         try:
             design = await self._stored(ending)
             if ending.is_set():
                 return
-            options = WorldOptions(
-                self._options.seed, boards=self._options.boards, up=self._options.up, link=link
-            )
+            options = WorldOptions(self._options.seed, boards=self._options.boards, link=link)
             world = World(design, clock, options)
             cameras = TwinCameras(world, loop, self._options.seed)
             self._parts = _Parts(world, cameras)
             cameras.start()
-            async with world.running(), asyncio.TaskGroup() as group:
+            self._waits = True
+            if paced is not None:
+                await _first(go.event, ending)
+                paced.speed = _FIRST * self._options.speed
+            async with (
+                world.running(),
+                running(*world.far),
+                asyncio.TaskGroup() as group,
+            ):
                 tasks = [group.create_task(self._sense(world))]
-                self._begun = True
                 if paced is not None:
-                    tasks.append(group.create_task(self._pace(world, paced)))
+                    tasks.append(group.create_task(self._lead(world, paced)))
                 await ending.wait()
                 for task in tasks:
                     task.cancel()
@@ -153,22 +166,30 @@ class TwinProgram:
             raise FetchError("the simulated field has not begun")
         return self._parts
 
-    async def _pace(self, world: World, loop: PacedLoop) -> None:
-        """Slow the time down while the plant is late, so that it loses no heliostat by that.
+    async def _lead(self, world: World, loop: PacedLoop) -> None:
+        """Let the field begin once the plant leads it; later slow time down while the plant is late.
 
-        Where the machine is too slow, everything takes longer, and nothing is lost. A plant that
-        leads no cluster any more has ended.
+        Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A
+        plant that leads no cluster any more has ended.
         """
-        led = False
+        # To connect takes wall time, to be led takes simulated time.
+        while not all(cluster.connected for cluster in world.clusters):
+            await _wall(_CHECKED)
+        loop.speed = self._options.speed
+        while min(cluster.lease_left for cluster in world.clusters) < _SHORT:
+            await _wall(_CHECKED)
+        await asyncio.sleep(_BEGUN)
+        if self._options.up:
+            world.put_up()
+        await asyncio.sleep(_REPORTED)
+        self._begun = True
         while True:
             left = [cluster.lease_left for cluster in world.clusters]
-            led |= min(left) > 0.0
-            short = min(left) < _SHORT and (not led or max(left) > 0.0)
+            short = min(left) < _SHORT and max(left) > 0.0
             speed = self._options.speed * (_SLOW if short else 1.0)
             if speed != loop.speed:
                 loop.speed = speed
-            # Wall time: the loop's own is what is slowed down.
-            await asyncio.to_thread(time.sleep, _CHECKED)
+            await _wall(_CHECKED)
 
     def _clock(self, clock: Clock, paced: PacedLoop | None) -> dict[str, Any]:
         """Return the state of the clock: monotonic s, UTC, speed, and whether the field is up."""
@@ -178,6 +199,7 @@ class TwinProgram:
             "utc": clock.utc().timestamp(),
             "speed": 1.0 if paced is None else paced.speed,
             "asked": self._options.speed,
+            "waits": self._waits,
             "begun": self._begun,
         }
 
@@ -190,6 +212,30 @@ class TwinProgram:
             share = world.flux.share()
             await asyncio.to_thread(_replace, path, f"{share:.5f}\n")
             await asyncio.sleep(_SENSED)
+
+
+class _Go:
+    """The plant's word that the field may begin."""
+
+    def __init__(self) -> None:
+        self.event = asyncio.Event()
+
+    def begin(self) -> bytes:
+        self.event.set()
+        return b""
+
+
+async def _first(*events: asyncio.Event) -> None:
+    """Wait until one of some events is set."""
+    waits = [asyncio.ensure_future(event.wait()) for event in events]
+    await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    for wait in waits:
+        wait.cancel()
+
+
+async def _wall(seconds: float) -> None:
+    """Wait for wall time: the loop's own is what is slowed down."""
+    await asyncio.to_thread(time.sleep, seconds)
 
 
 def _replace(path: Path, text: str) -> None:

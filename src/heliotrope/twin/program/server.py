@@ -44,6 +44,8 @@ class TwinServer:
         Takes a photograph by a camera, by name; called in a thread.
     errors
         Returns the true errors; called in the loop.
+    begin
+        Lets the field begin; called in the loop.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class TwinServer:
         loop: asyncio.AbstractEventLoop,
         photograph: Callable[[str], Frame],
         errors: Callable[[], bytes],
+        begin: Callable[[], bytes],
     ) -> None:
         def answer(path: str) -> tuple[int, str, bytes]:
             parts = path.strip("/").split("/")
@@ -62,6 +65,8 @@ class TwinServer:
             match parts[1:]:
                 case ["clock"]:
                     return 200, "application/json", json.dumps(clock()).encode()
+                case ["begin"]:
+                    return 200, "text/plain", _asked(loop, begin)
                 case ["errors"]:
                     return 200, "application/octet-stream", _asked(loop, errors)
                 case ["cameras", name] if name.endswith(".png"):
