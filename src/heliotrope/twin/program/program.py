@@ -23,8 +23,8 @@ from heliotrope.twin.program.server import TwinServer
 #: Share of the speed at which time goes on until all clusters are connected; and while a lease of
 #: the plant is shorter than this, s.
 _FIRST, _SLOW, _SHORT = 0.02, 0.2, 1.5
-#: Time in which clusters have sent the orders with which they begin, and in which the plant has heard
-#: of a field that tracks, s.
+#: Time in which clusters have sent the orders with which they begin, and in which the plant has
+#: heard of a field that tracks, s.
 _BEGUN, _REPORTED = 0.5, 1.2
 #: Wall time between checks of the leases, s.
 _CHECKED = 0.1
@@ -167,7 +167,7 @@ class TwinProgram:
         return self._parts
 
     async def _lead(self, world: World, loop: PacedLoop) -> None:
-        """Let the field begin once the plant leads it; later slow time down while the plant is late.
+        """Let the field begin once the plant leads it, and slow time down while the plant is late.
 
         Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A
         plant that leads no cluster any more has ended.
