@@ -49,6 +49,7 @@ from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
+from heliotrope.twin.invariants.panel import Panel
 from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.progress import ProgressObserver
@@ -361,40 +362,38 @@ class Simulation:
         self.observer = PlantObserver(
             self.begin, self.disk, SETTINGS, observers, automatic=works(plan.worlds)
         )
-        self.operator = self._new_operator(fits, scene.keep_outs[0][0])
-        self.operator.quiet, self.operator.tickets = self.quiet, self.tickets
-        self.operator.alarms = self.alarms
+        others = (self.readings, self.alarms, self.tickets)
+        panel = Panel(
+            self.observer,
+            self.beams,
+            self.persons,
+            others if self.quiet is None else (*others, self.quiet),
+        )
+        self.operator = Operator(
+            self._clock,
+            plan.seed,
+            Habits.of(plan.worlds, plan.seed),
+            panel,
+            fits,
+            self.pods,
+            scene.keep_outs[0][0],
+            None if self._measured else self._flux,
+        )
         self._maintenance: Maintenance | None = None
         if self._store is not None:
             self._maintenance = self.operator.maintenance = Maintenance(
-                self.operator, self.observer, self.beams, self.boards, self._clock, plan.seed
+                self.operator, self.boards, self._clock, plan.seed
             )
         self._work = self._new_work() if works(plan.worlds) else None
         self._tour: Tour | None = None
         if TOUR in plan.worlds:
-            self._tour = Tour(
-                self.operator, self.observer, self.boards, self._clock, self.sun, plan.seed
-            )
+            self._tour = Tour(self.operator, self.boards, self._clock, self.sun, plan.seed)
         self._second = self._second_plant(fits) if "twice" in plan.worlds else None
+        self._judges = panel.each
+        if self._work is not None:
+            self._judges += self._work.watch.each
         for pod in self.pods:
             pod.plant = self.observer
-
-    def _new_operator(
-        self, fits: Sequence[Outfit], keep_out: tuple[float, float, float]
-    ) -> Operator:
-        """Return the persons who command."""
-        return Operator(
-            self._clock,
-            self.plan.seed,
-            Habits.of(self.plan.worlds, self.plan.seed),
-            self.observer,
-            self.beams,
-            self.persons,
-            fits,
-            self.pods,
-            keep_out,
-            None if self._measured else self._flux,
-        )
 
     def _quiet_observer(self) -> QuietObserver | None:
         """Return the observer of work; None: what is wrong from the start hinders it."""
@@ -425,7 +424,7 @@ class Simulation:
         work = Work(plan.seed, sight, self._exits, kind)
         watch = self._new_watch(work, together=together)
         truth = {name: board.outfit.causes for name, board in boards.items()}
-        acts = Acts(work, self.operator, self.observer, self.beams, watch, truth, clock, plan.seed)
+        acts = Acts(work, self.operator, watch, truth, clock, plan.seed)
         if DAYS in plan.worlds:
             crew = Crew(acts, self.boards, plan.seconds, rough=self._coarse, planned=plan.acts)
             return Working(work, crew, watch)
@@ -508,11 +507,9 @@ class Simulation:
 
     @property
     def checks(self) -> Counter[int]:
-        """Number of checks of each invariant by the observers of work, alarms and tickets."""
-        counts = self.alarms.checks + self.tickets.checks + self.persons.checks
-        if self._work is not None:
-            counts += self._work.watch.checks
-        return counts if self.quiet is None else counts + self.quiet.checks
+        """Number of checks of each invariant."""
+        judges = (*self._judges, *(judge for pod in self.pods for judge in pod.judges))
+        return sum((judge.checks for judge in judges), Counter())
 
     # -- the plant -------------------------------------------------------------------------
 
@@ -522,15 +519,13 @@ class Simulation:
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
             link = pod.line.end(0, pod.name, self._clock, seed=seed)
-            pod.ear = PlantEar(
-                pod, self.observer, self.beams, self.quiet, self.alarms, self.persons
-            )
+            pod.ear = PlantEar(pod, self.operator.panel)
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
         if self._work is not None:
             self._wanted = wanted_of(self._fits)  # the store knows better; see `Work.begins`
-            noted = self.alarms.alarmed
+            noted = self.alarms.on_alarm
             self._work.control.opens(lambda alarm: noted(alarm, self._clock.monotonic()))
         if self._store is not None:
             self._read_plant_file()
@@ -635,11 +630,8 @@ class Simulation:
     def _alarmed(self, alarm: Alarm) -> None:
         if self._work is not None:
             self._work.control.take_alarm(alarm)
-        self.beams.alarmed(alarm, self._clock.monotonic())
-        self.readings.alarmed(alarm)
-        self.alarms.alarmed(alarm, self._clock.monotonic())
-        if self.quiet is not None:
-            self.quiet.alarmed(alarm)
+        for each in self._judges:
+            each.on_alarm(alarm, self._clock.monotonic())
 
     def crash_plant(self, now: float) -> None:
         """Kill the plant's program wherever it is; the network tells the clusters."""
@@ -648,7 +640,6 @@ class Simulation:
                 pod.ear.end()
         if self._work is not None:
             self._work.control.ends()
-            self._work.watch.ended()
         if self.plant is not None:
             self._audit.lose()
         for task in self._program:
@@ -661,13 +652,8 @@ class Simulation:
         if self._maintenance is not None:
             self._maintenance.service = None
         self.instruments.plant = None
-        self.observer.ended(now)
-        self.beams.ended()
-        self.readings.ended(now)
-        self.alarms.ended()
-        self.tickets.ended()
-        if self.quiet is not None:
-            self.quiet.ended()
+        for each in self._judges:
+            each.on_end(now)
         for pod in self.pods:
             pod.tap = pod.ear = None
             pod.line.drop()
@@ -720,7 +706,7 @@ class Simulation:
                     pod.freeze(on=False)
             if self._tour is not None and self.plan.seconds >= TOUR_LENGTH:
                 saw = f"the tour is not over after {self.plan.seconds:g} s"
-                self.observer.check(11, self._tour.over, self._clock.monotonic(), saw)
+                self.observer.check(11, self._tour.over, self._clock.monotonic(), "plant", saw)
             self.crash_plant(self._clock.monotonic())
             self.run_twice(group, on=False)
             for pod in self.pods:
@@ -810,11 +796,7 @@ def run(plan: RunPlan) -> RunResult:
         runner.close()
     except RuntimeError as error:  # a task does not end, such as one of a program that is frozen
         outcome.problem = outcome.problem or f"the run does not end: {error}"
-    outcome.checks = sum(
-        (pod.checks for pod in simulation.pods),
-        simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
-    )
-    outcome.checks += simulation.checks
+    outcome.checks = simulation.checks
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
     outcome.counts["proofs"] = simulation.beams.proofs

@@ -18,6 +18,7 @@ from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Alarm, Condition
 from heliotrope.twin.boards.outfit import Ball, Outfit
 from heliotrope.twin.invariants.beams import BeamObserver
+from heliotrope.twin.invariants.panel import Panel
 from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
@@ -77,20 +78,19 @@ class SecondPlant:
         self._clock, self._chance = clock, random.Random(f"twice {seed}")
         self._design, self._homes, self._settings, self._table = design, homes, settings, table
         self._wanted, self._assigned, self._pods = wanted, assigned, pods
-        self._beams, self._on_alarm = beams, on_alarm
+        self._on_alarm = on_alarm
         self.plant: PlantController | None = None
         self._disk = RecordsDisk()
         self.observer = PlantObserver(
             clock.monotonic(), self._disk, settings, [pod.observer for pod in pods]
         )
         self._persons = PersonsObserver(clock.monotonic(), ())
+        panel = Panel(self.observer, beams, self._persons)
         self.operator = Operator(
             clock,
             -1 - seed,
             Habits(),
-            self.observer,
-            beams,
-            self._persons,
+            panel,
             fits,
             pods,
             keep_out[0],
@@ -117,9 +117,7 @@ class SecondPlant:
         links = {}
         for pod in self._pods:
             link = pod.line.end(0, pod.name, self._clock, seed=self._chance.getrandbits(31))
-            links[pod.name] = TappedLink(
-                link, self._clock, PlantEar(pod, self.observer, self._beams)
-            )
+            links[pod.name] = TappedLink(link, self._clock, PlantEar(pod, self.operator.panel))
         assigned = AssignedDisk()
         assigned.keep(self._assigned.read())
         self.plant = PlantController(
@@ -146,4 +144,4 @@ class SecondPlant:
         self._disk.lose()
         self.operator.begins(None)
         self._persons.forget()
-        self.observer.ended(self._clock.monotonic())
+        self.observer.on_end(self._clock.monotonic())
