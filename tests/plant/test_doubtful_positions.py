@@ -13,7 +13,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.field.state import Mask
-from heliotrope.plant.operations.calibrating import Calibrating
+from heliotrope.plant.operations.calibrating import Calibrating, Visits
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.schedule.scheduler import VISITS
@@ -175,8 +175,7 @@ def test_heliostats_in_doubt_are_visited_before_others(
             calibrating = Calibrating(
                 plant,
                 silent,
-                Refusing(),
-                chooser,
+                Visits(Refusing(), chooser),  # type: ignore[arg-type]
                 book,
                 silent,
                 unknown,  # type: ignore[arg-type]
