@@ -69,9 +69,9 @@ CHECKS: tuple[tuple[type[Any], str], ...] = (
     (Agreement, "take"),
     (Agreement, "readings"),
     (BeamWatch, "readings"),
-    (Identities, "look"),
+    (Identities, "on_status"),
     (Identities, "off"),
-    (DoubtfulPositions, "look"),
+    (DoubtfulPositions, "on_status"),
 )
 
 

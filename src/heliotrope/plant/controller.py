@@ -13,7 +13,6 @@ emergency.
 import asyncio
 import math
 import secrets
-import struct
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,7 +28,6 @@ from heliotrope.field.volumes import Volume
 from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages
-from heliotrope.lcu.journal import CODES_OF
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.link import Link
@@ -42,7 +40,7 @@ from heliotrope.links.messages import (
     ProtocolError,
     Stage,
 )
-from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of, tables_with
+from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant import refusals
 from heliotrope.plant.emergency import (
@@ -65,6 +63,9 @@ from heliotrope.plant.field.firmware import Firmware
 from heliotrope.plant.field.identity import Identities
 from heliotrope.plant.field.lockouts import Lockouts
 from heliotrope.plant.field.locks import Locks
+from heliotrope.plant.field.ordered import Ordered
+from heliotrope.plant.field.part import Part
+from heliotrope.plant.field.row_names import RowNames
 from heliotrope.plant.field.second_plant import SecondPlant
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.field.witnesses import Witnesses
@@ -76,9 +77,10 @@ from heliotrope.plant.orders.giving_back import GivingBack
 from heliotrope.plant.orders.guards import Asked, Guards
 from heliotrope.plant.orders.joining import JoinDispatcher, JoinQueue
 from heliotrope.plant.orders.movements import Movements
-from heliotrope.plant.orders.parameters import ParameterSync, Tables, change_of_beam
+from heliotrope.plant.orders.parameters import ParameterSync, change_of_beam
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.stepping import Stepping
+from heliotrope.plant.orders.taken import Taken
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.orders.unacknowledged import Unacknowledged
 from heliotrope.plant.refusals import BEAM_REFUSED, OUT_OF_SERVICE
@@ -90,8 +92,34 @@ from heliotrope.sun import fast_vector
 _SAME = 0.25
 #: Pause between two passes over parameters and owed records, s.
 _SLOW_BEAT = 1.0
-#: A cluster is asked again for the names of its rows after this time, s.
-_ASK_NAMES = 5.0
+
+
+class _Noted(Part):
+    """What the plant notes of its orders, until one ledger holds it."""
+
+    def __init__(self, agreement: Agreement, ordered: Ordered, given: Unacknowledged) -> None:
+        self._agreement, self._ordered, self._given = agreement, ordered, given
+
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
+        del now
+        self._agreement.take(cluster, status)
+
+    def on_sent(
+        self, name: str, values: Sequence[float], heliostats: Sequence[str], now: float
+    ) -> None:
+        self._agreement.sent(name, values, heliostats, now)
+        self._ordered.sent(name, heliostats, now)
+
+    def on_stage(
+        self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
+    ) -> None:
+        if stage is Stage.ACKNOWLEDGED:
+            self._agreement.obeyed(ticket.name, ticket.accepted_at, heliostats, now)
+            self._ordered.taken(ticket.name, heliostats, now)
+        elif stage is Stage.REFUSED:
+            self._ordered.refused(ticket.name, heliostats, now)
+        elif stage is Stage.DONE and ticket.name in KINDS:
+            self._given.done(ticket, heliostats)
 
 
 class PlantController:
@@ -203,34 +231,58 @@ class PlantController:
             self.wanted.items,
             self._clusters.connection,
             self._tell,
+            self._give_up,
         )
         self.witnesses = Witnesses(
             self.settings.witnesses, design.site, lambda: clock.utc().timestamp(), self._tell
         )
         self.drive_checks, self.doubtful = self._doubting()
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
-        self._second_plant, self._told_alarms = SecondPlant(self.name, self._tell), ClusterAlarms()
-        self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
-        self._firmware = Firmware(self.settings.firmware, self._clusters, self._tell)
+        self._second_plant = SecondPlant(self.name, self._tell)
         self._orders = self._ordering(clock, audit, disk or AtOnce())
-        self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
+        self._taken = Taken(self.movements, self.locks, self.stepping, points, self._orders.owe)
+        self._joining = JoinQueue(
+            self.settings.join_rate, self.settings.join_burst, self.settings.join_wait
+        )
         self._sync = ParameterSync(
             self.field,
             self.wanted,
             self._orders,
             self._clusters,
             self._tell,
-            self._rewriting,
-            self._resting,
+            self._ways,
             self._unwritable,
+            self._writing,
         )
         self.sentinel = self._guarded(table, record)
         self._given = Unacknowledged(self.field, points)
         self._guards = self._guarding()
         self.commands = self._directed()
-        self._joiner = self._dispatching()
-        self._giving_back = self._returning()
-        self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
+        #: The order is that of the calls of each hook.
+        self._parts: tuple[Part, ...] = (
+            # First at a beat, so that nothing begins that the safety table forbids by now; and
+            # first at a cluster that has connected, which repeats an emergency before all else.
+            self.sentinel,
+            self._dispatching(),
+            self._orders,
+            # After new orders, which may take what a visit has left.
+            self._returning(),
+            _Noted(self._agreement, self._ways.ordered, self._given),
+            ClusterSettings(self._tell, _expected(self.settings)),
+            self._second_plant,
+            ClusterAlarms(self._tell),
+            # These judge a status before the sentinel proves anything by it (`on_rows`).
+            self._identities,
+            self.doubtful,
+            self.drive_checks,
+            RowNames(self.field, self._clusters),
+            self.witnesses,
+            Firmware(self.settings.firmware, self._clusters, self._tell),
+            self._taken,
+            # Last: what it compares and writes depends on points that the others have taken.
+            self._sync,
+        )
+        self._slow_at = -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
 
@@ -257,9 +309,7 @@ class PlantController:
             disk,
             self._clusters,
             self.name,
-            self.settings.lifetime,
-            self.settings.patience,
-            self.settings.stow_rate,
+            self.settings,
             self._sent,
         )
 
@@ -278,19 +328,17 @@ class PlantController:
             self.sun_vector,
         )
         return Sentinel(
-            self.clock,
             TableWatch(
                 table,
                 readings,
                 self.field.clusters,
                 self.settings.sensors | self.settings.given,
                 self.now(),
+                self._tell,
             ),
-            self.field,
             self._orders,
             self._joining,
             self._ways,
-            self.beams.drives,
             self.settings.repeat,
             self._identities,
             self.drive_checks,
@@ -328,8 +376,6 @@ class PlantController:
     def _directed(self) -> Commands:
         """Return what gives people's commands."""
         return Commands(
-            self.now,
-            self.field,
             self._orders,
             self._joining,
             self._guards,
@@ -337,21 +383,17 @@ class PlantController:
             self._ways,
             self.design,
             self.wanted,
-            self.settings.join_wait,
-            self.movements,
-            self.locks,
-            self.stepping,
-            self.authority,
+            self._taken,
         )
 
     def _dispatching(self) -> JoinDispatcher:
         """Return what sends heliostats whose turn to join has come."""
         return JoinDispatcher(
-            self.now,
             self._joining,
             self._orders,
             self._ways,
             self.settings.join_life,
+            lambda: bool(self.sentinel.refusal(("",))),
             self._guards.in_turn,
             self.commands.examine,
         )
@@ -364,9 +406,7 @@ class PlantController:
             self._orders,
             self._guards,
             self.commands,
-            self.movements,
-            self.locks,
-            self.stepping,
+            self._taken,
             lambda names: self.stow("plant", names),
         )
 
@@ -400,10 +440,9 @@ class PlantController:
         return Lease(self.authority.token, settings.lease, settings.autonomy, self.name)
 
     def _greet(self, end: ClusterEnd) -> None:
-        """Repeat orders to a cluster that has connected, and compare its parameters."""
-        self.sentinel.greet(end.name)
-        self._sync.greet(end.members)
-        self._firmware.greet(end.name, self.now())
+        now = self.now()
+        for part in self._parts:
+            part.on_connected(end.name, now)
 
     def _take(self, end: ClusterEnd, message: object, now: float) -> None:
         match message:
@@ -412,11 +451,11 @@ class PlantController:
             case Progress():
                 found = self._orders.take(end.name, message)
                 if found is not None:
-                    self.sentinel.take_progress(*found, message)
-                    self._obeyed(*found, message.stage, now)
+                    for part in self._parts:
+                        part.on_stage(*found, message.stage, now)
             case Alarm():
-                for alarm in self._told_alarms.take(end.name, message):
-                    self._tell(alarm)
+                for part in self._parts:
+                    part.on_alarm(end.name, message)
             case Answer():
                 self._clusters.take_answer(message)
             case _:
@@ -427,46 +466,16 @@ class PlantController:
     def _sent(
         self, name: str, values: tuple[float, ...], heliostats: tuple[str, ...], now: float
     ) -> None:
-        """Note what has been sent to heliostats."""
-        self._agreement.sent(name, values, heliostats, now)
-        self._ways.ordered.sent(name, heliostats, now)
-
-    def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
-        """Note what some heliostats of a ticket have acknowledged or done."""
-        if stage is Stage.DONE and ticket.name == "DIAGNOSE":
-            self.drive_checks.ask(part)
-        if stage is Stage.ACKNOWLEDGED:
-            self._agreement.obeyed(ticket.name, ticket.accepted_at, part, now)
-            self._ways.ordered.taken(ticket.name, part, now)
-        elif stage is Stage.REFUSED:
-            self._ways.ordered.refused(ticket.name, part, now)
-        elif stage is Stage.DONE and ticket.name in KINDS:
-            self._given.done(ticket, part)
-            for name in self.wanted.missing.keys() & part:
-                self._sync.compare(name)
+        for part in self._parts:
+            part.on_sent(name, values, heliostats, now)
 
     def _take_status(self, end: ClusterEnd, status: ClusterStatus, now: float) -> None:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
-        self._sync.greet(self.field.restarted)
-        self._agreement.take(end.name, status)
-        self._cluster_settings.take(end.name, status, now)
-        self._second_plant.take(end.name, status)
-        for alarm in self._told_alarms.compare(end.name, status):
-            self._tell(alarm)
-        self._give_up(self._identities.look(end.name))
-        self.doubtful.look(end.name)
-        self.drive_checks.look(end.name)
-        if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
-            # The message that names the rows was lost; the statistics come in the same order.
-            self._named_at[end.name] = now
-
-            def learn(answer: Answer) -> None:
-                if "error" not in answer.data:
-                    self.field.learn_order(end.name, tuple(answer.data))
-
-            self._clusters.ask(end, "statistics", learn)
-        self.sentinel.take_rows(end.name, now)
+        for part in self._parts:
+            part.on_status(end.name, status, now)
+        for part in self._parts:
+            part.on_rows(end.name, now)
 
     async def _beats(self) -> None:
         while True:
@@ -475,32 +484,19 @@ class PlantController:
             await sleep_until(self.clock, due)
 
     def _beat(self, now: float) -> None:
-        for alarm in self.sentinel.beat(now):
-            self._tell(alarm)
-        token = self.authority.token
-        self._joiner.beat(now, self.authority.lost, held=bool(self.sentinel.refusal(("",))))
-        self._orders.beat(now)
-        self._giving_back.beat(now)
-        slow = now - self._slow_at >= _SLOW_BEAT
-        if self._orders.owing or slow:
+        for part in self._parts:
+            part.on_beat(now)
+        second = now - self._slow_at >= _SLOW_BEAT
+        if self._orders.owing or second:
             self._orders.pay()
-        if slow:
+        if second:
             self._slow_at = now
-            self.witnesses.beat()
-            self._firmware.beat(now)
-            points, held = self._ways.points, self._held()
-            for work in (points.settling(), points.released(held, now)):
-                if work is not None:
-                    self._orders.owe(work)
-            self._sync.beat(now, token, not self.sentinel.refusal(self.field.clusters))
+            for part in self._parts:
+                part.on_second(now)
 
-    def _held(self) -> dict[str, frozenset[str]]:
-        """Return the heliostats of which visits hold something, by kind (`assigned.HELD`)."""
-        return {
-            "LOCKED": self.locks.names,
-            "LENT": self.movements.names,
-            "ROUGH": self.stepping.lent,
-        }
+    def _writing(self) -> int:
+        """Return the token under which parameters may be written now, 0 if none may be."""
+        return 0 if self.sentinel.refusal(self.field.clusters) else self.authority.token
 
     def _tell(self, alarm: Alarm) -> None:
         self.alarms.append(alarm)
@@ -807,7 +803,7 @@ class PlantController:
         self.wanted.check(heliostat, items)
         if reason := self._unwritable(heliostat):
             raise BeamError("PARAMETERS", {heliostat: reason})
-        before, after = self._tables(heliostat, items)
+        before, after = self._ways.tables(heliostat, items)
         self.authority.check(person, token, "PARAMETERS")
         self._sync.check(heliostat, items)
         if POSE_ITEMS.intersection(items):
@@ -821,7 +817,7 @@ class PlantController:
 
         def use() -> None:
             self.wanted.set(heliostat, items)
-            self._use(row, *self._tables(heliostat, items)[1])
+            self._use(row, *self._ways.tables(heliostat, items)[1])
             self._joining.drop("its parameters are being written", frozenset([heliostat]))
             if record is not None:
                 self.beliefs.take(record)
@@ -833,18 +829,11 @@ class PlantController:
         """Use an armature (18,) and drives (2, 19) in proofs, and to compare the pointing."""
         self.beams.replace(row, armature, drives)
         self._agreement.believe(row, armature, drives)
-        self._give_up(self._identities.learn(row, armature))
+        self._identities.learn(row, armature)
 
     def _give_up(self, heliostats: Mapping[str, str]) -> None:
         """Let heliostats that are not what they seem wait no longer to join."""
-        if heliostats:
-            self._joining.drop(next(iter(heliostats.values())), frozenset(heliostats))
-
-    def _tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
-        """Return the tables of a heliostat's mechanism now, and once items are stored."""
-        row = self.field.place(heliostat)
-        before = self.beams.armature.table[row].copy(), self.beams.drives.table[row].copy()
-        return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
+        self._joining.drop(next(iter(heliostats.values())), frozenset(heliostats))
 
     @contextmanager
     def unverified(self, heliostat: str) -> Iterator[None]:
@@ -879,23 +868,10 @@ class PlantController:
         """
         return self._guards.reasons(Asked(name, tuple(heliostats), aims))
 
-    def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
-        return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
-
     def _unwritable(self, heliostat: str) -> str | None:
         """Return why nothing may be written to a heliostat, None if it may."""
         asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
         return self._guards.reasons(asked, *kinds).get(heliostat)
-
-    def _resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
-        """Return why a heliostat may not rest at the stow position in items, "" if it may."""
-        if "stow" not in items:
-            return ""
-        counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
-        armature, drives = self._tables(heliostat, items)[1]
-        rows = np.array([self.field.place(heliostat)])
-        found = self.beams.standing(rows, counts, (armature[None], drives[None]))
-        return found.get(heliostat, "")
 
     def _differing(self, heliostat: str) -> str | None:
         return self._sync.differing(heliostat)

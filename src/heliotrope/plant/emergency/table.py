@@ -172,7 +172,9 @@ class TableWatch:
         clusters: Sequence[str],
         sensors: Iterable[str],
         now: float,
+        tell: Callable[[Alarm], None],
     ) -> None:
+        self.tell = tell
         table = watched_by(rows, Watcher.PLANT)
         self._sensors = frozenset(sensors)
         known = {row.reading for row in table} - OWN_READINGS | set(DERIVED.values())

@@ -3,6 +3,7 @@
 The watch over beams that light a receiver unsent is `unsent`.
 """
 
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -12,6 +13,8 @@ import numpy.typing as npt
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states
 from heliotrope.lcu.diagnosis import NUDGE
+from heliotrope.lcu.journal import CODES_OF
+from heliotrope.mechanism.board_items import POSE_ITEMS, Tables, tables_with
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.tracking import TrackingStatus
@@ -22,7 +25,6 @@ from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.motion.defocusing import way_out
 from heliotrope.plant.motion.paths import Paths
 from heliotrope.plant.motion.stray_beams import TURNS, StrayBeams
-from heliotrope.plant.orders.parameters import Tables
 from heliotrope.plant.refusals import BEAM_REFUSED, SOON, STILL_MOVING, NoFreePath, RefusedError
 from heliotrope.safety import Act, Reading
 
@@ -90,7 +92,7 @@ class BeamWatch:
 
     Attributes
     ----------
-    points
+    check, field, points
         As given.
     unsent
         Watch over beams on a receiver that were not sent there.
@@ -106,7 +108,7 @@ class BeamWatch:
         sun: Callable[[float], FloatArray],
         machines: Mapping[str, Machine],
     ) -> None:
-        self._check, self._field, self.points, self._sun = check, field, points, sun
+        self.check, self.field, self.points, self._sun = check, field, points, sun
         self.ordered = Ordered(field)
         self._machines = machines
         self._ways = Paths(check, machines)
@@ -133,10 +135,10 @@ class BeamWatch:
         wrong = self._early(name, rows)
         for start, among in self._starts(rows, tracking):
             of = rows[among], wanted[among], light
-            wrong |= self._check.problems(*of, start=start, stopped=stopped)
+            wrong |= self.check.problems(*of, start=start, stopped=stopped)
         if not stopped:
-            every = self.points.possible("STANDBY", np.arange(len(self._field)))
-            wrong |= self._check.glare(rows, wanted, every, light)
+            every = self.points.possible("STANDBY", np.arange(len(self.field)))
+            wrong |= self.check.glare(rows, wanted, every, light)
         if wrong:
             raise BeamError(name, _paths(wrong))
 
@@ -146,11 +148,11 @@ class BeamWatch:
         The way to it is proven from the point before. One that is on its way there, or may be by
         an order that no report shows yet, would go to the new point from elsewhere.
         """
-        if not self._check.volumes:
+        if not self.check.volumes:
             return {}
         if name == "AIM":  # those that track join it, and are examined then
             return self.ordered.unshown(rows, messages.JOINING)
-        state = self._field.rows["state"][rows]
+        state = self.field.rows["state"][rows]
         found = self.ordered.unshown(rows[np.isin(state, _TO_STANDBY)])
         return found | self._unsettled(rows[state == states.IDLE])
 
@@ -182,20 +184,20 @@ class BeamWatch:
         BeamError
             If none may.
         """
-        solids = self._check.solids if name == "APPROACH" else ()
-        if name not in _PROVEN or not (self._check.volumes or solids):
+        solids = self.check.solids if name == "APPROACH" else ()
+        if name not in _PROVEN or not (self.check.volumes or solids):
             return heliostats, {}
-        rows = np.array([self._field.place(n) for n in heliostats], dtype=np.intp)
+        rows = np.array([self.field.place(n) for n in heliostats], dtype=np.intp)
         # A heliostat without known counts is left to its local controller.
-        rows = rows[np.isfinite(self._field.counted_at[rows])]
+        rows = rows[np.isfinite(self.field.counted_at[rows])]
         if name == "APPROACH":
             wrong = self._from_stow(rows)
         elif name == "IDLE":
-            mine = np.isin(self._field.rows["state"][rows], _TO_STANDBY)
+            mine = np.isin(self.field.rows["state"][rows], _TO_STANDBY)
             wrong = self._back_to_standby(rows[mine], now)
         else:
             path = self._by_counts(name, values, rows)
-            wrong = self._check.moving(rows, path, self._sun(0.0)) | self.ordered.unshown(rows)
+            wrong = self.check.moving(rows, path, self._sun(0.0)) | self.ordered.unshown(rows)
         wrong = _paths(wrong)
         if wrong and len(wrong) == len(heliostats):
             raise BeamError(name, wrong)
@@ -205,9 +207,9 @@ class BeamWatch:
         """Return which heliostats have no free way from stow to standby, and why."""
         early = self.ordered.unshown(rows, messages.SAFE)
         rows, wrong = self._resting(rows)
-        if not self._check.volumes:
+        if not self.check.volumes:
             wrong = {}  # a way to a point that is not known here is not proven
-        stow, counts = self._ways.stow[rows], self._field.counts(rows)
+        stow, counts = self._ways.stow[rows], self.field.counts(rows)
         begin = dict(zip(rows.tolist(), np.where(np.isfinite(stow), stow, counts), strict=True))
         for some, standbys in self.points.possible("STANDBY", rows):
             here = np.array([begin[row] for row in some.tolist()])
@@ -226,22 +228,38 @@ class BeamWatch:
         for some, standbys in self.points.possible("STANDBY", rows):
             wrong |= self._by_earlier(some, standbys)
             good, path = self._to_standby(some, standbys, light)
-            wrong |= self._check.moving(good, path, light)
+            wrong |= self.check.moving(good, path, light)
         return wrong | early
 
     def _unsettled(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats move, or have told nothing since they were ordered to."""
-        found = {self._field.names[row]: STILL_MOVING.text for row in rows[self._moving(rows)]}
+        found = {self.field.names[row]: STILL_MOVING.text for row in rows[self._moving(rows)]}
         return found | self.ordered.unshown(rows)
 
     def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
         """Return the heliostats whose standby points are known, and why the others do not go."""
         known = np.isfinite(self.points.standbys[rows]).all(axis=-1)
         return rows[known], {
-            self._field.names[row]: "its standby point is not known here; give it one "
+            self.field.names[row]: "its standby point is not known here; give it one "
             "(STANDBY) first, or stow it"
             for row in rows[~known]
         }
+
+    def tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
+        """Return the tables of a heliostat's mechanism now, and once items are stored."""
+        row = self.field.place(heliostat)
+        before = self.check.armature.table[row].copy(), self.check.drives.table[row].copy()
+        return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
+
+    def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
+        """Return why a heliostat may not rest at the stow position in items, "" if it may."""
+        if "stow" not in items:
+            return ""
+        counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
+        armature, drives = self.tables(heliostat, items)[1]
+        rows = np.array([self.field.place(heliostat)])
+        found = self.check.standing(rows, counts, (armature[None], drives[None]))
+        return found.get(heliostat, "")
 
     def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str:
         """Return why new parameters may not be written where a heliostat stands, "" if they may.
@@ -257,8 +275,8 @@ class BeamWatch:
         armature, drives
             The new tables, (18,) and (2, 19).
         """
-        row = self._field.place(heliostat)
-        if not self._check.volumes or not np.isfinite(self._field.posed_at[row]):
+        row = self.field.place(heliostat)
+        if not self.check.volumes or not np.isfinite(self.field.posed_at[row]):
             return ""
         rows, new, present = np.array([row]), (armature, drives), self._tables(row)
         for tables in (present, new):
@@ -277,7 +295,7 @@ class BeamWatch:
         By those, the heliostat goes to a target and comes back; if they are wrong, its beam is
         where the present ones say.
         """
-        row = self._field.place(heliostat)
+        row = self.field.place(heliostat)
         self._earlier[row] = self._tables(row)
         try:
             yield
@@ -286,22 +304,22 @@ class BeamWatch:
 
     def misled(self, heliostat: str, point: FloatArray) -> str:
         """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
-        rows = np.array([self._field.place(heliostat)])
+        rows = np.array([self.field.place(heliostat)])
         wrong = self._by_earlier(rows, point[None])
         return wrong[heliostat].partition(";")[0] if wrong else ""
 
     def _tables(self, row: int) -> Tables:
-        return self._check.armature.table[row].copy(), self._check.drives.table[row].copy()
+        return self.check.armature.table[row].copy(), self.check.drives.table[row].copy()
 
     @contextmanager
     def _believing(self, row: int, tables: Tables) -> Iterator[None]:
         """Prove with other tables of a heliostat."""
         present = self._tables(row)
-        self._check.replace(row, *tables)
+        self.check.replace(row, *tables)
         try:
             yield
         finally:
-            self._check.replace(row, *present)
+            self.check.replace(row, *present)
 
     def _misled(self, rows: Rows, point: FloatArray, tables: Tables) -> dict[str, str]:
         """Return why the way on which one heliostat is led to a point (1, 3) is not free.
@@ -310,10 +328,10 @@ class BeamWatch:
         """
         if not np.isfinite(point).all():
             return {}
-        counts, light = self._field.counts(rows), self._sun(0.0)
-        ends = self._check.poses(rows, point, light, counts).best_counts
+        counts, light = self.field.counts(rows), self._sun(0.0)
+        ends = self.check.poses(rows, point, light, counts).best_counts
         with self._believing(int(rows[0]), tables):
-            return self._check.moving(rows, self._ways.motion(rows, counts, ends), light)
+            return self.check.moving(rows, self._ways.motion(rows, counts, ends), light)
 
     def _by_earlier(self, rows: Rows, points: FloatArray) -> dict[str, str]:
         """Return which ways to points (K, 3) are not free by parameters that were replaced."""
@@ -326,15 +344,15 @@ class BeamWatch:
     def _from_here(self, rows: Rows) -> dict[str, str]:
         """Return which heliostats may not go from where they stand to standby, and why."""
         light = self._sun(0.0)
-        here = self._angles(rows, self._field.posed[rows])
-        wrong = self._check.moving(rows, np.repeat(here[:, None], 2, axis=1), light)
+        here = self._angles(rows, self.field.posed[rows])
+        wrong = self.check.moving(rows, np.repeat(here[:, None], 2, axis=1), light)
         known = rows[np.isfinite(self.points.standbys[rows]).all(axis=-1)]
         good, path = self._to_standby(known, self.points.standbys[known], light)
         wrong |= {
-            self._field.names[row]: "its standby point cannot be reached"
+            self.field.names[row]: "its standby point cannot be reached"
             for row in np.setdiff1d(known, good)
         }
-        return wrong | self._check.moving(good, path, light)
+        return wrong | self.check.moving(good, path, light)
 
     def joining(
         self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
@@ -343,9 +361,9 @@ class BeamWatch:
 
         AIM brings a new aim, its values; every other command leads to those that they may have.
         """
-        if not self._check.volumes:
+        if not self.check.volumes:
             return {}
-        rows = np.array([self._field.index[n] for n in heliostats], dtype=np.intp)
+        rows = np.array([self.field.index[n] for n in heliostats], dtype=np.intp)
         new = name == "AIM"
         aims = np.tile(values, (len(rows), 1)) if new else self.points.aims[rows]
         unknown = ~np.isfinite(aims).all(axis=-1)
@@ -361,9 +379,9 @@ class BeamWatch:
                 found |= self._by_earlier(known, places)
                 for some, begin in self._begins(known):
                     to = known[some], begin, places[some], light, self._ways.motion
-                    found |= self._check.on_the_way(*to)
+                    found |= self.check.on_the_way(*to)
                 if name == "SEARCH":
-                    found |= self._check.around(known, places, values[1], light)
+                    found |= self.check.around(known, places, values[1], light)
         return _paths(found)
 
     def _begins(self, rows: Rows) -> list[tuple[npt.NDArray[np.bool_], FloatArray]]:
@@ -371,7 +389,7 @@ class BeamWatch:
 
         One that moves may be anywhere between its counts and its goals.
         """
-        counts, goals = self._field.counts(rows), self._field.goals(rows)
+        counts, goals = self.field.counts(rows), self.field.goals(rows)
         moving = self._moving(rows)
         found = [(np.ones(len(rows), dtype=np.bool_), counts)]
         if moving.any():
@@ -384,15 +402,15 @@ class BeamWatch:
         self, rows: Rows, standbys: FloatArray, light: FloatArray
     ) -> tuple[Rows, FloatArray]:
         """Return the heliostats that reach their standby points (K, 3), and their ways there."""
-        counts = self._field.counts(rows)
-        found = self._check.poses(rows, standbys, light, counts)
+        counts = self.field.counts(rows)
+        found = self.check.poses(rows, standbys, light, counts)
         good = found.chosen(found.status) == TrackingStatus.OK
         rows, ends = rows[good], found.best_counts[good]
         return rows, self._ways.motion(rows, counts[good], ends)
 
     def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:
         """Return the angles that a command passes, from where the axes stand, (K, W, 2)."""
-        counts = self._field.counts(rows)
+        counts = self.field.counts(rows)
         if name == "DIAGNOSE":
             begin = self._angles(rows, counts)
             nudges = NUDGE * np.array([(1, 0), (-1, 0), (0, 0), (0, 1), (0, -1)])
@@ -400,13 +418,13 @@ class BeamWatch:
         ends = np.broadcast_to(np.asarray(values, dtype=np.float64), (len(rows), 2))
         if name == "JOG":
             axis, steps = int(values[0]), values[1]
-            ends = self._field.goals(rows)
+            ends = self.field.goals(rows)
             if axis < 2:  # the local controller refuses any other axis
                 ends[:, axis] += steps
         return self._ways.motion(rows, counts, ends)
 
     def _angles(self, rows: Rows, counts: FloatArray) -> FloatArray:
-        angles: FloatArray = Drive(self._check.drives.table[rows]).angles(counts)
+        angles: FloatArray = Drive(self.check.drives.table[rows]).angles(counts)
         return angles
 
     # -- the watch -------------------------------------------------------------------------
@@ -414,7 +432,7 @@ class BeamWatch:
     @property
     def watched(self) -> frozenset[str]:
         """Names of the readings: of keep-out volumes and of receivers, where there are any."""
-        found = {"keep_out_predicted": self._check.volumes, "beam_unsent": self._check.solids}
+        found = {"keep_out_predicted": self.check.volumes, "beam_unsent": self.check.solids}
         return frozenset(name for name, places in found.items() if places)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
@@ -425,7 +443,7 @@ class BeamWatch:
         """
         if now - self._at >= LOOK_PERIOD:
             self._at = now
-            if self._check.volumes:
+            if self.check.volumes:
                 self._look(now)
             if self.stray.watches:
                 self.stray.look(now)
@@ -445,24 +463,24 @@ class BeamWatch:
         again
             Whether it has been ordered off already, and its beam is still there.
         """
-        row = self._field.place(name)
+        row = self.field.place(name)
         if name not in self._seen:
             lit = name in self.stray.seen
             return self.stray.way_out(name, again=again) if lit else Act.DEFOCUS
-        state = int(self._field.rows["state"][row])
+        state = int(self.field.rows["state"][row])
         if state == states.STOWING or (again and self._stands(row)) or self.turned(name):
             return Act.STOW
         machine = self._machines.get(name)
-        points, counts, sun = self.points, self._field.posed[row], self._sun(0.0)
+        points, counts, sun = self.points, self.field.posed[row], self._sun(0.0)
         aim, standby = points.aims[row], points.standbys[row]
-        return way_out(self._check, machine, row, counts, sun, state, aim, standby)
+        return way_out(self.check, machine, row, counts, sun, state, aim, standby)
 
     def turned(self, name: str) -> bool:
         """Return whether a beam stands where it may not be, and DEFOCUS turns it no further."""
         if name not in self._seen and name not in self.stray.seen:
             return False
-        row = self._field.place(name)
-        off = self._field.rows["state"][row] == states.DEFOCUSED or self._field.turned[row]
+        row = self.field.place(name)
+        off = self.field.rows["state"][row] == states.DEFOCUSED or self.field.turned[row]
         return bool(off and self._stands(row))
 
     def _stands(self, row: int) -> bool:
@@ -470,11 +488,11 @@ class BeamWatch:
 
     def _moving(self, rows: Rows) -> npt.NDArray[np.bool_]:
         """Return which heliostats are on their way to their goals, (K,)."""
-        left = np.abs(self._field.goals(rows) - self._field.posed[rows])
+        left = np.abs(self.field.goals(rows) - self.field.posed[rows])
         return np.asarray((left > _MOVES).any(axis=-1))
 
     def _look(self, now: float) -> None:
-        field = self._field
+        field = self.field
         self._turn = (self._turn + 1) % TURNS
         every = np.flatnonzero(np.isfinite(field.posed_at))
         state, begin = field.rows["state"][every], field.posed[every]
@@ -492,11 +510,11 @@ class BeamWatch:
         both, ends = follows & ~turns, moves & ~follows
         stand = np.concatenate([rows[~follows], rows[ends]])
         at = self._angles(stand, np.concatenate([begin[~follows], end[ends]]))
-        wrong = self._check.moving(stand, np.repeat(at[:, None], 2, axis=1), light)
+        wrong = self.check.moving(stand, np.repeat(at[:, None], 2, axis=1), light)
         path = self._ways.turns(rows[turns], begin[turns], end[turns])
-        wrong |= self._check.moving(rows[turns], path, light)
+        wrong |= self.check.moving(rows[turns], path, light)
         path = self._ways.motion(rows[both], begin[both], end[both], ramps=False)
-        wrong |= self._check.moving(rows[both], path, light)
+        wrong |= self.check.moving(rows[both], path, light)
         looked = {field.names[row] for row in rows}
         self._seen = frozenset(wrong) | (self._seen - looked)
 

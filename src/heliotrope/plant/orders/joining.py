@@ -11,6 +11,7 @@ from functools import partial
 
 from heliotrope.lcu import messages
 from heliotrope.links.messages import Stage
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.motion.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.orders.queue import PlantOrders
@@ -67,10 +68,22 @@ class JoinQueue:
     """The waiting heliostats: first come, first served, as fast as a `JoinLimiter` admits.
 
     Of those that leave stow, a slice goes at each look.
+
+    Parameters
+    ----------
+    rate, burst
+        Heliostats that may join in a second, and at once after a rest.
+    patience
+        Longest time that a heliostat waits for its turn, s.
+
+    Attributes
+    ----------
+    patience
+        As given.
     """
 
-    def __init__(self, rate: float, burst: int) -> None:
-        self._limiter = JoinLimiter(rate, burst)
+    def __init__(self, rate: float, burst: int, patience: float) -> None:
+        self._limiter, self.patience = JoinLimiter(rate, burst), patience
         self._jobs: deque[JoiningJob] = deque()
 
     def __len__(self) -> int:
@@ -130,7 +143,7 @@ class JoinQueue:
         job.waiting = deque(name for name in job.waiting if name not in left)
 
 
-class JoinDispatcher:
+class JoinDispatcher(Part):
     """The sending of heliostats whose turn has come, if the way of their beams is clear now.
 
     The sun has moved since the aim was accepted, and the heliostat may point anywhere. So the sweep
@@ -138,12 +151,12 @@ class JoinDispatcher:
 
     Parameters
     ----------
-    now
-        Returns the monotonic time, s.
     queue, orders, beams
         Of the plant.
     life
         Life of a command whose turn has come, s.
+    held
+        Returns whether no new motion may begin.
     blocked
         Returns the heliostats that guards stop when their turn comes, and the reasons.
     examine
@@ -152,21 +165,21 @@ class JoinDispatcher:
 
     def __init__(
         self,
-        now: Callable[[], float],
         queue: JoinQueue,
         orders: PlantOrders,
         beams: BeamWatch,
         life: float,
+        held: Callable[[], bool],
         blocked: Callable[[str, tuple[float, ...], tuple[str, ...]], dict[str, str]],
         examine: Examine,
     ) -> None:
-        self._now, self._queue, self._orders = now, queue, orders
-        self._beams, self._life = beams, life
+        self._queue, self._orders, self._now = queue, orders, orders.clock.monotonic
+        self._beams, self._life, self._held = beams, life, held
         self._blocked, self._examine = blocked, examine
 
-    def beat(self, now: float, lost: Lost, *, held: bool) -> None:
-        """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
-        for job, part in self._queue.admit(now, lost, held=held):
+    def on_beat(self, now: float) -> None:
+        """Send the heliostats whose turn it is, unless no new motion may begin."""
+        for job, part in self._queue.admit(now, self._orders.authority.lost, held=self._held()):
             clear = self._clear(job, part)
             if job.assign is None or not clear:
                 self._send(job, clear)
