@@ -22,7 +22,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
 from heliotrope.links.link import running
 from heliotrope.mechanism.board_items import items_of
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.emergency import at_stow
 from heliotrope.plant.field.assigned import rest_on
 from heliotrope.plant.io.sensors import Sensors
@@ -133,12 +133,9 @@ class PlantAssembly:
             design,
             self.logbook.tapped(ports.links),
             ports.clock,
-            ports.audit,
+            Stores(ports.audit, assigned=ports.assigned, record=ports.records, disk=ports.disk),
             settings=replace(chosen.plant, sensors=chosen.plant.sensors | fed),
-            assigned=ports.assigned,
             on_alarm=self.logbook.take_alarm,
-            disk=ports.disk,
-            record=ports.records,
         )
         cameras = ports.cameras if design.targets else None
         self.schedule: PlantSchedule | None = None

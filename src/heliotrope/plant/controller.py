@@ -16,6 +16,7 @@ import secrets
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,6 @@ import numpy.typing as npt
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
-from heliotrope.field.volumes import Volume
 from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages
@@ -94,6 +94,31 @@ _SAME = 0.25
 _SLOW_BEAT = 1.0
 
 
+@dataclass(frozen=True)
+class Stores:
+    """What outlives a program of the plant.
+
+    Attributes
+    ----------
+    audit
+        Audit of accepted commands.
+    wanted
+        Parameters that local controllers should store.
+    assigned
+        Store of aims and standby points; None: they end with the program.
+    record
+        Store of the emergency that stands; None: it ends with the program.
+    disk
+        Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
+    """
+
+    audit: Audit
+    wanted: Wanted = field(default_factory=Wanted)
+    assigned: Assigned | None = None
+    record: EmergencyRecord | None = None
+    disk: Disk | None = None
+
+
 class _Noted(Part):
     """What the plant notes of its orders, until one ledger holds it."""
 
@@ -133,28 +158,16 @@ class PlantController:
         Links by name of the cluster; the owner runs them, for example by a `TcpServer`.
     clock
         Clock of the plant; everything is timed by its monotonic time.
-    audit
-        Audit of accepted commands.
-    clusters
-        Names of the heliostats of each cluster; None: the design's.
+    stores
+        What outlives this program.
     settings
         Times and limits.
-    volumes, eyes
-        Keep-out volumes; eyes that may look into beams, ENU, m, (P, 3); None: the design's.
-    wanted
-        Parameters that local controllers should store.
-    assigned
-        Store of aims and standby points that outlives a restart; None: they are not kept.
     table
         Rows of the safety table; None: those of the design at the autonomy of the settings.
     entropy
         Source of random bytes for tokens and identities.
     on_alarm
         Called with each alarm.
-    disk
-        Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
-    record
-        Store of the emergency that stands; None: it ends with the program.
 
     Attributes
     ----------
@@ -179,9 +192,7 @@ class PlantController:
     Raises
     ------
     InputError
-        A cluster without a link, or a link without a cluster.
-    UnknownNameError
-        A cluster has a heliostat that the design does not know.
+        A cluster without a link, a link without a cluster, or a heliostat without a cluster.
     """
 
     def __init__(
@@ -189,32 +200,25 @@ class PlantController:
         design: Plant,
         links: Mapping[str, Link],
         clock: Clock,
-        audit: Audit,
+        stores: Stores,
         *,
-        clusters: Mapping[str, Sequence[str]] | None = None,
         settings: PlantSettings | None = None,
-        volumes: Sequence[Volume] | None = None,
-        eyes: npt.ArrayLike | None = None,
-        wanted: Wanted | None = None,
-        assigned: Assigned | None = None,
         table: Iterable[Condition] | None = None,
         entropy: Callable[[int], bytes] = secrets.token_bytes,
         on_alarm: Callable[[Alarm], None] | None = None,
-        disk: Disk | None = None,
-        record: EmergencyRecord | None = None,
     ) -> None:
-        members = _checked(design, links, clusters)
+        members = _checked(design, links)
         self.design, self.settings = design, settings or PlantSettings()
         self.clock, self._on_alarm = clock, on_alarm
         self.alarms, self.counters = deque[Alarm](maxlen=1000), Counters()
         self.field = FieldState(members, self.settings.stale)
         self.authority = Authority(clock, self.settings.authority, entropy)
-        self.wanted = wanted or Wanted()
-        self.beams = BeamCheck(design, self.field.names, volumes, eyes)
+        self.wanted = stores.wanted
+        self.beams = BeamCheck(design, self.field.names)
         self.beliefs = Beliefs(design)
         self.beliefs.subscribe(self._believe)
         self.lockouts = Lockouts(design)
-        points = Points(self.field.names, assigned)
+        points = Points(self.field.names, stores.assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
         resting = (name for name, each in self.beams.machines.items() if each.rests)
@@ -239,7 +243,7 @@ class PlantController:
         self.drive_checks, self.doubtful = self._doubting()
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
         self._second_plant = SecondPlant(self.name, self._tell)
-        self._orders = self._ordering(clock, audit, disk or AtOnce())
+        self._orders = self._ordering(stores.audit, stores.disk or AtOnce())
         self._taken = Taken(self.movements, self.locks, self.stepping, points, self._orders.owe)
         self._joining = JoinQueue(
             self.settings.join_rate, self.settings.join_burst, self.settings.join_wait
@@ -254,7 +258,7 @@ class PlantController:
             self._unwritable,
             self._writing,
         )
-        self.sentinel = self._guarded(table, record)
+        self.sentinel = self._guarded(table, stores.record)
         self._given = Unacknowledged(self.field, points)
         self._guards = self._guarding()
         self.commands = self._directed()
@@ -300,10 +304,10 @@ class PlantController:
             checks.stalled,
         )
 
-    def _ordering(self, clock: Clock, audit: Audit, disk: Disk) -> PlantOrders:
+    def _ordering(self, audit: Audit, disk: Disk) -> PlantOrders:
         """Return what follows accepted commands to their ends."""
         return PlantOrders(
-            clock,
+            self.clock,
             self.authority,
             audit,
             disk,
@@ -920,17 +924,13 @@ def _expected(settings: PlantSettings) -> str:
     return "" if settings.common is None else settings_checksum(settings.common)
 
 
-def _checked(
-    design: Plant, links: Mapping[str, Link], clusters: Mapping[str, Sequence[str]] | None
-) -> Mapping[str, Sequence[str]]:
+def _checked(design: Plant, links: Mapping[str, Link]) -> Mapping[str, Sequence[str]]:
     """Return the heliostats of each cluster, which must have a link each."""
-    members = clusters_of(design) if clusters is None else clusters
+    members = clusters_of(design)
     odd = sorted(set(members) ^ set(links))
     if odd:
         raise InputError(
             f"plant: cluster {odd[0]} has heliostats or a link, but not both; correct the plant "
             "file or the links"
         )
-    for name in (name for names in members.values() for name in names):
-        design.find(name)
     return members

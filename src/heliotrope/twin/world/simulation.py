@@ -11,7 +11,7 @@ import contextlib
 import random
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,11 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.common_settings import CommonSettings
+from heliotrope.links.link import Link
 from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted, packed
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.emergency import EmergencyRecord
 from heliotrope.plant.field.assigned import Assigned
 from heliotrope.plant.field.witnesses import SENSOR_ERROR
@@ -330,7 +331,8 @@ class Simulation:
             self._assigned, self._emergency = self._store.points, self._store.keeper
         self._assigned.keep({"STANDBY": {outfit.name: STANDBY for outfit in fits}})
         self.disk = RecordsDisk()
-        self._employ(fits, scene)
+        self._outfits = fits
+        self._employ()
         self.plant: PlantController | None = None
         self._program: list[asyncio.Task[None]] = []
 
@@ -355,7 +357,7 @@ class Simulation:
                 pod.answers.quiet = self.quiet.calm
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
 
-    def _employ(self, fits: Sequence[Outfit], scene: Scene) -> None:
+    def _employ(self) -> None:
         """Let persons, automatic control and the tour work at the plant, before its observer."""
         plan = self.plan
         observers = [pod.observer for pod in self.pods]
@@ -369,15 +371,8 @@ class Simulation:
             self.persons,
             others if self.quiet is None else (*others, self.quiet),
         )
-        self.operator = Operator(
-            self._clock,
-            plan.seed,
-            Habits.of(plan.worlds, plan.seed),
-            panel,
-            fits,
-            self.pods,
-            scene.keep_outs[0][0],
-            None if self._measured else self._flux,
+        self.operator = self._people(
+            plan.seed, Habits.of(plan.worlds, plan.seed), panel, not self._measured
         )
         self._maintenance: Maintenance | None = None
         if self._store is not None:
@@ -388,7 +383,7 @@ class Simulation:
         self._tour: Tour | None = None
         if TOUR in plan.worlds:
             self._tour = Tour(self.operator, self.boards, self._clock, self.sun, plan.seed)
-        self._second = self._second_plant(fits) if "twice" in plan.worlds else None
+        self._second = self._second_plant() if "twice" in plan.worlds else None
         self._judges = panel.each
         if self._work is not None:
             self._judges += self._work.watch.each
@@ -530,21 +525,9 @@ class Simulation:
         if self._store is not None:
             self._read_plant_file()
         context = context_of(_PLANT)
-        plant = self.plant = PlantController(
-            self._design,
-            links,
-            self._clock,
-            audit,
-            clusters=self._homes,
-            settings=self._settings(),
-            wanted=self._wanted,
-            assigned=self._assigned,
-            table=TABLE,
-            entropy=self._chance.randbytes,
-            on_alarm=self._alarmed,
-            disk=self.disk.queue(self._clock, context) if "disk" in self.plan.worlds else None,
-            record=self._emergency,
-        )
+        slow = self.disk.queue(self._clock, context) if "disk" in self.plan.worlds else None
+        stores = Stores(audit, self._wanted, self._assigned, self._emergency, slow)
+        plant = self.plant = self._begins(links, stores, self._chance.randbytes, self._settings())
         self.operator.begins(plant)
         self.instruments.plant = plant
         parts = [*(link.run() for link in links.values()), plant.run()]
@@ -555,6 +538,38 @@ class Simulation:
         if self._work is not None:
             parts.append(self._work.control.begins(plant).run())
         self._program = [group.create_task(part, context=context) for part in parts]
+
+    def _begins(
+        self,
+        links: Mapping[str, Link],
+        stores: Stores,
+        entropy: Callable[[int], bytes],
+        settings: PlantSettings = SETTINGS,
+    ) -> PlantController:
+        """Return a new program of the plant."""
+        return PlantController(
+            self._design,
+            links,
+            self._clock,
+            stores,
+            settings=settings,
+            table=TABLE,
+            entropy=entropy,
+            on_alarm=self._alarmed,
+        )
+
+    def _people(self, seed: int, habits: Habits, panel: Panel, feeds: bool) -> Operator:
+        """Return the persons who command a plant."""
+        return Operator(
+            self._clock,
+            seed,
+            habits,
+            panel,
+            self._outfits,
+            self.pods,
+            self._scene.keep_outs[0][0],
+            self._flux if feeds else None,
+        )
 
     def _settings(self) -> PlantSettings:
         """Return the settings of the plant."""
@@ -604,22 +619,20 @@ class Simulation:
             self._store.restore()
             self._assigned, self._emergency = self._store.points, self._store.keeper
 
-    def _second_plant(self, fits: Sequence[Outfit]) -> SecondPlant:
+    def _second_plant(self) -> SecondPlant:
+        def observers(disk: RecordsDisk) -> Panel:
+            own = PlantObserver(self.begin, disk, SETTINGS, [pod.observer for pod in self.pods])
+            return Panel(own, self.beams, PersonsObserver(self.begin, ()))
+
         return SecondPlant(
             self._clock,
             self.plan.seed,
-            self._design,
-            self._homes,
-            SETTINGS,
-            TABLE,
             self._wanted,
             self._assigned,
             self.pods,
-            fits,
-            self._scene.keep_outs[0],
-            self.beams,
-            self._flux,
-            self._alarmed,
+            observers,
+            self._people,
+            self._begins,
         )
 
     def run_twice(self, group: asyncio.TaskGroup, *, on: bool) -> None:
