@@ -262,30 +262,7 @@ class PlantController:
         self._given = Unacknowledged(self.field, points)
         self._guards = self._guarding()
         self.commands = self._directed()
-        #: The order is that of the calls of each hook.
-        self._parts: tuple[Part, ...] = (
-            # First at a beat, so that nothing begins that the safety table forbids by now; and
-            # first at a cluster that has connected, which repeats an emergency before all else.
-            self.sentinel,
-            self._dispatching(),
-            self._orders,
-            # After new orders, which may take what a visit has left.
-            self._returning(),
-            _Noted(self._agreement, self._ways.ordered, self._given),
-            ClusterSettings(self._tell, _expected(self.settings)),
-            self._second_plant,
-            ClusterAlarms(self._tell),
-            # These judge a status before the sentinel proves anything by it (`on_rows`).
-            self._identities,
-            self.doubtful,
-            self.drive_checks,
-            RowNames(self.field, self._clusters),
-            self.witnesses,
-            Firmware(self.settings.firmware, self._clusters, self._tell),
-            self._taken,
-            # Last: what it compares and writes depends on points that the others have taken.
-            self._sync,
-        )
+        self._parts = self._listed()
         self._slow_at = -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
@@ -364,6 +341,32 @@ class PlantController:
             self.lockouts,
             self._given,
             self.aims,
+        )
+
+    def _listed(self) -> tuple[Part, ...]:
+        """Return the parts, in the order in which each hook is called."""
+        return (
+            # First at a beat, so that nothing begins that the safety table forbids by now; and
+            # first at a cluster that has connected, which repeats an emergency before all else.
+            self.sentinel,
+            self._dispatching(),
+            self._orders,
+            # After new orders, which may take what a visit has left.
+            self._returning(),
+            _Noted(self._agreement, self._ways.ordered, self._given),
+            ClusterSettings(self._tell, _expected(self.settings)),
+            self._second_plant,
+            ClusterAlarms(self._tell),
+            # These judge a status before the sentinel proves anything by it (`on_rows`).
+            self._identities,
+            self.doubtful,
+            self.drive_checks,
+            RowNames(self.field, self._clusters),
+            self.witnesses,
+            Firmware(self.settings.firmware, self._clusters, self._tell),
+            self._taken,
+            # Last: what it compares and writes depends on points that the others have taken.
+            self._sync,
         )
 
     def _compared(self, points: Points) -> Agreement:
