@@ -346,7 +346,7 @@ def visited(
     observer = ResultObserver.__new__(ResultObserver)
     accounts: dict[str, Any] = {}
     observer.__dict__.update(
-        checks=dict.fromkeys(TITLES, 0), _start=0.0, _zero=0.0, _accounts=accounts,
+        checks=dict.fromkeys(TITLES, 0), start=0.0, _zero=0.0, _accounts=accounts,
         _boards={f"H{i}": None for i in range(names)}, _dark=frozenset(), _barren=[],
         _together=True,
     )  # fmt: skip

@@ -104,9 +104,7 @@ def items_of(mechanism: Mechanism, machine: Machine | None = None) -> dict[str, 
 Tables = tuple[FloatArray, FloatArray]
 
 
-def tables_with(
-    items: Mapping[str, bytes], armature: FloatArray, table: FloatArray
-) -> Tables:
+def tables_with(items: Mapping[str, bytes], armature: FloatArray, table: FloatArray) -> Tables:
     """Return the armature (18,) and the drives (2, 19) of a mechanism once items are stored.
 
     The inverse of `items_of`, as far as the pose is concerned.
