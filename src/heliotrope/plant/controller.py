@@ -228,16 +228,7 @@ class PlantController:
         self._second_plant = SecondPlant(self.name, self._tell)
         self._orders = self._ordering(stores.audit, stores.disk or AtOnce())
         self._taken = Taken(self.movements, self.locks, self.stepping, points, self._orders.owe)
-        self._sync = ParameterSync(
-            self.field,
-            self.wanted,
-            self._orders,
-            self._clusters,
-            self._tell,
-            self._proofs,
-            self._unwritable,
-            self._writing,
-        )
+        self._sync = self._syncing()
         self.sentinel = self._guarded(table, stores.record)
         self._given = Unacknowledged(self.field, points)
         self.guards = self._guarding()
@@ -272,6 +263,19 @@ class PlantController:
             self.name,
             self.settings,
             self._sent,
+        )
+
+    def _syncing(self) -> ParameterSync:
+        """Return what compares and writes the parameters of local controllers."""
+        return ParameterSync(
+            self.field,
+            self.wanted,
+            self._orders,
+            self._clusters,
+            self._tell,
+            self._proofs,
+            self._unwritable,
+            self._writing,
         )
 
     def _guarded(
