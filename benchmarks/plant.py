@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.field.agreement import Agreement
 from heliotrope.plant.field.aims import BeamCheck
 from heliotrope.plant.field.assigned import Points
@@ -70,9 +71,9 @@ CHECKS: tuple[tuple[type[Any], str], ...] = (
     (Agreement, "take"),
     (Agreement, "readings"),
     (BeamWatch, "readings"),
-    (Identities, "look"),
+    (Identities, "on_status"),
     (Identities, "off"),
-    (DoubtfulPositions, "look"),
+    (DoubtfulPositions, "on_status"),
 )
 
 
@@ -176,8 +177,9 @@ class _Run:
         self.names = design.names
         self.links = [_Direct(f"K{k:03d}") for k in range(clusters)]
         audit = JsonLines(folder / "audit.jsonl", clock.utc())
+        links = {x.name: x for x in self.links}
         self.plant = PlantController(
-            design, {x.name: x for x in self.links}, clock, audit, volumes=volumes
+            replace(design, keep_outs=tuple(volumes)), links, clock, Stores(audit)
         )
         self.rows = np.zeros(len(design), NODE)
         self.rows["state"] = states.TRACKING

@@ -31,7 +31,7 @@ from heliotrope.links.link import running
 from heliotrope.links.messages import Stage
 from heliotrope.links.tcp import TcpServer
 from heliotrope.mechanism.board_items import Wanted
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.orders.tickets import Ticket
@@ -138,9 +138,8 @@ class Installation:
             self._design(),
             server.links,
             self.clock,
-            self.audit,
+            Stores(self.audit, Wanted(dict(zip(self.field.names, self.field.items, strict=True)))),
             settings=PlantSettings(),
-            wanted=Wanted(dict(zip(self.field.names, self.field.items, strict=True))),
         )
         with contextlib.ExitStack() as stack:
             async with running(server), running(self.plant):

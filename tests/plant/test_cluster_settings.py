@@ -81,7 +81,7 @@ def named_of(*settings: str, expected: str = "") -> dict[str, str]:
     watch = ClusterSettings(told.append, expected)
     for second in range(10):
         for name, each in zip("ABCDEF", settings, strict=False):
-            watch.take(name, replace(STATUS, settings=each), float(second))
+            watch.on_status(name, replace(STATUS, settings=each), float(second))
     return named(told)
 
 
@@ -120,7 +120,7 @@ def test_the_alarm_waits_is_told_once_and_follows_the_others() -> None:
 
     def second(at: float, **statuses: ClusterStatus) -> None:
         for name, status in statuses.items():
-            watch.take(name, status, at)
+            watch.on_status(name, status, at)
 
     second(0.0, A=good, B=bad)
     second(0.0, A=good)
@@ -149,7 +149,7 @@ def test_a_cluster_counts_with_its_last_settings_only() -> None:
     for begin, settings, odd in ((0, (SAME, SAME, OTHER), "C"), (10, (OTHER, SAME, OTHER), "B")):
         for second in range(begin, begin + 10):
             for name, each in zip("ABC", settings, strict=True):
-                watch.take(name, replace(STATUS, settings=each), float(second))
+                watch.on_status(name, replace(STATUS, settings=each), float(second))
         assert set(named(told)) == {odd}
 
 

@@ -11,9 +11,10 @@ import pytest
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import ClusterStatus
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.field.state import Mask
-from heliotrope.plant.operations.calibrating import Calibrating
+from heliotrope.plant.operations.calibrating import Calibrating, Visits
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.schedule.scheduler import VISITS
@@ -112,7 +113,8 @@ def test_one_that_loses_its_power_while_it_waits_to_join_is_not_sent(tmp_path: P
             reports(bench, "P5A", DOUBTFUL, 1)
             row = plant.field.place("P5A")
             plant.field.rows["flags"][row], plant.field.rows["boots"][row] = DOUBTFUL, 1
-            plant.doubtful.look(cluster.name)
+            status = ClusterStatus(cluster.name, 0, 0.0, "gps", 0.0, 3.0, 0.1)
+            plant.doubtful.on_status(cluster.name, status, plant.now())
             await bench.wait(2.0)
             assert not cluster.commands("TRACK")
 
@@ -175,8 +177,7 @@ def test_heliostats_in_doubt_are_visited_before_others(
             calibrating = Calibrating(
                 plant,
                 silent,
-                Refusing(),
-                chooser,
+                Visits(Refusing(), chooser),  # type: ignore[arg-type]
                 book,
                 silent,
                 unknown,  # type: ignore[arg-type]

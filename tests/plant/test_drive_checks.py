@@ -71,9 +71,7 @@ async def automatic(
     """Automatic control beside a block; its alarms are ``told``."""
     log = Logbook(bench.clock)
     log.forward = None if told is None else told.append
-    control = AutomaticControl(
-        bench.plant, log, None, scheduler=None, records=None, truth=None, settings=WORK
-    )
+    control = AutomaticControl(bench.plant, log, settings=WORK)
     task = asyncio.create_task(control.run())
     try:
         yield control
@@ -181,7 +179,11 @@ def test_a_proof_says_which_mirrors_were_seen_to_follow_and_which_are_believed(
 ) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        work = Operations(plant, Logbook(bench.clock), settings=AutomaticSettings(calibrate=False))
+        work = Operations(
+            plant,
+            log := Logbook(bench.clock),
+            AutomaticControl(plant, log, settings=AutomaticSettings(calibrate=False)),
+        )
         await diagnosed(bench, "P5A", MOVED)
         plant.drive_checks.seen("P5B", PHOTOGRAPH)
         plant.drive_checks.seen("P5C", PHOTOGRAPH)
@@ -211,7 +213,11 @@ def test_a_proof_says_which_mirrors_were_seen_to_follow_and_which_are_believed(
 def test_a_measured_flux_is_said_to_be_measured_and_hides_single_beams(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        work = Operations(plant, Logbook(bench.clock), settings=AutomaticSettings(calibrate=False))
+        work = Operations(
+            plant,
+            log := Logbook(bench.clock),
+            AutomaticControl(plant, log, settings=AutomaticSettings(calibrate=False)),
+        )
         plant.raise_emergency("Olga", Act.STOW)
         for _ in range(10):
             await bench.wait(1.0)
@@ -361,10 +367,6 @@ def test_real_boards_are_diagnosed_by_their_tilt_sensors(tmp_path: Path) -> None
             control = AutomaticControl(
                 plant,
                 Logbook(clock),
-                None,
-                scheduler=None,
-                records=None,
-                truth=None,
                 settings=WORK,
             )
             task = asyncio.create_task(control.run())

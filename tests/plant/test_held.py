@@ -14,7 +14,7 @@ from heliotrope.links.messages import Command, Emergency
 from heliotrope.plant.field.assigned import HELD, AssignedFile, Points
 from heliotrope.plant.field.locks import CERTAIN
 from heliotrope.plant.operations import Logbook, Operations
-from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.orders.audit import read
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.records import Kind, Lockout
@@ -319,7 +319,9 @@ def test_one_heliostat_in_detail_says_why_it_is_locked(tmp_path: Path) -> None:
         mirror.join(bench)
         async with running(bench):
             plant, work = bench.plant, AutomaticSettings(calibrate=False)
-            shown = Operations(plant, Logbook(clock), settings=work)
+            shown = Operations(
+                plant, log := Logbook(clock), AutomaticControl(plant, log, settings=work)
+            )
             await bench.wait(2.0)
             assert shown.viewer.heliostat(NAME).locked == ""
             assert shown.automatic.view().choice == "", "it calibrates nothing"

@@ -26,7 +26,7 @@ from heliotrope.imaging.coded import Verdict
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts
-from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors
+from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors, Visits
 from heliotrope.plant.operations.coded_visits import JointVisits
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.views import PictureRow
@@ -600,19 +600,20 @@ def calibrating_of(
     plant.beliefs.count = lambda name: 0  # type: ignore[method-assign, misc]
     silent = SimpleNamespace(event=event, keep=lambda *_: None, take_alarm=lambda alarm: None)
     book = SimpleNamespace(error=np.full(6, 1e-3), conclude=lambda entry: None)
-    return Calibrating(
+    schedule = SimpleNamespace(
+        done=lambda entry: done.append(entry.heliostat), attempts=Attempts(VISITS)
+    )
+    found = Calibrating(
         plant,
         silent,  # type: ignore[arg-type]
-        made.cycle,  # type: ignore[arg-type]
-        SimpleNamespace(  # type: ignore[arg-type]
-            done=lambda entry: done.append(entry.heliostat), attempts=Attempts(VISITS)
-        ),
+        Visits(made.cycle, schedule),  # type: ignore[arg-type]
         book,  # type: ignore[arg-type]
         silent,  # type: ignore[arg-type]
         TrueErrors(plant, truth),
         lambda: (),
-        joint=made,
     )
+    found._joint = made
+    return found
 
 
 def test_what_a_joint_visit_disproves_is_an_alarm_when_it_ends() -> None:

@@ -24,7 +24,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import SendOutcome, Statistics
 from heliotrope.links.messages import Ask, ClusterStatus, Lease, encode
 from heliotrope.optics import FluxView, air_loss, intercept_rectangle, predict_flux
-from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.operations import Operations
@@ -854,7 +854,11 @@ def test_stow_from_before_a_lockout_does_not_park(tmp_path: Path) -> None:
     async def main(clock: VirtualClock) -> None:
         async with running(Bench(clock, tmp_path)) as bench:
             plant, name = bench.plant, "P1A"
-            shown = Operations(plant, Logbook(clock), settings=AutomaticSettings(calibrate=False))
+            shown = Operations(
+                plant,
+                log := Logbook(clock),
+                AutomaticControl(plant, log, settings=AutomaticSettings(calibrate=False)),
+            )
             work = asyncio.create_task(shown.run())
             token, cluster = await bench.commanded(), bench.cluster_of(name)
             ticket = plant.command(OPERATOR, token, "APPROACH", (name,))

@@ -535,7 +535,7 @@ def test_nothing_that_a_cluster_says_ends_the_plant(tmp_path: Path) -> None:
 
 
 def test_an_alarm_of_a_cluster_ends_with_its_list_though_its_end_was_lost() -> None:
-    told = ClusterAlarms()
+    told = ClusterAlarms(lambda alarm: None)
     bus = Alarm("bus_failed", "", Severity.ALARM, "text")
     node = Alarm("node_fault", "P1A", Severity.ALARM, "text")
     event = alarms.PLANT_UNINTELLIGIBLE.raised(problem="a test")

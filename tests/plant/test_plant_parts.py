@@ -335,7 +335,7 @@ def test_a_record_is_waited_for_no_longer_than_it_takes() -> None:
 
 def test_who_waits_too_long_to_join_is_given_up() -> None:
     clock = VirtualClock()
-    queue = JoinQueue(1.0, 1)
+    queue = JoinQueue(1.0, 1, 60.0)
 
     def lost(token: int, heliostats: Iterable[str]) -> frozenset[str]:
         return frozenset() if token == 7 else frozenset(heliostats)

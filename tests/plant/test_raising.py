@@ -217,9 +217,7 @@ def test_what_cannot_go_on_is_stowed_and_raised_again(tmp_path: Path) -> None:
         cluster = bench.cluster_of(NAME)
         row, log = cluster.names.index(NAME), Logbook(bench.clock)
         settings = AutomaticSettings(wanted=True, calibrate=False)
-        control = AutomaticControl(
-            bench.plant, log, None, scheduler=None, records=None, truth=None, settings=settings
-        )
+        control = AutomaticControl(bench.plant, log, settings=settings)
         running = asyncio.create_task(control.run())
         await bench.wait(20.0)
         assert bench.count(states.IDLE) == len(bench.plant.field.names)
@@ -293,9 +291,7 @@ def test_a_mirror_at_standby_names_the_witness_that_it_waits_for(tmp_path: Path)
             other = bench.cluster_of(OTHER)
             other.rows["flags"][other.names.index(OTHER)] = 0
             plant, work = bench.plant, AutomaticSettings(wanted=True, calibrate=False, margin=0.0)
-            control = AutomaticControl(
-                plant, Logbook(clock), None, scheduler=None, records=None, truth=None, settings=work
-            )
+            control = AutomaticControl(plant, Logbook(clock), settings=work)
             tasks = asyncio.create_task(control.run())
             await bench.wait(6.0)
             why = "it waits: no independent witness confirms the sun of this plant: none of its"
@@ -323,10 +319,6 @@ def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: P
         control = AutomaticControl(
             bench.plant,
             logbook,
-            None,
-            scheduler=None,
-            records=None,
-            truth=None,
             settings=AutomaticSettings(wanted=True),
         )
         running = asyncio.create_task(control.run())
@@ -357,9 +349,7 @@ def test_the_field_is_raised_again_once_the_sun_is_a_degree_above_where_it_was_s
     async def scene(bench: Bench) -> None:
         logbook, count = Logbook(bench.clock), len(bench.plant.field.names)
         settings = AutomaticSettings(wanted=True, calibrate=False)
-        control = AutomaticControl(
-            bench.plant, logbook, None, scheduler=None, records=None, truth=None, settings=settings
-        )
+        control = AutomaticControl(bench.plant, logbook, settings=settings)
         running = asyncio.create_task(control.run())
         for elevation, stowed in ((7.9, count), (8.9, count), (9.1, 0)):
             sun = direction(np.radians(180.0), np.radians(elevation))
@@ -386,10 +376,6 @@ def test_a_mirror_that_is_locked_at_dusk_is_stowed_soon_after(tmp_path: Path) ->
         control = AutomaticControl(
             bench.plant,
             Logbook(bench.clock),
-            None,
-            scheduler=None,
-            records=None,
-            truth=None,
             settings=AutomaticSettings(wanted=True),
         )
         running = asyncio.create_task(control.run())

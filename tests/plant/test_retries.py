@@ -17,7 +17,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.emergency.sentinel import _TABLE
-from heliotrope.plant.operations import Logbook
+from heliotrope.plant.operations import Logbook, calibrating
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import FRESH, PLACES, Calibrating
 from heliotrope.plant.operations.raising import RAISING
@@ -82,7 +82,9 @@ class Scene:
         book: Any = SimpleNamespace(error=np.zeros(len(self.plant.field)), conclude=lambda _: None)
         unknown: Any = SimpleNamespace(now=lambda: np.full(64, np.nan))
         self.first: frozenset[str] = frozenset()
-        made: Any = (self.plant, silent, self.visits, self.schedule, book, silent, unknown)
+        made_by: Any = self.visits, self.schedule
+        chosen = calibrating.Visits(*made_by)
+        made: Any = (self.plant, silent, chosen, book, silent, unknown)
         self.calibrating = Calibrating(*made, lambda: self.first)
         self.ready = np.ones(len(self.plant.field), dtype=np.bool_)
 
@@ -250,9 +252,7 @@ def test_a_heliostat_that_is_raised_in_vain_is_left_alone(tmp_path: Path) -> Non
             await bench.wait(2.0)
             cluster, log = bench.cluster_of(NAME), Logbook(clock)
             settings = AutomaticSettings(wanted=True, calibrate=False)
-            control = AutomaticControl(
-                bench.plant, log, None, scheduler=None, records=None, truth=None, settings=settings
-            )
+            control = AutomaticControl(bench.plant, log, settings=settings)
             working = asyncio.create_task(control.run())
             # It comes to standby, and is not able to go on from there.
             cluster.rows["flags"][cluster.names.index(NAME)] = 0

@@ -15,6 +15,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency.sentinel import OFF_SHOWS
 from heliotrope.plant.field.aims import BeamCheck
 from heliotrope.plant.field.assigned import Points
 from heliotrope.plant.field.state import FieldState
@@ -90,6 +91,29 @@ def test_a_beam_left_on_the_receiver_is_sent_off_in_every_state(state: int, tmp_
     turned = state in (states.DEFOCUSED, states.STOWING)
     assert sent[0].name == ("STOW" if turned else "DEFOCUS")
     assert sent[-1].name == "STOW"
+
+
+def test_a_mirror_that_a_person_has_just_sent_off_has_the_time_to_show_it(tmp_path: Path) -> None:
+    """The table orders it off once that time is over, and its beam is still there."""
+
+    async def scene(bench: Bench) -> None:
+        cluster = bench.cluster_of("P5A")
+        cluster.deaf.add("P5A")
+        put(bench, "P5A", states.LOCKED, ON)
+        await bench.wait(2.0)
+        first = bench.plant.defocus("Olga", ("P5A",)).identity
+
+        def orders() -> set[str]:
+            sent = cluster.of(Emergency)
+            return {m.identity.rpartition(".")[0] for m in sent if "P5A" in m.heliostats}
+
+        await bench.wait(OFF_SHOWS - 1.0)
+        assert alarmed(bench.plant) == {"P5A"}
+        assert orders() == {first}
+        await bench.wait(2.0)
+        assert len(orders()) == 2
+
+    play(tmp_path, scene)
 
 
 def test_each_mirror_that_stands_is_checked_in_turn(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import running
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.refusals import RefusedError
@@ -34,7 +34,7 @@ class Backup:
             whole.design,
             self.links,
             whole.clock,
-            self.audit,
+            Stores(self.audit),
             settings=_SETTINGS,
             entropy=chance.randbytes,
         )

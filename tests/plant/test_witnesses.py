@@ -76,7 +76,7 @@ class Day:
 def test_none_joins_before_a_witness_has_agreed_and_each_day_anew() -> None:
     day = Day(frozenset({SENSOR}))
     assert "none of its witnesses (sun sensor) has agreed today" in day.witnesses.refusal
-    day.witnesses.beat()
+    day.witnesses.on_second(0.0)
     assert day.standing() == {"unwitnessed": Severity.ALARM}
     day.witnesses.take("another", day.sun(), 0.0)
     assert day.witnesses.refusal, "it is not one of those that count"
@@ -87,7 +87,7 @@ def test_none_joins_before_a_witness_has_agreed_and_each_day_anew() -> None:
     assert day.witnesses.refusal
     count = len(day.told)
     for _ in range(3):
-        day.witnesses.beat()
+        day.witnesses.on_second(0.0)
     assert len(day.told) == count + 2, "it says so once a day, and that it begins anew"
 
 
@@ -172,11 +172,11 @@ def test_a_plant_without_a_witness_says_so_once_a_day_unless_that_is_accepted() 
     day, accepted = Day(frozenset()), Day(None)
     for each in (day, accepted):
         each.utc -= 8.0 * 3600.0
-        each.witnesses.beat()
+        each.witnesses.on_second(0.0)
         assert each.told == [], "it is night"
         each.utc += 8.0 * 3600.0
-        each.witnesses.beat()
-        each.witnesses.beat()
+        each.witnesses.on_second(0.0)
+        each.witnesses.on_second(0.0)
         assert each.witnesses.refusal == ""
     assert day.standing() == {"unwitnessed": Severity.WARNING}
     assert accepted.told == []

@@ -142,7 +142,7 @@ class Plant:
         self.run = "first"
 
     async def listen(self) -> None:
-        told = ClusterAlarms()
+        told = ClusterAlarms(lambda alarm: None)
         async for data in received(self.link):
             message = decode(data)
             repeated = isinstance(message, Alarm) and not told.take("C1", message)

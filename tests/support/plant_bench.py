@@ -5,6 +5,7 @@ import contextlib
 import functools
 import struct
 from collections.abc import AsyncIterator, Callable
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.settings import PlantSettings
@@ -240,6 +241,13 @@ class Bench:
     ) -> None:
         self.clock = clock
         self.design = design or example_plant()
+        if "volumes" in options:
+            self.design = replace(self.design, keep_outs=tuple(options.pop("volumes")))
+        if "eyes" in options:
+            eyes = {f"eye {i}": np.array(eye) for i, eye in enumerate(options.pop("eyes"))}
+            self.design = replace(self.design, eyes=eyes)
+        names = {each.name for each in fields(Stores)}
+        kept = {name: options.pop(name) for name in names.intersection(options)}
         self.audit = JsonLines(folder / "audit.jsonl", clock.utc())
         held: dict[str, list[str]] = {}
         for group in self.design.groups.values():
@@ -259,7 +267,7 @@ class Bench:
             self.design,
             links,
             clock,
-            self.audit,
+            Stores(self.audit, **kept),
             entropy=lambda n: (next(counter) * 7919).to_bytes(n, "little"),
             **{"settings": PlantSettings(), **options},
         )

@@ -119,7 +119,7 @@ def done_when_acknowledged(patch: pytest.MonkeyPatch) -> None:
 
 def identity_unchecked(patch: pytest.MonkeyPatch) -> None:
     """Whatever board answers at an address counts as the heliostat's."""
-    patch.setattr(Identities, "look", lambda self, cluster: ())
+    patch.setattr(Identities, "on_status", lambda self, cluster, status, now: None)
     patch.setattr(Identities, "blocked", lambda self, heliostat: None)
 
 

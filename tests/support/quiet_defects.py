@@ -158,16 +158,15 @@ def _role_too_high(patch: pytest.MonkeyPatch) -> None:
 
 def _unheard(patch: pytest.MonkeyPatch) -> None:
     """The statuses of a cluster that has come back are not judged."""
-    look = Identities.look
+    judge = Identities.on_status
 
-    def first_only(self: Any, cluster: str) -> Any:
+    def first_only(self: Any, cluster: str, *status: Any) -> None:
         before = self._judged.get(cluster)
-        found = look(self, cluster)
+        judge(self, cluster, *status)
         if before is not None:
             self._judged[cluster] = before
-        return found
 
-    patch.setattr(Identities, "look", first_only)
+    patch.setattr(Identities, "on_status", first_only)
 
 
 def _uncompared(patch: pytest.MonkeyPatch) -> None:

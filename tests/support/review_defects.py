@@ -15,11 +15,11 @@ from heliotrope.cluster._work import Work
 from heliotrope.lcu import motion, states
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism import machine
-from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import Standing, sentinel
 from heliotrope.plant.field.identity import Identities
 from heliotrope.plant.field.lockouts import Lockouts
 from heliotrope.plant.field.witnesses import Witnesses
+from heliotrope.plant.motion.proofs import PathProofs
 from heliotrope.plant.motion.stray_beams import StrayBeams
 from heliotrope.plant.orders import guards
 from heliotrope.plant.refusals import OUT_OF_SERVICE
@@ -48,7 +48,7 @@ def written_under_a_lock(patch: pytest.MonkeyPatch) -> None:
         for each in guards.GUARDS
     ]
     patch.setattr(guards, "GUARDS", tuple(rows))
-    patch.setattr(PlantController, "_resting", lambda self, heliostat, items: "")
+    patch.setattr(PathProofs, "resting", lambda self, heliostat, items: "")
 
 
 def unlisted_unseen(patch: pytest.MonkeyPatch) -> None:
@@ -94,7 +94,7 @@ def any_stow_position(patch: pytest.MonkeyPatch) -> None:
         found = lit(self, rows)
         return found & ~np.isin(self._field.rows["state"][rows], states.STOWED)
 
-    patch.setattr(PlantController, "_resting", lambda self, heliostat, items: "")
+    patch.setattr(PathProofs, "resting", lambda self, heliostat, items: "")
     patch.setattr(StrayBeams, "lit", off_stow)
 
 

@@ -26,7 +26,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.settings import PlantSettings
@@ -143,8 +143,7 @@ class WholePlant:
             self.design,
             links,
             clock,
-            self.audit,
-            wanted=Wanted(wanted),
+            Stores(self.audit, Wanted(wanted)),
             entropy=chance.randbytes,
             **{"settings": PlantSettings(sensors=frozenset({FLUX_READING})), **options},
         )

@@ -51,7 +51,7 @@ def last_look(turned: float, until: float, unsurveyed: tuple[str, ...] = ()) -> 
     board = standing(turned)
     observer = BeamObserver(0.0, {"C1": [board]}, lambda now: SUN, (), None, unsurveyed)
     for message in (Command("a", "AIM", RECEIVER), Command("t", "TRACK")):
-        observer.sent(message, ("H01",), 0.0)
+        observer.on_command(message, ("H01",), 0.0)
     observer.resumed(("H01",), "TRACK", 0.0)
     now = 0.0
     while now < until:
@@ -85,8 +85,8 @@ def rests_in_doubt(ends_at: float, named_again_at: float, until: float) -> None:
     assert board.node is not None
     board.node.controller.state = states.APPROACHING
     observer = BeamObserver(0.0, {"C1": [board]}, lambda now: SUN, ())
-    observer.sent(Command("s", "STANDBY", (60.0, 0.0, 40.0)), ("H01",), 0.0)
-    observer.sent(Command("a", "APPROACH"), ("H01",), 0.0)
+    observer.on_command(Command("s", "STANDBY", (60.0, 0.0, 40.0)), ("H01",), 0.0)
+    observer.on_command(Command("a", "APPROACH"), ("H01",), 0.0)
     for axis in board.axes:
         axis.turned, axis.joint = axis.turned - 60_000, axis.joint - 60_000.0
     for half in range(round(2.0 * until)):
@@ -94,9 +94,9 @@ def rests_in_doubt(ends_at: float, named_again_at: float, until: float) -> None:
         if now == 1.0:
             board.node.controller.state = states.IDLE
         if now in (5.0, named_again_at):
-            observer.alarmed(alarms.COUNTS_DOUBTFUL.raised("H01"), now)
+            observer.on_alarm(alarms.COUNTS_DOUBTFUL.raised("H01"), now)
         if now == ends_at:
-            observer.ended()
+            observer.on_end(now)
         observer.look(None, {"C1"}, now)
 
 
@@ -178,7 +178,7 @@ class Scene:
         self.observer = BeamObserver(0.0, {"C1": self.boards}, lambda now: SUN, (), losses)
         self.now = 0.0
         for message in (Command("a", "AIM", RECEIVER), Command("t", "TRACK")):
-            self.observer.sent(message, NAMES, 0.0)
+            self.observer.on_command(message, NAMES, 0.0)
         self.observer.resumed(NAMES, "TRACK", 0.0)
         self.observer.given(NAMES, 0.0)
         self.passes(20.0)
@@ -192,12 +192,12 @@ class Scene:
             self.now += 0.5
             self.observer.look(None, {"C1"}, self.now)
             if self.now % 1.0 == 0.0:
-                self.observer.reported(status, NAMES, self.now)
+                self.observer.on_status(status, NAMES, self.now)
 
     def enter(self, state: int, *which: int) -> None:
         """Let mirrors enter a state, TRACKING by a command."""
         if state == states.TRACKING:
-            self.observer.sent(Command("t", "TRACK"), [NAMES[i] for i in which], self.now)
+            self.observer.on_command(Command("t", "TRACK"), [NAMES[i] for i in which], self.now)
         for i in which:
             node = self.boards[i].node
             assert node is not None
@@ -232,7 +232,7 @@ def test_what_may_be_lost_may_return() -> None:
 def test_automatic_control_need_not_wait(excuse: str) -> None:
     scene = Scene(losses=1)
     if excuse == "ordered":
-        scene.observer.ordered_off(NAMES, scene.now)
+        scene.observer.on_emergency("DEFOCUS", NAMES, scene.now)
     elif excuse == "taken":
         scene.observer.taken(NAMES)
     scene.enter(states.LOCKED if excuse == "locked" else states.DEFOCUSED, 0)

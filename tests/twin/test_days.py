@@ -16,7 +16,7 @@ from heliotrope.links.messages import Command, Stage
 from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.orders.audit import Record
 from heliotrope.plant.orders.authority import Person
-from heliotrope.safety import Alarm, Severity
+from heliotrope.safety import Act, Alarm, Severity
 from heliotrope.sun import vector
 from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.invariants import (
@@ -194,7 +194,7 @@ def test_a_persons_emergency_and_what_is_out_of_service_outlive_a_restart() -> N
         observer.emergency(on=called)
         if out:
             observer.held(("H1",), 0.0, out=True)
-        observer.ended()
+        observer.on_end(1.0)
         observer.look(new, set(), ZENITH, 1.0, governs=False)
 
     out = SimpleNamespace(out=(SimpleNamespace(name="H1"),))
@@ -237,7 +237,7 @@ def commanded(
     observer.granted(ENGINEER, 8, 0.0, seized=False)
     taken: Any = SimpleNamespace(identity="x-1", heliostats=("H1", "H2"), refusals={"H2": "no"})
     disk.records["x-1"] = Record("x-1", ENGINEER.name, "engineer", "IDLE", "")
-    observer.accepted(ENGINEER, 8, taken, "IDLE", 1.0)
+    observer.on_accepted(ENGINEER, 8, taken, "IDLE", 1.0)
     now = 1.0 + after
     if gone:
         observer.released(ENGINEER, now)
@@ -271,7 +271,7 @@ def ticked(one: Any, at: float, *, was: bool = True, stowed: bool = False) -> No
         state=states.FAULT, was_in=lambda wanted, since: was, stands_at_stow=lambda: stowed
     )
     observer = TicketObserver(0.0, {"H1": account})
-    observer.accepted(one, 1.0)
+    observer.on_accepted(ENGINEER, 1, one, "TRACK", 1.0)
     observer.look(1.0 + at, runs=True)
 
 
@@ -304,20 +304,20 @@ def alarmed(
     """
     observer = AlarmObserver(0.0, {"C1": [board(states.STOWED)]}, (DAYS,))
     if began:
-        observer.ended()
+        observer.on_end(0.0)
     for _ in range(calls):
-        observer.called()
+        observer.on_call("Ann", Act.STOW, 0.0)
     for _ in range(over):
-        observer.alarmed(
+        observer.on_alarm(
             Alarm("operator_emergency", "", Severity.ALARM, "it is over", active=False), 1.0
         )
     for now in np.arange(began, 200.0, 0.5):
-        observer.heard("C1", float(now))
+        observer.on_heard("C1", float(now))
         observer.look({"H1": rest}, {"C1"}, float(now), runs=True, writes=True)
-    observer.alarmed(Alarm(kind, "", Severity.ALARM, "three heliostats left the receiver"), 200.0)
+    observer.on_alarm(Alarm(kind, "", Severity.ALARM, "three heliostats left the receiver"), 200.0)
     if ends:
-        observer.alarmed(Alarm(kind, "", Severity.ALARM, "it is over", active=False), 200.0)
-    observer.heard("C1", 200.0)
+        observer.on_alarm(Alarm(kind, "", Severity.ALARM, "it is over", active=False), 200.0)
+    observer.on_heard("C1", 200.0)
     observer.look({"H1": rest}, {"C1"}, 200.0, runs=True, writes=True)
 
 
@@ -346,7 +346,7 @@ def visited(
     observer = ResultObserver.__new__(ResultObserver)
     accounts: dict[str, Any] = {}
     observer.__dict__.update(
-        checks=dict.fromkeys(TITLES, 0), _start=0.0, _zero=0.0, _accounts=accounts,
+        checks=dict.fromkeys(TITLES, 0), start=0.0, _zero=0.0, _accounts=accounts,
         _boards={f"H{i}": None for i in range(names)}, _dark=frozenset(), _barren=[],
         _together=True,
     )  # fmt: skip

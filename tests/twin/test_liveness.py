@@ -29,7 +29,7 @@ def line(*spans: tuple[float, bool, bool, bool]) -> None:
         while now < until:
             now += 0.5
             if leases:
-                observer.leased(now)
+                observer.on_lease(1, now)
             observer.look(now, clear=clear, connected=connected)
     assert observer.checks[16] > 0
 
@@ -69,7 +69,7 @@ def asked(reason: str, person: Person, token: int, what: str = "TRACK", at: floa
     """Refuse a command of a person, while Ann has the command authority with token 7 since 1 s."""
     observer = PlantObserver(0.0, RecordsDisk(), SETTINGS, [])
     observer.granted(ANN, 7, 1.0, seized=False)
-    observer.refused(person, token, what, reason, at)
+    observer.on_refused(person, token, (what, ()), reason, at)
 
 
 def test_a_refusal_names_the_holder_of_the_authority_and_the_role_that_lacks() -> None:
@@ -98,9 +98,9 @@ def test_a_command_refused_for_another_reason_may_renew_the_authority() -> None:
     def given(reason: str, at: float) -> None:
         observer = PlantObserver(0.0, RecordsDisk(), SETTINGS, [])
         observer.granted(ANN, 7, 1.0, seized=False)
-        observer.refused(ANN, 7, "AIM", reason, 0.95 + SETTINGS.authority)
+        observer.on_refused(ANN, 7, ("AIM", ()), reason, 0.95 + SETTINGS.authority)
         ticket: Any = SimpleNamespace(identity="x")
-        observer.accepted(ANN, 7, ticket, "AIM", at)
+        observer.on_accepted(ANN, 7, ticket, "AIM", at)
 
     busy = str(refusals.NOT_NOW.error(what="AIM", reason="a frozen cluster"))
     lost = str(refusals.NO_AUTHORITY.error(person="Ann"))
@@ -122,11 +122,11 @@ def refused() -> Callable[..., None]:
             name="A1", board=SimpleNamespace(outfit=SimpleNamespace(mechanism=None))
         )
         observer = QuietObserver.__new__(QuietObserver)
-        observer.__dict__.update(checks={16: 0}, _start=0.0)
+        observer.__dict__.update(checks={16: 0}, start=0.0)
         mirror = silent._Mirror(account, "C1", state=0, quiet_since=quiet, sure_since=sure)  # type: ignore[arg-type]
         observer.__dict__.update(_mirrors={"A1": mirror}, _quiet={"A1"} if quiet < inf else set())
         observer._refusals = []
-        observer.refused("A1", f"TRACK A1: {kind.text}", 100.0)
+        observer.on_refused(ANN, 7, ("TRACK", ("A1",)), f"TRACK A1: {kind.text}", 100.0)
         if fails:  # the fault that was the reason has just begun
             observer._quiet = frozenset()
         observer._reasoned(100.5)

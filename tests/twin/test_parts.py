@@ -5,6 +5,7 @@ import asyncio
 import contextlib
 import math
 import random
+from collections.abc import Sequence
 from contextvars import copy_context
 from importlib import import_module
 from pathlib import Path
@@ -18,7 +19,7 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.lcu import ticks, wire
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
-from heliotrope.links.messages import Emergency, Lease, encode
+from heliotrope.links.messages import Command, Emergency, Lease, encode
 from heliotrope.plant.orders.audit import AuditError, Record
 from heliotrope.plant.orders.authority import Person
 from heliotrope.safety import Alarm, Severity
@@ -30,7 +31,7 @@ from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCoun
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
 from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import RECEIVER, outfits
-from heliotrope.twin.invariants.invariants import InvariantError
+from heliotrope.twin.invariants.invariants import InvariantError, Judge
 from heliotrope.twin.invariants.plant_observer import TURN_WITHIN, PlantObserver
 from heliotrope.twin.invariants.runs import RunAccount
 from heliotrope.twin.invariants.sensors import LIMITS as SENSORS
@@ -418,11 +419,12 @@ def test_an_alarm_of_a_sensor_outlives_a_frozen_plant_but_not_a_killed_one() -> 
         observer.look(set(), 0.0, runs=True)
         for name in SENSORS:
             condition = SENSORS[name][0][0]
-            observer.alarmed(Alarm(condition, "", Severity.ALARM, "no reading", active=True))
+            alarm = Alarm(condition, "", Severity.ALARM, "no reading", active=True)
+            observer.on_alarm(alarm, 0.0)
         observer.look(set(), 10.0, runs=True)
         observer.look(set(), 20.0, runs=False)
         if killed:
-            observer.ended(21.0)
+            observer.on_end(21.0)
         observer.look(set(), 30.0, runs=True)
         if killed:
             with pytest.raises(InvariantError, match="no alarm names it"):
@@ -436,9 +438,10 @@ def test_what_a_killed_plant_still_posts_is_not_judged() -> None:
     posted: list[tuple[str, ...]] = []
 
     async def main(clock: VirtualClock) -> None:
-        pod = SimpleNamespace(addresses={"H1": 1})
+        pod = SimpleNamespace(addresses={"H1": 1}, judges=())
         plant = SimpleNamespace(posted=lambda members, message, now: posted.append(members))
-        ear = PlantEar(pod, plant, SimpleNamespace())  # type: ignore[arg-type]
+        panel = SimpleNamespace(plant=plant, each=())
+        ear = PlantEar(pod, panel)  # type: ignore[arg-type]
         data = encode(Emergency("r-1.1", "DEFOCUS", ("H1",)))
         await ear.posted(data, 0.0)
         ear.end()
@@ -446,6 +449,61 @@ def test_what_a_killed_plant_still_posts_is_not_judged() -> None:
 
     run_virtual(main)
     assert posted == [("H1",)]
+
+
+class _Log(Judge):
+    """An observer that notes what it hears, in the order in which it hears it."""
+
+    def __init__(self, name: str, heard: list[tuple[str, str]]) -> None:
+        super().__init__(0.0)
+        self._name, self._heard = name, heard
+
+    def on_lease(self, token: int, now: float) -> None:
+        del token, now
+        self._heard.append((self._name, "lease"))
+
+    def on_emergency(self, name: str, heliostats: Sequence[str], now: float) -> None:
+        del now
+        self._heard.append((self._name, f"{name} {' '.join(heliostats)}"))
+
+    def on_write(self, heliostat: str, what: str, now: float) -> None:
+        del now
+        self._heard.append((self._name, f"{what} {heliostat}"))
+
+
+def test_each_observer_hears_in_its_turn_of_what_leaves_the_plant() -> None:
+    heard: list[tuple[str, str]] = []
+    calls: Any = SimpleNamespace(known=lambda token: True, until=lambda token, at: at)
+    own: Any = SimpleNamespace(emergency=lambda *args, **kwargs: None, ordered=lambda order: None)
+    pod: Any = SimpleNamespace(
+        addresses={"H1": 1, "H2": 2},
+        file={},
+        judges=(_Log("line", heard),),
+        observer=own,
+        carried=lambda now: True,
+    )
+    panel: Any = SimpleNamespace(plant=calls, each=(_Log("beams", heard), _Log("work", heard)))
+    ear = PlantEar(pod, panel)
+    ear.sent(encode(Lease(7)), 0.0)
+    assert heard == [("line", "lease"), ("beams", "lease"), ("work", "lease")]
+    heard.clear()
+    ear.sent(encode(Emergency("r-1.1", "STOW")), 1.0)
+    assert heard == [("beams", "STOW H1 H2"), ("work", "STOW H1 H2")]
+    heard.clear()
+    ear.sent(encode(Command("r-1.2", "ZERO", (0.0, 0.0), ("H2",), 7)), 2.0)
+    assert heard == [("beams", "ZERO H2"), ("work", "ZERO H2")]
+
+
+def test_an_observer_replaces_only_hooks_that_something_calls() -> None:
+    """A misspelt hook would never be called, and what it judges never judged."""
+    hooks = {name for name in vars(Judge) if name.startswith("on_")}
+    world = Path(invariants.__path__[0]).parent / "world"
+    text = "".join(page.read_text(encoding="utf-8") for page in world.glob("*.py"))
+    assert {name for name in hooks if f".{name}(" not in text} == set()
+    observers = [kind for kind in Judge.__subclasses__() if kind is not _Log]
+    assert len(observers) > 12
+    for kind in observers:
+        assert {name for name in vars(kind) if name.startswith("on_")} <= hooks, kind
 
 
 def test_no_observer_takes_a_table_from_the_code_that_it_observes() -> None:

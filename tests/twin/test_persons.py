@@ -40,9 +40,9 @@ def looks(observer: PersonsObserver, seen: Any, *times: float) -> None:
 
 def test_an_order_stands_under_its_owners_name_until_it_is_withdrawn() -> None:
     observer = PersonsObserver(0.0, [board()])
-    observer.ordered("Ann", Act.DEFOCUS, 0.0)
-    observer.ordered("Ben", Act.STOW, 0.0)
-    observer.ordered("Ben", Act.DEFOCUS, 5.0)  # the stronger act holds
+    observer.on_call("Ann", Act.DEFOCUS, 0.0)
+    observer.on_call("Ben", Act.STOW, 0.0)
+    observer.on_call("Ben", Act.DEFOCUS, 5.0)  # the stronger act holds
     looks(observer, plant(Act.STOW, "Ann", "Ben"), 0.0, 10.0)
     with pytest.raises(InvariantError, match=r"invariant 17 .* Ben ordered STOW .* DEFOCUS holds"):
         looks(observer, plant(Act.DEFOCUS, "Ann", "Ben"), 10.0, 13.0)
@@ -60,7 +60,7 @@ def test_an_order_stands_under_its_owners_name_until_it_is_withdrawn() -> None:
 def test_no_mirror_is_up_while_an_order_stands_unless_another_plant_commands() -> None:
     for alone in (True, False):
         observer = PersonsObserver(0.0, [board(states.TRACKING)], alone=alone)
-        observer.ordered("Ann", Act.DEFOCUS, 0.0)
+        observer.on_call("Ann", Act.DEFOCUS, 0.0)
         looks(observer, None, 30.0)
         if alone:
             with pytest.raises(InvariantError, match=r"H1: TRACKING 31.5 s after Ann ordered DEFO"):
@@ -87,16 +87,16 @@ def test_a_locked_mirror_stands_still_until_the_last_lock_is_returned() -> None:
     with pytest.raises(InvariantError, match="33 steps"):
         looks(observer, None, 24.0)
     with pytest.raises(InvariantError, match=r"H1: ZERO is sent to it 24\.0 s after it was locked"):
-        observer.written("H1", "ZERO", 25.0)
+        observer.on_write("H1", "ZERO", 25.0)
     observer.returned("Ben", ["H1"])
     looks(observer, None, 25.0)
-    observer.written("H1", "ZERO", 25.0)
+    observer.on_write("H1", "ZERO", 25.0)
 
 
 def test_the_plant_has_the_locks_of_each_person_once_a_restored_store_is_confirmed() -> None:
     observer = PersonsObserver(0.0, [board()])
     observer.locked("Ann", ["H1"], 0.0)
-    observer.ordered("Ann", Act.DEFOCUS, 0.0)
+    observer.on_call("Ann", Act.DEFOCUS, 0.0)
     words = observer.words()
     observer.withdrew("Ann")
     observer.locked("Ben", ["H1"], 5.0)

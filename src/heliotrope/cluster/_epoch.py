@@ -29,6 +29,11 @@ class Epoch:
         The time at the start. Without a state file only the time makes the epoch higher than that
         of any earlier run.
 
+    Attributes
+    ----------
+    kept
+        As given.
+
     Raises
     ------
     OSError
@@ -36,7 +41,7 @@ class Epoch:
     """
 
     def __init__(self, kept: Kept, exchange: Exchange, reports: Reports, present: Time) -> None:
-        self._kept, self._exchange, self._reports = kept, exchange, reports
+        self.kept, self._exchange, self._reports = kept, exchange, reports
         self._of_time = present.usable
         self._duplicates = 0
         self._of_one: Counter[int] = Counter()  # by the place of the local controller
@@ -91,7 +96,7 @@ class Epoch:
             self._of_time = self._of_time or at_least > 0
             self._reports.clear(alarms.STATE_UNWRITABLE.ended())
 
-        self._kept.begin(at_least, stored)
+        self.kept.begin(at_least, stored)
 
     def _use(self) -> None:
         """Begin the stored epoch: only before SESSION, which tells it to the local controllers."""

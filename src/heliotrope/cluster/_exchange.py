@@ -49,13 +49,15 @@ class Exchange:
     ----------
     sender
         Makes and numbers the frames.
+    clock
+        As given.
     now
         When the last poll ended, monotonic s.
     """
 
     def __init__(self, bus: Bus, clock: Clock, answer: float, stored_answer: float) -> None:
         self.sender = Sender(wire.CLUSTER_ADDRESS, 0, sha256)
-        self._bus, self._clock = bus, clock
+        self._bus, self.clock = bus, clock
         self._sign: Sign | None = None
         self._answer, self._stored_answer = answer, stored_answer
         self._hurry = False
@@ -106,7 +108,7 @@ class Exchange:
 
     async def transmit(self, frame: bytes, *, life: float = 0.5, urgent: bool = False) -> bool:
         """Send a frame that is not answered, within ``life`` s; return whether it went out."""
-        expires = self._clock.monotonic() + life
+        expires = self.clock.monotonic() + life
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
         return outcome is SendOutcome.SENT
 
@@ -121,10 +123,10 @@ class Exchange:
         if values is None:
             frame = answer_in(data, node.address, sequence, (question.answer,)) if data else None
             if frame is None or (values := frame.values()) is None:
-                self.now = self._clock.monotonic()
+                self.now = self.clock.monotonic()
                 self._spoilt(node, data, begin)
                 return None
-        self.now = now = self._clock.monotonic()
+        self.now = now = self.clock.monotonic()
         self._answered += 1
         node.answered(now, now - begin)
         return values
@@ -152,7 +154,7 @@ class Exchange:
         sequence = self.sender.count & 0xFFFF
         expected = tuple(messages.NUMBER_OF[number] for number in numbers)
         for attempt in range(tries):
-            begin = self._clock.monotonic()
+            begin = self.clock.monotonic()
             if begin >= expires or (attempt and self._hurry):
                 break
             node.asked(again=attempt > 0)
@@ -167,7 +169,7 @@ class Exchange:
             answer = answer_in(data, node.address, sequence, expected) if data else None
             fields = None if answer is None else answer.values()
             if answer is not None and fields is not None:
-                now = self._clock.monotonic()
+                now = self.clock.monotonic()
                 self._answered += 1
                 node.answered(now, now - begin)
                 return NodeAnswer(answer.name, fields, attempt)

@@ -22,7 +22,6 @@ from heliotrope.cluster._goals import GOALS, Goals, Shift
 from heliotrope.cluster._nodes import ClusterNode, Nodes, OrderRefusedError
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster._watch import Watch
-from heliotrope.cluster.memory import Kept
 from heliotrope.lcu import messages, names, states, wire
 from heliotrope.lcu.journal import CODES_OF, ITEMS, SIZE_OF, TARGETS
 from heliotrope.links.messages import Command, Parameters, ProtocolError, Stage
@@ -108,10 +107,8 @@ class Orders:
 
     Parameters
     ----------
-    nodes, exchange, goals, reports, watch, epoch, kept
+    nodes, exchange, goals, reports, watch, epoch
         Parts of the cluster.
-    clock
-        Returns monotonic s.
     gps
         Returns the GPS time of the local controllers in s, None if they have none.
     look
@@ -126,14 +123,12 @@ class Orders:
         reports: Reports,
         watch: Watch,
         epoch: Epoch,
-        kept: Kept,
-        clock: Callable[[], float],
         gps: Callable[[], float | None],
         look: Callable[[ClusterNode], Awaitable[None]],
     ) -> None:
         self._nodes, self._exchange, self._goals, self._reports = nodes, exchange, goals, reports
-        self._watch, self._epoch, self._kept = watch, epoch, kept
-        self._clock, self._gps, self._look = clock, gps, look
+        self._watch, self._epoch, self._gps, self._look = watch, epoch, gps, look
+        self._clock = exchange.clock.monotonic
         self._ready: deque[NodeOrder] = deque()
         self._later: list[NodeOrder] = []
         self._at_work: NodeOrder | None = None
@@ -306,7 +301,7 @@ class Orders:
             if step.name != "SET_ADDRESS" and not await self._knows_edition(job):
                 return self._again(job, "no answer to QUERY_STORED before it expired")
             try:
-                edition = self._kept.next_edition(job.edition)
+                edition = self._epoch.kept.next_edition(job.edition)
             except OSError as error:
                 return self._again(job, f"the edition cannot be kept: {error.strerror}")
             if edition is None:

@@ -7,8 +7,10 @@ from heliotrope.cluster._nodes import Nodes
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster._watch import Watch
 from heliotrope.cluster._work import Work
+from heliotrope.cluster.config import ClusterConfig
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.links.clock import Clock
+from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.link import Link, LinkClosedError, SendOutcome, received
 from heliotrope.links.messages import (
     Acknowledge,
@@ -27,7 +29,6 @@ from heliotrope.links.messages import (
     encode,
 )
 from heliotrope.safety import AcknowledgeRole, Alarm, alarms
-from heliotrope.sun import Site
 
 #: Life of a message to the plant, s. The ages in a status count from when it was made: it is not
 #: sent later than `_STATUS_WAITS`, since the program may have been frozen meanwhile.
@@ -45,12 +46,8 @@ class PlantLink:
 
     Parameters
     ----------
-    cluster
-        Name of the cluster.
-    site
-        Site for which it computes the sun.
-    settings
-        Checksum of its common settings, see `links.common_settings`.
+    config
+        Name of the cluster, the site for which it computes the sun, and its common settings.
     link, clock, nodes, watch, work, reports
         Parts of the cluster.
     wake
@@ -59,9 +56,7 @@ class PlantLink:
 
     def __init__(
         self,
-        cluster: str,
-        site: Site,
-        settings: str,
+        config: ClusterConfig,
         link: Link,
         clock: Clock,
         nodes: Nodes,
@@ -70,9 +65,9 @@ class PlantLink:
         reports: Reports,
         wake: Callable[[], None],
     ) -> None:
-        self._cluster, self._link, self._clock, self._nodes = cluster, link, clock, nodes
+        self._cluster, self._link, self._clock, self._nodes = config.name, link, clock, nodes
         self._watch, self._work, self._reports, self._wake = watch, work, reports, wake
-        self._site, self._settings = site.numbers, settings
+        self._site, self._settings = config.site.numbers, settings_checksum(config.common)
         self._names = tuple(node.name for node in nodes)
         self._opened = -1
         self._was_connected = False

@@ -43,7 +43,6 @@ from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Time, TimeKeeper
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
-from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.keys import KeyRing
 from heliotrope.links.link import Bus, Link, LinkClosedError, LinkError
 from heliotrope.safety import Alarm
@@ -123,8 +122,6 @@ class Cluster:
             reports,
             self._watch,
             epoch,
-            kept,
-            clock.monotonic,
             self._broadcast.bus_time,
             self._polling.look,
         )
@@ -134,9 +131,7 @@ class Cluster:
         )
         self._wake = asyncio.Event()
         self._plant = PlantLink(
-            config.name,
-            config.site,
-            settings_checksum(config.common),
+            config,
             link,
             clock,
             self.nodes,

@@ -100,9 +100,11 @@ def items_of(mechanism: Mechanism, machine: Machine | None = None) -> dict[str, 
     return {name: packed(name, values) for name, values in numbers.items()}
 
 
-def tables_with(
-    items: Mapping[str, bytes], armature: FloatArray, table: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+#: Armature (18,) and drives (2, 19) of one heliostat.
+Tables = tuple[FloatArray, FloatArray]
+
+
+def tables_with(items: Mapping[str, bytes], armature: FloatArray, table: FloatArray) -> Tables:
     """Return the armature (18,) and the drives (2, 19) of a mechanism once items are stored.
 
     The inverse of `items_of`, as far as the pose is concerned.

@@ -10,7 +10,7 @@ chooses which heliostat is measured next. `kept_audit` needs the store's librari
 from its module.
 """
 
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.field.aims import BeamCheck, default_aims, spread
 from heliotrope.plant.field.assigned import Assigned, AssignedError, AssignedFile, rest_on
@@ -44,6 +44,7 @@ __all__ = [
     "Refusal",
     "RefusedError",
     "Role",
+    "Stores",
     "Ticket",
     "clusters_of",
     "default_aims",

@@ -22,12 +22,12 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
 from heliotrope.links.link import running
 from heliotrope.mechanism.board_items import items_of
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.emergency import at_stow
 from heliotrope.plant.field.assigned import rest_on
 from heliotrope.plant.io.sensors import Sensors
-from heliotrope.plant.operations.automatic import AutomaticSettings
-from heliotrope.plant.operations.calibrating import Scheduling
+from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
+from heliotrope.plant.operations.calibrating import Scheduling, Visits
 from heliotrope.plant.operations.foresight import Prospect
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
@@ -133,41 +133,30 @@ class PlantAssembly:
             design,
             self.logbook.tapped(ports.links),
             ports.clock,
-            ports.audit,
+            Stores(ports.audit, assigned=ports.assigned, record=ports.records, disk=ports.disk),
             settings=replace(chosen.plant, sensors=chosen.plant.sensors | fed),
-            assigned=ports.assigned,
             on_alarm=self.logbook.take_alarm,
-            disk=ports.disk,
-            record=ports.records,
         )
         cameras = ports.cameras if design.targets else None
-        cycle = joint = receiver = None
-        if cameras is not None:
-            eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
-            unhidden = Unhidden(self.plant, ports.worker)
-            cycle = CalibrationCycle(
-                self.plant, eye, chosen.cycle, Centring(), unhidden, ports.worker
-            )
-            if design.joint_visits is not None:
-                joint = JointCycle(self.plant, eye, cycle, design.joint_visits)
-            if design.receiver_visits is not None:
-                receiver = ReceiverCycle(self.plant, eye, cycle, design.receiver_visits)
-        self.schedule = None if cycle is None else self._schedule(cycle)
-        self.operations = Operations(
+        self.schedule: PlantSchedule | None = None
+        automatic = AutomaticControl(
             self.plant,
             self.logbook,
-            cycle,
-            cameras={} if cameras is None else dict.fromkeys(self._seen(cameras), cameras),
-            scheduler=self._watched(cameras),
+            None if cameras is None else self._visits(cameras),
             records=ports.records,
             truth=ports.truth,
             settings=chosen.work,
+            learner=ports.learner,
+        )
+        self.operations = Operations(
+            self.plant,
+            self.logbook,
+            automatic,
+            cameras={} if cameras is None else dict.fromkeys(self._seen(cameras), cameras),
+            records=ports.records,
             extra=ports.facts,
             pictures=ports.pictures,
             marking=None if cameras is None else self._marking(cameras),
-            learner=ports.learner,
-            joint=joint,
-            receiver=receiver,
         )
         #: When each heliostat last moved, or was ordered to, on its way to stow at the end.
         self._moved_at = np.full(len(self.names), math.inf)
@@ -207,16 +196,24 @@ class PlantAssembly:
         made.resume()
         return made
 
-    def _schedule(self, cycle: CalibrationCycle) -> PlantSchedule:
+    def _visits(self, cameras: Cameras) -> Visits:
+        """Return the visits that the design and its cameras allow, and make their schedule."""
+        plant, design, ports, settings = self.plant, self.design, self.ports, self.settings.cycle
+        eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
+        unhidden = Unhidden(plant, ports.worker)
+        cycle = CalibrationCycle(plant, eye, settings, Centring(), unhidden, ports.worker)
         scheduler = Scheduler(
-            self.design, settings_for(cycle.settings), now=self.clock.utc(), names=self.names
+            design, settings_for(settings), now=self.clock.utc(), names=self.names
         )
-        return PlantSchedule(self.plant, scheduler)
-
-    def _watched(self, cameras: Cameras | None) -> Scheduling | None:
-        if cameras is None or self.schedule is None:
-            return None
-        return _WhereAwake(self.schedule, cameras)
+        self.schedule = PlantSchedule(plant, scheduler)
+        joint, receiver = design.joint_visits, design.receiver_visits
+        return Visits(
+            cycle,
+            _WhereAwake(self.schedule, cameras),
+            None if joint is None else JointCycle(plant, eye, cycle, joint),
+            None if receiver is None else ReceiverCycle(plant, eye, cycle, receiver),
+            ports.pictures,
+        )
 
     def _rest_on_machines(self) -> None:
         """Take the standby points of the plant file for all heliostats that were assigned none."""

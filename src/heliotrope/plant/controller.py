@@ -13,10 +13,10 @@ emergency.
 import asyncio
 import math
 import secrets
-import struct
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,11 +25,9 @@ import numpy.typing as npt
 from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
-from heliotrope.field.volumes import Volume
 from heliotrope.files.disk import AtOnce, Disk
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages
-from heliotrope.lcu.journal import CODES_OF
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.common_settings import settings_checksum
 from heliotrope.links.link import Link
@@ -40,9 +38,8 @@ from heliotrope.links.messages import (
     Lease,
     Progress,
     ProtocolError,
-    Stage,
 )
-from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of, tables_with
+from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant import refusals
 from heliotrope.plant.emergency import (
@@ -54,7 +51,7 @@ from heliotrope.plant.emergency import (
 )
 from heliotrope.plant.field.agreement import Agreement
 from heliotrope.plant.field.aims import BeamCheck, default_aims
-from heliotrope.plant.field.assigned import KINDS, Assigned, Points
+from heliotrope.plant.field.assigned import Assigned, Points
 from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.field.cluster_alarms import ClusterAlarms
 from heliotrope.plant.field.cluster_settings import ClusterSettings
@@ -66,6 +63,8 @@ from heliotrope.plant.field.identity import Identities
 from heliotrope.plant.field.ledger import Ledger
 from heliotrope.plant.field.lockouts import Lockouts
 from heliotrope.plant.field.locks import Locks
+from heliotrope.plant.field.part import Part
+from heliotrope.plant.field.row_names import RowNames
 from heliotrope.plant.field.second_plant import SecondPlant
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.field.witnesses import Witnesses
@@ -80,9 +79,10 @@ from heliotrope.plant.orders.giving_back import GivingBack
 from heliotrope.plant.orders.guards import Asked, Guards
 from heliotrope.plant.orders.joining import JoinQueue
 from heliotrope.plant.orders.movements import Movements
-from heliotrope.plant.orders.parameters import ParameterSync, Tables, change_of_beam
+from heliotrope.plant.orders.parameters import ParameterSync, change_of_beam
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.stepping import Stepping
+from heliotrope.plant.orders.taken import Taken
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.orders.unacknowledged import Unacknowledged
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
@@ -94,8 +94,31 @@ from heliotrope.sun import fast_vector
 _SAME = 0.25
 #: Pause between two passes over parameters and owed records, s.
 _SLOW_BEAT = 1.0
-#: A cluster is asked again for the names of its rows after this time, s.
-_ASK_NAMES = 5.0
+
+
+@dataclass(frozen=True)
+class Stores:
+    """What outlives a program of the plant.
+
+    Attributes
+    ----------
+    audit
+        Audit of accepted commands.
+    wanted
+        Parameters that local controllers should store.
+    assigned
+        Store of aims and standby points; None: they end with the program.
+    record
+        Store of the emergency that stands; None: it ends with the program.
+    disk
+        Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
+    """
+
+    audit: Audit
+    wanted: Wanted = field(default_factory=Wanted)
+    assigned: Assigned | None = None
+    record: EmergencyRecord | None = None
+    disk: Disk | None = None
 
 
 class PlantController:
@@ -109,28 +132,16 @@ class PlantController:
         Links by name of the cluster; the owner runs them, for example by a `TcpServer`.
     clock
         Clock of the plant; everything is timed by its monotonic time.
-    audit
-        Audit of accepted commands.
-    clusters
-        Names of the heliostats of each cluster; None: the design's.
+    stores
+        What outlives this program.
     settings
         Times and limits.
-    volumes, eyes
-        Keep-out volumes; eyes that may look into beams, ENU, m, (P, 3); None: the design's.
-    wanted
-        Parameters that local controllers should store.
-    assigned
-        Store of aims and standby points that outlives a restart; None: they are not kept.
     table
         Rows of the safety table; None: those of the design at the autonomy of the settings.
     entropy
         Source of random bytes for tokens and identities.
     on_alarm
         Called with each alarm.
-    disk
-        Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
-    record
-        Store of the emergency that stands; None: it ends with the program.
 
     Attributes
     ----------
@@ -157,9 +168,7 @@ class PlantController:
     Raises
     ------
     InputError
-        A cluster without a link, or a link without a cluster.
-    UnknownNameError
-        A cluster has a heliostat that the design does not know.
+        A cluster without a link, a link without a cluster, or a heliostat without a cluster.
     """
 
     def __init__(
@@ -167,33 +176,26 @@ class PlantController:
         design: Plant,
         links: Mapping[str, Link],
         clock: Clock,
-        audit: Audit,
+        stores: Stores,
         *,
-        clusters: Mapping[str, Sequence[str]] | None = None,
         settings: PlantSettings | None = None,
-        volumes: Sequence[Volume] | None = None,
-        eyes: npt.ArrayLike | None = None,
-        wanted: Wanted | None = None,
-        assigned: Assigned | None = None,
         table: Iterable[Condition] | None = None,
         entropy: Callable[[int], bytes] = secrets.token_bytes,
         on_alarm: Callable[[Alarm], None] | None = None,
-        disk: Disk | None = None,
-        record: EmergencyRecord | None = None,
     ) -> None:
-        members = _checked(design, links, clusters)
+        members = _checked(design, links)
         self.design, self.settings = design, settings or PlantSettings()
         self.clock, self._on_alarm = clock, on_alarm
         self.alarms, self.counters = deque[Alarm](maxlen=1000), Counters()
         self.field = FieldState(members, self.settings.stale)
         self.ledger = Ledger(self.field)
         self.authority = Authority(clock, self.settings.authority, entropy)
-        self.wanted = wanted or Wanted()
-        self.beams = BeamCheck(design, self.field.names, volumes, eyes)
+        self.wanted = stores.wanted
+        self.beams = BeamCheck(design, self.field.names)
         self.beliefs = Beliefs(design)
         self.beliefs.subscribe(self._believe)
         self.lockouts = Lockouts(design)
-        points = Points(self.field.names, assigned)
+        points = Points(self.field.names, stores.assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self.movements = Movements(design.receivers, self.beams.armature)
         resting = (name for name, each in self.beams.machines.items() if each.rests)
@@ -207,40 +209,32 @@ class PlantController:
         self.movements.recall(points.held["LENT"])
         self._agreement = self._compared(points)
         self._clusters = Clusters(members, links, clock, self.counters)
+        self._joining = JoinQueue(
+            self.settings.join_rate, self.settings.join_burst, self.settings.join_wait
+        )
         self._identities = Identities(
             self.field,
             self.beams.armature.table,
             self.wanted.items,
             self._clusters.connection,
             self._tell,
+            self._joining.drop,
         )
         self.witnesses = Witnesses(
             self.settings.witnesses, design.site, lambda: clock.utc().timestamp(), self._tell
         )
         self.drive_checks, self.doubtful = self._doubting()
         self.name = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
-        self._second_plant, self._told_alarms = SecondPlant(self.name, self._tell), ClusterAlarms()
-        self._cluster_settings = ClusterSettings(self._tell, _expected(self.settings))
-        self._firmware = Firmware(self.settings.firmware, self._clusters, self._tell)
-        self._orders = self._ordering(clock, audit, disk or AtOnce())
-        self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
-        self._sync = ParameterSync(
-            self.field,
-            self.wanted,
-            self._orders,
-            self._clusters,
-            self._tell,
-            self._rewriting,
-            self._resting,
-            self._unwritable,
-        )
-        self.sentinel = self._guarded(table, record)
+        self._second_plant = SecondPlant(self.name, self._tell)
+        self._orders = self._ordering(stores.audit, stores.disk or AtOnce())
+        self._taken = Taken(self.movements, self.locks, self.stepping, points, self._orders.owe)
+        self._sync = self._syncing()
+        self.sentinel = self._guarded(table, stores.record)
         self._given = Unacknowledged(self.field, points)
         self.guards = self._guarding()
         self.commands = self._directed()
-        self._joiner = self._dispatching()
-        self._giving_back = self._returning()
-        self._named_at, self._slow_at = dict.fromkeys(members, -math.inf), -math.inf
+        self._parts = self._listed()
+        self._slow_at = -math.inf
         self._closing = asyncio.Event()
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
 
@@ -258,19 +252,30 @@ class PlantController:
             checks.stalled,
         )
 
-    def _ordering(self, clock: Clock, audit: Audit, disk: Disk) -> PlantOrders:
+    def _ordering(self, audit: Audit, disk: Disk) -> PlantOrders:
         """Return what follows accepted commands to their ends."""
         return PlantOrders(
-            clock,
+            self.clock,
             self.authority,
             audit,
             disk,
             self._clusters,
             self.name,
-            self.settings.lifetime,
-            self.settings.patience,
-            self.settings.stow_rate,
+            self.settings,
             self._sent,
+        )
+
+    def _syncing(self) -> ParameterSync:
+        """Return what compares and writes the parameters of local controllers."""
+        return ParameterSync(
+            self.field,
+            self.wanted,
+            self._orders,
+            self._clusters,
+            self._tell,
+            self._proofs,
+            self._unwritable,
+            self._writing,
         )
 
     def _guarded(
@@ -288,19 +293,17 @@ class PlantController:
             self.sun_vector,
         )
         return Sentinel(
-            self.clock,
             TableWatch(
                 table,
                 readings,
                 self.field.clusters,
                 self.settings.sensors | self.settings.given,
                 self.now(),
+                self._tell,
             ),
-            self.field,
             self._orders,
             self._joining,
             self._watch,
-            self.beams.drives,
             self.settings.repeat,
             self._identities,
             self.drive_checks,
@@ -324,6 +327,34 @@ class PlantController:
             self.aims,
         )
 
+    def _listed(self) -> tuple[Part, ...]:
+        """Return the parts, in the order in which each hook is called."""
+        return (
+            # First at a beat, so that nothing begins that the safety table forbids by now; and
+            # first at a cluster that has connected, which repeats an emergency before all else.
+            self.sentinel,
+            self._dispatching(),
+            self._orders,
+            # After new orders, which may take what a visit has left.
+            self._returning(),
+            self.ledger,
+            self._agreement,
+            self._given,
+            ClusterSettings(self._tell, _expected(self.settings)),
+            self._second_plant,
+            ClusterAlarms(self._tell),
+            # These judge a status before the sentinel proves anything by it (`on_rows`).
+            self._identities,
+            self.doubtful,
+            self.drive_checks,
+            RowNames(self.field, self._clusters),
+            self.witnesses,
+            Firmware(self.settings.firmware, self._clusters, self._tell),
+            self._taken,
+            # Last: what it compares and writes depends on points that the others have taken.
+            self._sync,
+        )
+
     def _compared(self, points: Points) -> Agreement:
         """Return what compares reports with the plant's own knowledge."""
         return Agreement(
@@ -339,8 +370,6 @@ class PlantController:
     def _directed(self) -> Commands:
         """Return what gives people's commands."""
         return Commands(
-            self.now,
-            self.field,
             self._orders,
             self._joining,
             self.guards,
@@ -348,21 +377,17 @@ class PlantController:
             self._proofs,
             self.design,
             self.wanted,
-            self.settings.join_wait,
-            self.movements,
-            self.locks,
-            self.stepping,
-            self.authority,
+            self._taken,
         )
 
     def _dispatching(self) -> JoinDispatcher:
         """Return what sends heliostats whose turn to join has come."""
         return JoinDispatcher(
-            self.now,
             self._joining,
             self._orders,
             self._proofs,
             self.settings.join_life,
+            lambda: bool(self.sentinel.refusal(("",))),
             self.guards,
             self.commands.examine,
         )
@@ -375,9 +400,7 @@ class PlantController:
             self._orders,
             self.guards,
             self.commands,
-            self.movements,
-            self.locks,
-            self.stepping,
+            self._taken,
             lambda names: self.stow("plant", names),
         )
 
@@ -411,10 +434,9 @@ class PlantController:
         return Lease(self.authority.token, settings.lease, settings.autonomy, self.name)
 
     def _greet(self, end: ClusterEnd) -> None:
-        """Repeat orders to a cluster that has connected, and compare its parameters."""
-        self.sentinel.greet(end.name)
-        self._sync.greet(end.members)
-        self._firmware.greet(end.name, self.now())
+        now = self.now()
+        for part in self._parts:
+            part.on_connected(end.name, now)
 
     def _take(self, end: ClusterEnd, message: object, now: float) -> None:
         match message:
@@ -423,11 +445,11 @@ class PlantController:
             case Progress():
                 found = self._orders.take(end.name, message)
                 if found is not None:
-                    self.sentinel.take_progress(*found, message)
-                    self._obeyed(*found, message.stage, now)
+                    for part in self._parts:
+                        part.on_stage(*found, message.stage, now)
             case Alarm():
-                for alarm in self._told_alarms.take(end.name, message):
-                    self._tell(alarm)
+                for part in self._parts:
+                    part.on_alarm(end.name, message)
             case Answer():
                 self._clusters.take_answer(message)
             case _:
@@ -443,45 +465,16 @@ class PlantController:
         now: float,
         again: bool,
     ) -> None:
-        """Note what has been sent to heliostats."""
-        self._agreement.sent(name, values, heliostats)
-        self.ledger.sent(name, heliostats, now, again=again)
-
-    def _obeyed(self, ticket: Ticket, part: Sequence[str], stage: Stage, now: float) -> None:
-        """Note what some heliostats of a ticket have acknowledged or done."""
-        if stage is Stage.DONE and ticket.name == "DIAGNOSE":
-            self.drive_checks.ask(part)
-        if stage is Stage.ACKNOWLEDGED:
-            self.ledger.acknowledged(ticket.name, ticket.accepted_at, part, now)
-        elif stage is Stage.REFUSED:
-            self.ledger.refused(ticket.name, part, now)
-        elif stage is Stage.DONE and ticket.name in KINDS:
-            self._given.done(ticket, part)
-            for name in self.wanted.missing.keys() & part:
-                self._sync.compare(name)
+        for part in self._parts:
+            part.on_sent(name, values, heliostats, now, again)
 
     def _take_status(self, end: ClusterEnd, status: ClusterStatus, now: float) -> None:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
-        self._sync.greet(self.field.restarted)
-        self._agreement.take(end.name, status)
-        self._cluster_settings.take(end.name, status, now)
-        self._second_plant.take(end.name, status)
-        for alarm in self._told_alarms.compare(end.name, status):
-            self._tell(alarm)
-        self._give_up(self._identities.look(end.name))
-        self.doubtful.look(end.name)
-        self.drive_checks.look(end.name)
-        if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
-            # The message that names the rows was lost; the statistics come in the same order.
-            self._named_at[end.name] = now
-
-            def learn(answer: Answer) -> None:
-                if "error" not in answer.data:
-                    self.field.learn_order(end.name, tuple(answer.data))
-
-            self._clusters.ask(end, "statistics", learn)
-        self.sentinel.take_rows(end.name, now)
+        for part in self._parts:
+            part.on_status(end.name, status, now)
+        for part in self._parts:
+            part.on_rows(end.name, now)
 
     async def _beats(self) -> None:
         while True:
@@ -490,32 +483,19 @@ class PlantController:
             await sleep_until(self.clock, due)
 
     def _beat(self, now: float) -> None:
-        for alarm in self.sentinel.beat(now):
-            self._tell(alarm)
-        token = self.authority.token
-        self._joiner.beat(now, self.authority.lost, held=bool(self.sentinel.refusal(("",))))
-        self._orders.beat(now)
-        self._giving_back.beat(now)
-        slow = now - self._slow_at >= _SLOW_BEAT
-        if self._orders.owing or slow:
+        for part in self._parts:
+            part.on_beat(now)
+        second = now - self._slow_at >= _SLOW_BEAT
+        if self._orders.owing or second:
             self._orders.pay()
-        if slow:
+        if second:
             self._slow_at = now
-            self.witnesses.beat()
-            self._firmware.beat(now)
-            points, held = self._proofs.points, self._held()
-            for work in (points.settling(), points.released(held, now)):
-                if work is not None:
-                    self._orders.owe(work)
-            self._sync.beat(now, token, not self.sentinel.refusal(self.field.clusters))
+            for part in self._parts:
+                part.on_second(now)
 
-    def _held(self) -> dict[str, frozenset[str]]:
-        """Return the heliostats of which visits hold something, by kind (`assigned.HELD`)."""
-        return {
-            "LOCKED": self.locks.names,
-            "LENT": self.movements.names,
-            "ROUGH": self.stepping.lent,
-        }
+    def _writing(self) -> int:
+        """Return the token under which parameters may be written now, 0 if none may be."""
+        return 0 if self.sentinel.refusal(self.field.clusters) else self.authority.token
 
     def _tell(self, alarm: Alarm) -> None:
         self.alarms.append(alarm)
@@ -818,7 +798,7 @@ class PlantController:
         self.wanted.check(heliostat, items)
         if reason := self._unwritable(heliostat):
             raise BeamError("PARAMETERS", {heliostat: reason})
-        before, after = self._tables(heliostat, items)
+        before, after = self._proofs.tables(heliostat, items)
         self.authority.check(person, token, "PARAMETERS")
         self._sync.check(heliostat, items)
         if POSE_ITEMS.intersection(items):
@@ -832,7 +812,7 @@ class PlantController:
 
         def use() -> None:
             self.wanted.set(heliostat, items)
-            self._use(row, *self._tables(heliostat, items)[1])
+            self._use(row, *self._proofs.tables(heliostat, items)[1])
             self._joining.drop("its parameters are being written", frozenset([heliostat]))
             if record is not None:
                 self.beliefs.take(record)
@@ -844,18 +824,7 @@ class PlantController:
         """Use an armature (18,) and drives (2, 19) in proofs, and to compare the pointing."""
         self.beams.replace(row, armature, drives)
         self._agreement.believe(row, armature, drives)
-        self._give_up(self._identities.learn(row, armature))
-
-    def _give_up(self, heliostats: tuple[str, ...]) -> None:
-        """Let heliostats that are not what they seem wait no longer to join."""
-        if heliostats:
-            self._joining.drop(self._identities.strange[heliostats[0]], frozenset(heliostats))
-
-    def _tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
-        """Return the tables of a heliostat's mechanism now, and once items are stored."""
-        row = self.field.place(heliostat)
-        before = self.beams.armature.table[row].copy(), self.beams.drives.table[row].copy()
-        return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
+        self._identities.learn(row, armature)
 
     @contextmanager
     def unverified(self, heliostat: str) -> Iterator[None]:
@@ -870,23 +839,10 @@ class PlantController:
         """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
         return self._proofs.misled(heliostat, point)
 
-    def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
-        return self._proofs.rewriting(heliostat, *self._tables(heliostat, items)[1])
-
     def _unwritable(self, heliostat: str) -> str | None:
         """Return why nothing may be written to a heliostat, None if it may."""
         asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
         return self.guards.reasons(asked, *kinds).get(heliostat)
-
-    def _resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
-        """Return why a heliostat may not rest at the stow position in items, "" if it may."""
-        if "stow" not in items:
-            return ""
-        counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
-        armature, drives = self._tables(heliostat, items)[1]
-        rows = np.array([self.field.place(heliostat)])
-        found = self.beams.standing(rows, counts, (armature[None], drives[None]))
-        return found.get(heliostat, "")
 
     def _differing(self, heliostat: str) -> str | None:
         return self._sync.differing(heliostat)
@@ -935,17 +891,13 @@ def _expected(settings: PlantSettings) -> str:
     return "" if settings.common is None else settings_checksum(settings.common)
 
 
-def _checked(
-    design: Plant, links: Mapping[str, Link], clusters: Mapping[str, Sequence[str]] | None
-) -> Mapping[str, Sequence[str]]:
+def _checked(design: Plant, links: Mapping[str, Link]) -> Mapping[str, Sequence[str]]:
     """Return the heliostats of each cluster, which must have a link each."""
-    members = clusters_of(design) if clusters is None else clusters
+    members = clusters_of(design)
     odd = sorted(set(members) ^ set(links))
     if odd:
         raise InputError(
             f"plant: cluster {odd[0]} has heliostats or a link, but not both; correct the plant "
             "file or the links"
         )
-    for name in (name for names in members.values() for name in names):
-        design.find(name)
     return members

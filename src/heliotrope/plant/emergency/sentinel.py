@@ -15,7 +15,7 @@ import numpy as np
 from heliotrope.lcu import messages, states
 from heliotrope.lcu import names as meanings
 from heliotrope.links.clock import Clock
-from heliotrope.links.messages import Progress, Stage
+from heliotrope.links.messages import Stage
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.emergency.order import (
     EmergencyOrder,
@@ -25,12 +25,12 @@ from heliotrope.plant.emergency.standing import Call, EmergencyRecord, Standing,
 from heliotrope.plant.emergency.table import ORDERED, TableWatch
 from heliotrope.plant.field.drive_checks import DriveChecks
 from heliotrope.plant.field.identity import Identities
-from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.joining import JoinQueue
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.tickets import Ticket
-from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act, Alarm
+from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act
 from heliotrope.store.records import StoreError
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
@@ -51,19 +51,15 @@ _AGAIN = ("plant", "plant")
 _NIGHT = ("the sun is down", "plant")
 
 
-class Sentinel:
+class Sentinel(Part):
     """Obedience to the safety table, and every emergency up to its proof.
 
     Parameters
     ----------
-    clock
-        Clock of the plant.
     table
         The plant's rows of the safety table.
-    field, orders, joining, watch
+    orders, joining, watch
         Of the plant.
-    drives
-        Of the heliostats, (N, 2), for the proof.
     repeat
         Pause between two repetitions of an order, s.
     identities
@@ -88,18 +84,16 @@ class Sentinel:
 
     def __init__(
         self,
-        clock: Clock,
         table: TableWatch,
-        field: FieldState,
         orders: PlantOrders,
         joining: JoinQueue,
         watch: BeamWatch,
-        drives: Drive,
         repeat: float,
         identities: Identities,
         drive_checks: DriveChecks,
         record: EmergencyRecord | None = None,
     ) -> None:
+        clock, field = orders.clock, watch.proofs.field
         self.order: EmergencyOrder | None = None
         self.on = False
         self.night: str = ""
@@ -115,7 +109,7 @@ class Sentinel:
         table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
         self._orders, self._joining, self._watch = orders, joining, watch
-        self._drives, self._repeat, self._identities = drives, repeat, identities
+        self._repeat, self._identities = repeat, identities
         self._drive_checks = drive_checks
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
@@ -125,8 +119,8 @@ class Sentinel:
 
     # -- the table -------------------------------------------------------------------------
 
-    def beat(self, now: float) -> list[Alarm]:
-        """Evaluate the table and do what it demands; return the alarms raised and ended."""
+    def on_beat(self, now: float) -> None:
+        """Evaluate the table, do what it demands, and report its alarms."""
         proof = self.order.proof if self.on and self.order is not None else None
         self._unproven = {n: at for n, at in self._unproven.items() if now - at < _PROVEN_SHOWS}
         news = self.table.evaluate(proof, self._unproven, called=bool(self._calls), now=now)
@@ -135,7 +129,8 @@ class Sentinel:
         self._obey_clusters()
         self._obey_heliostats(now)
         self._keep(now)
-        return news
+        for alarm in news:
+            self.table.tell(alarm)
 
     def _obey_field(self, now: float) -> None:
         wanted, caused = self.table.demanded(), self.table.caused()
@@ -333,8 +328,9 @@ class Sentinel:
             self._orders.emergency(ticket, act, heliostats)
         return ticket
 
-    def greet(self, cluster: str) -> None:
+    def on_connected(self, cluster: str, now: float) -> None:
         """Send a cluster that has connected the order that it missed."""
+        del now
         self._acts.pop(cluster, None)
         self._repeat_order([cluster])
 
@@ -358,8 +354,8 @@ class Sentinel:
         if name == FLUX_READING and self.order is not None:
             self.order.take_flux(value, at)
 
-    def take_progress(
-        self, ticket: Ticket, heliostats: tuple[str, ...], progress: Progress
+    def on_stage(
+        self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
         """Take a cluster's report on a ticket, if it is the order's ticket.
 
@@ -369,7 +365,6 @@ class Sentinel:
         order = self.order
         if order is None or ticket is not order.ticket:
             return
-        stage = progress.stage
         if stage is Stage.DONE:
             flags = self._field.rows["flags"]
             good = (flags & meanings.COUNTS_UNKNOWN == 0) & ~switched_off(flags)
@@ -378,9 +373,9 @@ class Sentinel:
             )
             if self._watch.stray.watches:
                 stage = Stage.ACKNOWLEDGED
-        order.take_stage(heliostats, stage, self._clock.monotonic())
+        order.take_stage(heliostats, stage, now)
 
-    def take_rows(self, cluster: str, now: float) -> None:
+    def on_rows(self, cluster: str, now: float) -> None:
         """Update the proof of the order from a cluster's new status."""
         order, names = self._proving, self._field.members[cluster]
         if not self.on:
@@ -398,7 +393,7 @@ class Sentinel:
                 self._field.rows[index],
                 self._field.heard[index],
                 self._field.counted_at[index],
-                Drive(self._drives.table[index]),
+                Drive(self._watch.proofs.paths.check.drives.table[index]),
                 now,
                 np.array([bool(self._doubted(self._field.names[r])) for r in rows]),
                 lit,

@@ -69,7 +69,7 @@ class PlantReadings:
 
     Parameters
     ----------
-    field, authority, orders, beams, agreement
+    field, authority, orders, watch, agreement
         Of the plant.
     sun
         Returns the unit vector to the sun now, (3,).
@@ -85,15 +85,15 @@ class PlantReadings:
         field: FieldState,
         authority: Authority,
         orders: PlantOrders,
-        beams: BeamWatch,
+        watch: BeamWatch,
         agreement: Agreement,
         sun: Callable[[], FloatArray],
     ) -> None:
         self._field, self._authority, self._orders = field, authority, orders
-        self._beams, self._agreement, self._sun = beams, agreement, sun
+        self._watch, self._agreement, self._sun = watch, agreement, sun
         self._sun_at = -math.inf
         self._elevation = -0.5 * np.pi
-        self.names = OWN_READINGS | beams.watched
+        self.names = OWN_READINGS | watch.watched
 
     def take(
         self, proof: Proof | None, unproven: Mapping[str, float], *, called: bool, now: float
@@ -124,7 +124,7 @@ class PlantReadings:
             ("node_fault_share", ""): Reading(self._field.failed_share(now), now),
             ("unproven", ""): Reading(0.0, now),
             **{("unproven", n): Reading(float(at > now), now) for n, at in unproven.items()},
-            **self._beams.readings(now),
+            **self._watch.readings(now),
             **self._agreement.readings(now),
         }
         for name, at in self._field.status_at.items():
@@ -172,7 +172,9 @@ class TableWatch:
         clusters: Sequence[str],
         sensors: Iterable[str],
         now: float,
+        tell: Callable[[Alarm], None],
     ) -> None:
+        self.tell = tell
         table = watched_by(rows, Watcher.PLANT)
         self._sensors = frozenset(sensors)
         known = {row.reading for row in table} - OWN_READINGS | set(DERIVED.values())

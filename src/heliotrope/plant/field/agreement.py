@@ -13,7 +13,7 @@ it is turned away, on its way, locked, or at stow by the counts that it stores i
 is to be compared.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from zlib import crc32
 
 import numpy as np
@@ -30,6 +30,7 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.field.aims import BeamCheck
 from heliotrope.plant.field.assigned import Points, differ, put_before
 from heliotrope.plant.field.ledger import TO_REST, Ledger
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState, Mask
 from heliotrope.safety import Reading
 from heliotrope.sun import Site, fast_vector
@@ -94,7 +95,7 @@ class _Points:
         return error
 
 
-class Agreement:
+class Agreement(Part):
     """Comparison of what clusters and heliostats report with what the plant knows itself.
 
     Parameters
@@ -148,16 +149,25 @@ class Agreement:
         """Take new parameters, which hold once the local controller reports their checksum."""
         self._pending[row] = crc32(packed("armature", tuple(armature))), armature, drives
 
-    def sent(self, name: str, values: Sequence[float], heliostats: Collection[str]) -> None:
+    def on_sent(
+        self,
+        name: str,
+        values: Sequence[float],
+        heliostats: Sequence[str],
+        now: float,
+        again: bool,
+    ) -> None:
         """Note how far a command that has been sent lets beams go."""
+        del now, again
         if name == "SEARCH":
             rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
             # One that searches already goes on with its spiral if it refuses the new one.
             searches = self._field.rows["state"][rows] == states.SEARCHING
             self._radius[rows] = np.fmax(values[1], np.where(searches, self._radius[rows], np.nan))
 
-    def take(self, cluster: str, status: ClusterStatus) -> None:
-        """Take a cluster's status that has just arrived."""
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
+        """Take the time and the site that a cluster reports."""
+        del now
         utc_s = self._utc()
         if status.time_quality != "none":
             self._time_off[cluster] = abs(status.utc_s - utc_s)

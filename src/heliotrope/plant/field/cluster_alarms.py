@@ -1,22 +1,41 @@
 """The alarms that clusters have told of, compared with those that they list in their statuses."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from heliotrope.links.messages import ClusterStatus
+from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 
 _Key = tuple[str, str]
 
 
-class ClusterAlarms:
+class ClusterAlarms(Part):
     """Alarms of clusters, each told once though it is repeated, and ended though its end was lost.
 
     A message may be lost with its connection, or come when the plant's program stands still. So a
     cluster repeats its alarms, and lists them; see `ClusterStatus`.
+
+    Parameters
+    ----------
+    tell
+        Called with each alarm.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tell: Callable[[Alarm], None]) -> None:
+        self._tell = tell
         self._active: dict[str, dict[_Key, Alarm]] = {}
+
+    def on_alarm(self, cluster: str, alarm: Alarm) -> None:
+        """Report an alarm of a cluster if it is news."""
+        for each in self.take(cluster, alarm):
+            self._tell(each)
+
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
+        """Report the ends of those alarms that a cluster no longer lists."""
+        del now
+        for each in self.compare(cluster, status):
+            self._tell(each)
 
     def take(self, cluster: str, alarm: Alarm) -> list[Alarm]:
         """Take an alarm of a cluster; return it if it is news."""

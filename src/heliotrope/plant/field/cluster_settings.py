@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 
 from heliotrope.links.messages import ClusterStatus
+from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 
 #: An alarm waits this long, s: after a start, the first clusters heard need not be most of them.
@@ -12,7 +13,7 @@ PATIENCE = 5.0
 EXPECTED = "this plant"
 
 
-class ClusterSettings:
+class ClusterSettings(Part):
     """The comparison of the clusters' settings with those that the plant expects.
 
     Where it expects none, they are compared with each other: a cluster is named if its checksum
@@ -37,7 +38,7 @@ class ClusterSettings:
         self._since: dict[str, float] = {}
         self._told: dict[str, Alarm] = {}
 
-    def take(self, cluster: str, status: ClusterStatus, now: float) -> None:
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
         """Take a cluster's status that has arrived at a monotonic time, s."""
         self._learn(cluster, status.settings)
         others = self._differing(cluster)

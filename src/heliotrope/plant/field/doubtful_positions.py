@@ -17,12 +17,14 @@ import numpy as np
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names as meanings
+from heliotrope.links.messages import ClusterStatus
 from heliotrope.plant import refusals
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState, Mask
 from heliotrope.safety import Alarm, alarms
 
 
-class DoubtfulPositions:
+class DoubtfulPositions(Part):
     """Doubts of local controllers about their step counts.
 
     Parameters
@@ -65,8 +67,9 @@ class DoubtfulPositions:
         self._confirmed = np.full(len(field), -1, dtype=np.int64)
         self.standing: Mask = np.zeros(len(field), dtype=np.bool_)
 
-    def look(self, cluster: str) -> None:
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
         """Judge the heliostats of a cluster by its status."""
+        del status, now
         self._judge([self._field.index[name] for name in self._field.members[cluster]])
 
     def confirm(self, heliostat: str, boots: int | None = None) -> None:

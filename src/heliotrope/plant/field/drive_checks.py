@@ -12,9 +12,11 @@ from datetime import date
 from heliotrope.lcu import diagnosis
 from heliotrope.lcu.names import FAULTS
 from heliotrope.links.clock import Clock, sleep_until
-from heliotrope.links.messages import Answer
+from heliotrope.links.messages import Answer, ClusterStatus, Stage
 from heliotrope.plant.field.clusters import Clusters
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Alarm, alarms
 from heliotrope.sun import Site, solar_day
 
@@ -30,7 +32,7 @@ _STALLS = (
 _POLL = 0.5
 
 
-class DriveChecks:
+class DriveChecks(Part):
     """What is known of the drives beside their step counts.
 
     Parameters
@@ -76,8 +78,9 @@ class DriveChecks:
         while self.due.intersection(heliostats) and self._clock.monotonic() < until:
             await sleep_until(self._clock, self._clock.monotonic() + _POLL)
 
-    def look(self, cluster: str) -> None:
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
         """Take the faults that the boards of a cluster report."""
+        del status, now
         faults = self._field.rows["fault"]
         for name in self._field.members[cluster]:
             fault = int(faults[self._field.index[name]])
@@ -88,8 +91,13 @@ class DriveChecks:
                 self._faulty.add(name)
                 self._stalls(name, drives)
 
-    def ask(self, heliostats: Iterable[str]) -> None:
+    def on_stage(
+        self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
+    ) -> None:
         """Ask for the results of diagnoses that have come to their end."""
+        del now
+        if stage is not Stage.DONE or ticket.name != "DIAGNOSE":
+            return
         for name in heliostats:
             take = self._taker(name)
             self._clusters.ask(self._clusters.home(name), "diagnosis", take, name)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from heliotrope.links.messages import Answer
 from heliotrope.plant.field.clusters import Clusters
+from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 
 #: Longest search of a bus, s; after it a cluster that has not answered is asked again.
@@ -15,7 +16,7 @@ SEARCH = 600.0
 _NAMED = 5
 
 
-class Firmware:
+class Firmware(Part):
     """The comparison of firmware versions.
 
     Parameters
@@ -36,12 +37,12 @@ class Firmware:
         self._due: dict[str, float] = {}
         self._told: set[str] = set()
 
-    def greet(self, cluster: str, now: float) -> None:
+    def on_connected(self, cluster: str, now: float) -> None:
         """Compare the boards of a cluster that has connected."""
         if self._expected is not None:
             self._due[cluster] = now
 
-    def beat(self, now: float) -> None:
+    def on_second(self, now: float) -> None:
         """Ask the clusters that are due."""
         for cluster, due in self._due.items():
             if now >= due:

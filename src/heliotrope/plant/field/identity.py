@@ -16,7 +16,9 @@ import numpy as np
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
+from heliotrope.links.messages import ClusterStatus
 from heliotrope.plant import refusals
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
 from heliotrope.safety import Act, Alarm, alarms
 
@@ -24,7 +26,7 @@ from heliotrope.safety import Act, Alarm, alarms
 _UNKNOWN = "its local controller stores parameters that this plant does not know"
 
 
-class Identities:
+class Identities(Part):
     """Comparison of the armatures that local controllers report with those of the whole field.
 
     Parameters
@@ -39,6 +41,8 @@ class Identities:
         Returns how often the link to a cluster has been opened.
     tell
         Called with each alarm.
+    give_up
+        Called with the reason and the names of heliostats newly found strange.
 
     Attributes
     ----------
@@ -53,8 +57,10 @@ class Identities:
         wanted: Mapping[str, Mapping[str, bytes]],
         connections: Callable[[str], int],
         tell: Callable[[Alarm], None],
+        give_up: Callable[[str, frozenset[str]], None],
     ) -> None:
         self._field, self._connections, self._tell = field, connections, tell
+        self._give_up = give_up
         self._wanted = wanted
         self.strange: dict[str, str] = {}
         #: Rows of the heliostats that have ever had an armature, by its checksum.
@@ -78,23 +84,24 @@ class Identities:
             if "armature" in items:
                 self._owners[crc32(items["armature"])].add(field.index[name])
 
-    def learn(self, row: int, armature: FloatArray) -> tuple[str, ...]:
-        """Add an armature (18,) that a heliostat may store; return as `look`."""
+    def learn(self, row: int, armature: FloatArray) -> None:
+        """Add an armature (18,) that a heliostat may store."""
         crc = crc32(np.ascontiguousarray(armature).tobytes())
         if row in self._owners[crc]:
-            return ()
+            return
         self._owners[crc].add(row)
-        return self._judge(np.flatnonzero(self._stored == crc).tolist())
+        self._judge(np.flatnonzero(self._stored == crc).tolist())
 
-    def look(self, cluster: str) -> tuple[str, ...]:
-        """Judge the heliostats of a cluster by its status; return those newly found strange."""
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
+        """Judge the heliostats of a cluster by its status."""
+        del status, now
         self._judged[cluster] = self._connections(cluster)
         self._compare_rows(cluster)
         rows = self._rows[cluster]
         stored = self._field.rows["armature_crc"][rows]
         changed = stored != self._stored[rows]
         self._stored[rows] = stored
-        return self._judge(rows[changed].tolist())
+        self._judge(rows[changed].tolist())
 
     def _compare_rows(self, cluster: str) -> None:
         """Raise the alarm about heliostats for which their cluster reports no row, and end it."""
@@ -106,14 +113,14 @@ class Identities:
             self._tell(alarms.UNLISTED.ended(name, cluster=cluster))
         self._unlisted = (self._unlisted - known) | unlisted
 
-    def _judge(self, changed: list[int]) -> tuple[str, ...]:
+    def _judge(self, changed: list[int]) -> None:
         """Judge rows whose checksum, or its owners, have changed, and with them their pairs."""
         for row in changed:
             self._own[row] = row in self._of(row)
             alien = not self._own[row] and bool(self._of(row))
             (self._foreign.add if alien else self._foreign.discard)(row)
         if not changed or not (self._foreign or self.strange):
-            return ()
+            return
         names, found = self._field.names, dict[str, str]()
         pairs = [(row, other) for row in sorted(self._foreign) for other in sorted(self._of(row))]
         for row, other in pairs:
@@ -129,7 +136,8 @@ class Identities:
         for name in self.strange.keys() - found.keys():
             self._tell(alarms.IDENTITY.ended(name))
         self.strange = found
-        return new
+        if new:
+            self._give_up(found[new[0]], frozenset(new))
 
     def _of(self, row: int) -> set[int]:
         """Return the rows of the heliostats that have ever had the armature of a row."""

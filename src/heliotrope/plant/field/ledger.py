@@ -16,7 +16,10 @@ import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states
+from heliotrope.links.messages import Stage
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState, Mask
+from heliotrope.plant.orders.tickets import Ticket
 
 #: A kind of order: the names of its commands.
 Kind = frozenset[str]
@@ -61,7 +64,7 @@ class _Column:
         self.sent, self.acknowledged, self.accepted, self.shown = np.full((4, count), -np.inf)
 
 
-class Ledger:
+class Ledger(Part):
     """The last orders of each kind that N heliostats were sent and have acknowledged.
 
     Parameters
@@ -81,6 +84,27 @@ class Ledger:
         self._obeyed = np.zeros(len(field), dtype=np.bool_)
 
     # -- what happens ----------------------------------------------------------------------
+
+    def on_sent(
+        self,
+        name: str,
+        values: Sequence[float],
+        heliostats: Sequence[str],
+        now: float,
+        again: bool,
+    ) -> None:
+        """Note an order that has been sent; see `sent`."""
+        del values
+        self.sent(name, heliostats, now, again=again)
+
+    def on_stage(
+        self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
+    ) -> None:
+        """Note what some heliostats of a ticket have acknowledged or refused."""
+        if stage is Stage.ACKNOWLEDGED:
+            self.acknowledged(ticket.name, ticket.accepted_at, heliostats, now)
+        elif stage is Stage.REFUSED:
+            self.refused(ticket.name, heliostats, now)
 
     def sent(
         self, name: str, heliostats: Sequence[str], now: float, *, again: bool = False

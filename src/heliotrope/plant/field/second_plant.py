@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterable
 
 from heliotrope.links.messages import ClusterStatus
+from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 
 
-class SecondPlant:
+class SecondPlant(Part):
     """Clusters that refuse this plant because they belong to another one.
 
     Parameters
@@ -22,8 +23,9 @@ class SecondPlant:
         #: The run that a cluster belongs to, by cluster.
         self._lost: dict[str, str] = {}
 
-    def take(self, cluster: str, status: ClusterStatus) -> None:
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
         """Take a cluster's status."""
+        del now
         before = bool(self._lost)
         if self._run in status.barred:
             new = self._lost.get(cluster) != status.run

@@ -23,6 +23,7 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.gpsd import Gpsd
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant import refusals
+from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 from heliotrope.sun import Site, fast_vector
 
@@ -122,7 +123,7 @@ class SunSensorFile:
         return direction(azimuth, elevation), SENSOR_ERROR
 
 
-class Witnesses:
+class Witnesses(Part):
     """What the witnesses of a plant have said today.
 
     Parameters
@@ -229,13 +230,14 @@ class Witnesses:
         """Whether photographs count and no witness has agreed today, or one contradicts."""
         return PHOTOGRAPHS in (self._names or ()) and bool(self.refusal)
 
-    def beat(self) -> None:
+    def on_second(self, now: float) -> None:
         """Say once a day that no witness has seen the sun, if that is so."""
-        now = self._utc()
-        day = self._day(now)
+        del now
+        utc_s = self._utc()
+        day = self._day(utc_s)
         if self._names is None or day in (self._agreed_on, self._told_on):
             return
-        if fast_vector(now, self._site)[2] < math.sin(_UP):
+        if fast_vector(utc_s, self._site)[2] < math.sin(_UP):
             return
         self._told_on = day
         listed = ", ".join(sorted(self._names))

@@ -3,6 +3,7 @@
 Where beams are afterwards is watched by `BeamWatch`.
 """
 
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -12,12 +13,13 @@ import numpy.typing as npt
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states
 from heliotrope.lcu.diagnosis import NUDGE
+from heliotrope.lcu.journal import CODES_OF
+from heliotrope.mechanism.board_items import POSE_ITEMS, Tables, tables_with
 from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant.field.assigned import BEFORE, KINDS, Points
 from heliotrope.plant.field.ledger import MOVING, Kind, Ledger
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.motion.paths import Paths
-from heliotrope.plant.orders.parameters import Tables
 from heliotrope.plant.refusals import (
     BEAM_REFUSED,
     PLACE_UNKNOWN,
@@ -232,6 +234,21 @@ class PathProofs:
             "(STANDBY) first, or stow it"
             for row in rows[~known]
         }
+
+    def tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
+        """Return the tables of a heliostat's mechanism now, and once items are stored."""
+        before = self._tables(self.field.place(heliostat))
+        return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
+
+    def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
+        """Return why a heliostat may not rest at the stow position in items, "" if it may."""
+        if "stow" not in items:
+            return ""
+        counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
+        armature, drives = self.tables(heliostat, items)[1]
+        rows = np.array([self.field.place(heliostat)])
+        blocked = self._check.standing(rows, counts, (armature[None], drives[None]))
+        return blocked.get(heliostat, "")
 
     def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str:
         """Return why new parameters may not be written where a heliostat stands, "" if they may.

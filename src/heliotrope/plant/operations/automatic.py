@@ -24,9 +24,8 @@ from heliotrope.links.messages import Stage
 from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
+from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors, Visits
 from heliotrope.plant.operations.calibration_book import CalibrationBook
-from heliotrope.plant.operations.coded_visits import JointVisits, ReceiverVisits
 from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.foresight import POINT_EVERY, Foresight
@@ -35,15 +34,11 @@ from heliotrope.plant.operations.learning import Learner, Learning
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.movement_checks import MovementChecks
-from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.timetable import Timetable
 from heliotrope.plant.operations.views import CalibrationView
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
-from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
-from heliotrope.plant.visits.joint_cycle import JointCycle
-from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
 from heliotrope.store.records import Kind, PlannedVisit, Records
@@ -150,7 +145,22 @@ class AutomaticSettings:
 
 
 class AutomaticControl:
-    """Automatic control of a plant; see `Operations` for the parameters.
+    """Automatic control of a plant.
+
+    Parameters
+    ----------
+    plant, logbook
+        The controller, and the logbook of its alarms and events.
+    visits
+        The visits that it can make; None: nothing is calibrated.
+    records
+        Store of everything that outlasts a restart; None: nothing is kept.
+    truth
+        Returns the true tracking errors, known to a twin only, rad, (N,); None: they are unknown.
+    settings
+        Its settings.
+    learner
+        Learns groups of mirrors at night; None: nothing is learnt.
 
     Attributes
     ----------
@@ -174,24 +184,20 @@ class AutomaticControl:
         self,
         plant: PlantController,
         logbook: Logbook,
-        cycle: CalibrationCycle | None,
+        visits: Visits | None = None,
         *,
-        scheduler: Scheduling | None,
-        records: Records | None,
-        truth: Callable[[], FloatArray] | None,
-        settings: AutomaticSettings,
-        pictures: Pictures | None = None,
+        records: Records | None = None,
+        truth: Callable[[], FloatArray] | None = None,
+        settings: AutomaticSettings | None = None,
         learner: Learner | None = None,
-        joint: JointCycle | None = None,
-        receiver: ReceiverCycle | None = None,
     ) -> None:
+        settings = settings or AutomaticSettings()
         self._plant, self._log, self._settings = plant, logbook, settings
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
         self._token, self._sun_at = 0, -math.inf
         self.truth = TrueErrors(plant, truth)
-        self.book = CalibrationBook(
-            plant, "malan8" if cycle is None else cycle.settings.first_model
-        )
+        cycle = CycleSettings() if visits is None else visits.cycle.settings
+        self.book = CalibrationBook(plant, "malan8" if visits is None else cycle.first_model)
         self.installed = self.book.installed()
         self._keeping = Keeping(plant.field.names, plant.beliefs, records)
         self.service = Service(plant, self._keeping, logbook.take_alarm)
@@ -208,36 +214,23 @@ class AutomaticControl:
         self._checks = MovementChecks(plant, AUTOMATIC, logbook.take_alarm)
         most = min(settings.losses, math.floor(settings.losses_share * len(plant.field)))
         self._losses = Losses(plant, logbook, most, records, self._wait)
-        visits = CycleSettings() if cycle is None else cycle.settings
-        self.flights = FlightIntake(plant, logbook, self._keeping, visits)
+        self.flights = FlightIntake(plant, logbook, self._keeping, cycle)
         self.learning = Learning(
-            plant, logbook, self._keeping, visits.first_model, learner, AUTOMATIC
+            plant, logbook, self._keeping, cycle.first_model, learner, AUTOMATIC
         )
         self.timetable = Timetable(plant, logbook, self._keeping)
         self._calibrating: Calibrating | None = None
         self._foresight: Foresight | None = None
-        if cycle is not None and scheduler is not None:
+        if visits is not None:
             self._calibrating = Calibrating(
-                plant,
-                logbook,
-                cycle,
-                scheduler,
-                self.book,
-                self._keeping,
-                self.truth,
-                self.flights.first,
-                pictures,
-                None if joint is None else JointVisits(plant, self.book, joint, logbook.take_alarm),
-                None
-                if receiver is None
-                else ReceiverVisits(plant, self.book, receiver, logbook.take_alarm),
+                plant, logbook, visits, self.book, self._keeping, self.truth, self.flights.first
             )
             if settings.foresee > 0.0:
                 self._foresight = Foresight(
-                    plant, self._keeping, scheduler, settings.foresee, cycle.worker
+                    plant, self._keeping, visits.scheduler, settings.foresee, visits.cycle.worker
                 )
         self._stopped = False
-        if cycle is not None:
+        if visits is not None:
             self._keeping.recall()
             self.learning.recall()
             self.flights.recall()

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
 
@@ -24,6 +25,8 @@ from heliotrope.plant.operations.views import CalibrationEntry, Running
 from heliotrope.plant.orders.authority import Person, RefusedError, TakenOutError
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 from heliotrope.plant.visits.coded_cycle import CodedCycle
+from heliotrope.plant.visits.joint_cycle import JointCycle
+from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import alarms
 from heliotrope.store.records import PlannedVisit
 
@@ -87,6 +90,31 @@ class Scheduling(Foreseeing, Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Visits:
+    """The visits that a plant can make, and what chooses and keeps them.
+
+    Attributes
+    ----------
+    cycle
+        Calibrates one heliostat.
+    scheduler
+        Chooses the next heliostat.
+    joint
+        Calibrates several heliostats on one target; None: each is calibrated alone.
+    receiver
+        Calibrates heliostats on a receiver; None: they go to targets.
+    pictures
+        Keeps photographs with their results; None: they are not kept.
+    """
+
+    cycle: CalibrationCycle
+    scheduler: Scheduling
+    joint: JointCycle | None = None
+    receiver: ReceiverCycle | None = None
+    pictures: Pictures | None = None
+
+
 class TrueErrors:
     """True tracking errors, known to a twin only, computed every five seconds.
 
@@ -130,40 +158,33 @@ class Calibrating:
     ----------
     plant, log
         The controller, and the logbook for events.
-    cycle
-        Makes one visit.
-    scheduler
-        Chooses the heliostats.
+    visits
+        The visits that the plant can make.
     book, keeping
         Take the results.
     truth
         True errors, known to a twin only.
     first
         Returns the heliostats to be visited first, after those in doubt.
-    pictures
-        Keeps the photographs with the results; None: they are not kept.
-    joint, receiver
-        Heliostats of joint visits and of receiver visits; None: there are none.
     """
 
     def __init__(
         self,
         plant: PlantController,
         log: Logbook,
-        cycle: CalibrationCycle,
-        scheduler: Scheduling,
+        visits: Visits,
         book: CalibrationBook,
         keeping: Keeping,
         truth: TrueErrors,
         first: Callable[[], Collection[str]],
-        pictures: Pictures | None = None,
-        joint: JointVisits | None = None,
-        receiver: ReceiverVisits | None = None,
     ) -> None:
-        self._first, self._joint, self._receiver = first, joint, receiver
-        self._plant, self._log, self._cycle, self._scheduler = plant, log, cycle, scheduler
+        self._plant, self._log, self._first = plant, log, first
         self._book, self._keeping, self._truth = book, keeping, truth
-        self._pictures = pictures
+        self._cycle, self._scheduler = visits.cycle, visits.scheduler
+        self._pictures, joint, receiver = visits.pictures, visits.joint, visits.receiver
+        tell = log.take_alarm
+        self._joint = None if joint is None else JointVisits(plant, book, joint, tell)
+        self._receiver = None if receiver is None else ReceiverVisits(plant, book, receiver, tell)
         self._running: dict[str, Running] = {}
         self._asked: dict[str, tuple[str, bool]] = {}
         #: Why requests of persons were given up, and the last result, by heliostat.
@@ -173,7 +194,7 @@ class Calibrating:
         self._visited = np.full(len(plant.field.names), -np.inf)
         self._flown: frozenset[str] = frozenset()
         self._places = Attempts(PLACES, log.take_alarm)
-        scheduler.attempts.report_to(log.take_alarm)
+        self._scheduler.attempts.report_to(log.take_alarm)
 
     @property
     def asked(self) -> tuple[str, ...]:

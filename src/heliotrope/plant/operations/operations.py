@@ -23,7 +23,6 @@ import numpy.typing as npt
 from heliotrope import sun
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
-from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
 from heliotrope.optics import FluxView, predict_flux
@@ -31,10 +30,8 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.field.lockouts import TOWER
-from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
-from heliotrope.plant.operations.calibrating import Scheduling
+from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.errands import Errands
-from heliotrope.plant.operations.learning import Learner
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
@@ -48,10 +45,7 @@ from heliotrope.plant.operations.views import (
 )
 from heliotrope.plant.orders.authority import Grant, Person, Role
 from heliotrope.plant.orders.tickets import Ticket
-from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
-from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.photographs import Shot
-from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import Act
 from heliotrope.store.records import Kind, Records
 
@@ -99,30 +93,18 @@ class Operations:
         ``logbook.tapped(links)``. It is run by the owner.
     logbook
         Alarms, events and packets.
-    cycle
-        Calibrates one heliostat; None: nothing is calibrated.
+    automatic
+        Automatic control of the plant.
     cameras
         Photographs of the targets for people, by name of the target.
-    scheduler
-        Chooses the next heliostat; None: nothing is calibrated.
     records
         Store of everything that outlasts a restart; None: nothing is kept.
-    truth
-        Returns the true tracking errors, known to a twin only, rad, (N,); None: they are unknown.
-    settings
-        Settings of automatic control.
     extra
         Returns further rows of the summary, such as the speed of a twin.
     pictures
         Keeps photographs with their results; None: they are not kept.
     marking
         Takes views that persons mark; None: there is no camera.
-    learner
-        Learns groups of mirrors at night; None: nothing is learnt.
-    joint
-        Calibrates several heliostats on one target; None: each is calibrated alone.
-    receiver
-        Calibrates heliostats on a receiver; None: they go to targets.
 
     Attributes
     ----------
@@ -134,35 +116,16 @@ class Operations:
         self,
         plant: PlantController,
         logbook: Logbook,
-        cycle: CalibrationCycle | None = None,
+        automatic: AutomaticControl,
         *,
         cameras: Mapping[str, Photographer] | None = None,
-        scheduler: Scheduling | None = None,
         records: Records | None = None,
-        truth: Callable[[], FloatArray] | None = None,
-        settings: AutomaticSettings | None = None,
         extra: Callable[[], Mapping[str, Any]] | None = None,
         pictures: Pictures | None = None,
         marking: Marking | None = None,
-        learner: Learner | None = None,
-        joint: JointCycle | None = None,
-        receiver: ReceiverCycle | None = None,
     ) -> None:
         self.plant, self.logbook, self.pictures, self.marking = plant, logbook, pictures, marking
-        self._cameras, self._extra = dict(cameras or {}), extra
-        self.automatic = AutomaticControl(
-            plant,
-            logbook,
-            cycle,
-            scheduler=scheduler,
-            records=records,
-            truth=truth,
-            settings=settings or AutomaticSettings(),
-            pictures=pictures,
-            learner=learner,
-            joint=joint,
-            receiver=receiver,
-        )
+        self.automatic, self._cameras, self._extra = automatic, dict(cameras or {}), extra
         self.errands = Errands(plant.clock)
         self.security = SecurityLog(logbook, plant.clock)
         self.viewer = Viewer(plant, self.automatic)

@@ -18,16 +18,13 @@ from heliotrope.lcu import states
 from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant import refusals
 from heliotrope.plant.field.assigned import NOTHING, Held, grouped, points_of
-from heliotrope.plant.field.locks import Locks
-from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.motion.proofs import BeamError, PathProofs
 from heliotrope.plant.orders.audit import AuditError
-from heliotrope.plant.orders.authority import Authority, Person
+from heliotrope.plant.orders.authority import Person
 from heliotrope.plant.orders.guards import TO_AIMS, Asked, Guards
 from heliotrope.plant.orders.joining import Assign, Clear, JoiningJob, JoinQueue, in_slices
-from heliotrope.plant.orders.movements import Movements
 from heliotrope.plant.orders.queue import PlantOrders, whole
-from heliotrope.plant.orders.stepping import Stepping
+from heliotrope.plant.orders.taken import Taken
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.orders.unacknowledged import Unacknowledged
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
@@ -87,9 +84,7 @@ class Commands:
 
     Parameters
     ----------
-    now
-        Returns the monotonic time, s.
-    field, orders, joining
+    orders, joining
         The plant's.
     guards
         What stops heliostats; see `GUARDS`.
@@ -101,18 +96,12 @@ class Commands:
         Knows the targets and receivers.
     wanted
         Parameters that local controllers should store, their standby points among them.
-    patience
-        Time that a heliostat waits for its turn to join, s.
-    movements, locks, stepping
-        What visits have taken: aims, heliostats that are locked, and fine steps.
-    authority
-        The plant's.
+    taken
+        What visits have taken.
     """
 
     def __init__(
         self,
-        now: Callable[[], float],
-        field: FieldState,
         orders: PlantOrders,
         joining: JoinQueue,
         guards: Guards,
@@ -120,17 +109,13 @@ class Commands:
         proofs: PathProofs,
         design: Plant,
         wanted: Wanted,
-        patience: float,
-        movements: Movements,
-        locks: Locks,
-        stepping: Stepping,
-        authority: Authority,
+        taken: Taken,
     ) -> None:
-        self._now, self._field, self._orders, self._joining = now, field, orders, joining
-        self._guards, self._given, self._proofs = guards, given, proofs
-        self._design, self._wanted, self._patience = design, wanted, patience
-        self._movements, self._locks = movements, locks
-        self._stepping, self._authority = stepping, authority
+        self._orders, self._joining, self._guards = orders, joining, guards
+        self._now, self._authority = orders.clock.monotonic, orders.authority
+        self._given, self._proofs, self._field = given, proofs, proofs.field
+        self._design, self._wanted = design, wanted
+        self._movements, self._locks, self._stepping = taken.movements, taken.locks, taken.stepping
 
     def give(
         self,
@@ -545,5 +530,5 @@ class Commands:
         token: int,
         assign: Assign | None = None,
     ) -> None:
-        until, waiting = self._now() + self._patience, deque(heliostats)
+        until, waiting = self._now() + self._joining.patience, deque(heliostats)
         self._joining.put(JoiningJob(ticket, name, values, token, waiting, until, assign))

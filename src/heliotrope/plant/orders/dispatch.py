@@ -8,10 +8,11 @@ from functools import partial
 import numpy as np
 
 from heliotrope.lcu import messages
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.motion.proofs import BeamError, PathProofs
 from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.orders.guards import Asked, Guards
-from heliotrope.plant.orders.joining import JoiningJob, JoinQueue, Lost
+from heliotrope.plant.orders.joining import JoiningJob, JoinQueue
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.refusals import BEAM_REFUSED
 
@@ -21,7 +22,7 @@ Examine = Callable[
 ]
 
 
-class JoinDispatcher:
+class JoinDispatcher(Part):
     """The sending of heliostats whose turn has come, if the path of their beams is clear now.
 
     The sun has moved since the aim was accepted, and the heliostat may point anywhere. So the sweep
@@ -29,12 +30,12 @@ class JoinDispatcher:
 
     Parameters
     ----------
-    now
-        Returns the monotonic time, s.
     queue, orders, proofs
         Of the plant.
     life
         Life of a command whose turn has come, s.
+    held
+        Returns whether no new motion may begin.
     guards
         What stops heliostats when their turn comes.
     examine
@@ -43,21 +44,21 @@ class JoinDispatcher:
 
     def __init__(
         self,
-        now: Callable[[], float],
         queue: JoinQueue,
         orders: PlantOrders,
         proofs: PathProofs,
         life: float,
+        held: Callable[[], bool],
         guards: Guards,
         examine: Examine,
     ) -> None:
-        self._now, self._queue, self._orders = now, queue, orders
-        self._proofs, self._life = proofs, life
+        self._queue, self._orders, self._now = queue, orders, orders.clock.monotonic
+        self._proofs, self._life, self._held = proofs, life, held
         self._guards, self._examine = guards, examine
 
-    def beat(self, now: float, lost: Lost, *, held: bool) -> None:
-        """Send the heliostats whose turn it is, unless no new motion may begin (``held``)."""
-        for job, part in self._queue.admit(now, lost, held=held):
+    def on_beat(self, now: float) -> None:
+        """Send the heliostats whose turn it is, unless no new motion may begin."""
+        for job, part in self._queue.admit(now, self._orders.authority.lost, held=self._held()):
             clear = self._clear(job, part)
             if job.assign is None or not clear:
                 self._send(job, clear)

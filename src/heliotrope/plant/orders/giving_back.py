@@ -13,16 +13,15 @@ import numpy as np
 
 from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray
-from heliotrope.plant.field.locks import Locks
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.audit import AuditError
 from heliotrope.plant.orders.authority import Authority, RefusedError
 from heliotrope.plant.orders.commands import Commands, NewPoints
 from heliotrope.plant.orders.guards import Asked, Guards
-from heliotrope.plant.orders.movements import Movements
 from heliotrope.plant.orders.queue import PlantOrders
-from heliotrope.plant.orders.stepping import Stepping
+from heliotrope.plant.orders.taken import Taken
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW
 
@@ -30,14 +29,14 @@ from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW
 _PLANT = ("plant", "anybody")
 
 
-class GivingBack:
+class GivingBack(Part):
     """Sends beams back to their aims, unlocks heliostats, and lets them step as before a visit.
 
     Parameters
     ----------
     field, authority, orders, guards, commands
         The plant's.
-    movements, locks, stepping
+    taken
         What visits have taken.
     stow
         Sends heliostats to stow.
@@ -50,17 +49,15 @@ class GivingBack:
         orders: PlantOrders,
         guards: Guards,
         commands: Commands,
-        movements: Movements,
-        locks: Locks,
-        stepping: Stepping,
+        taken: Taken,
         stow: Callable[[Sequence[str]], object],
     ) -> None:
         self._field, self._authority, self._orders = field, authority, orders
         self._guards, self._commands = guards, commands
-        self._movements, self._locks, self._stepping = movements, locks, stepping
+        self._movements, self._locks, self._stepping = taken.movements, taken.locks, taken.stepping
         self._stow = stow
 
-    def beat(self, now: float) -> None:
+    def on_beat(self, now: float) -> None:
         """Give back what is due, as far as motions are accepted now."""
         self._unlock(now)
         self._bring_back(now)

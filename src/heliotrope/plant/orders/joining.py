@@ -58,10 +58,22 @@ class JoinQueue:
     """The waiting heliostats: first come, first served, as fast as a `JoinLimiter` admits.
 
     Of those that leave stow, a slice goes at each look.
+
+    Parameters
+    ----------
+    rate, burst
+        Heliostats that may join in a second, and at once after a rest.
+    patience
+        Longest time that a heliostat waits for its turn, s.
+
+    Attributes
+    ----------
+    patience
+        As given.
     """
 
-    def __init__(self, rate: float, burst: int) -> None:
-        self._limiter = JoinLimiter(rate, burst)
+    def __init__(self, rate: float, burst: int, patience: float) -> None:
+        self._limiter, self.patience = JoinLimiter(rate, burst), patience
         self._jobs: deque[JoiningJob] = deque()
 
     def __len__(self) -> int:

@@ -9,14 +9,23 @@ import numpy.typing as npt
 from heliotrope.geometry import FloatArray, angle_between, normalize, reflect
 from heliotrope.lcu import states
 from heliotrope.lcu.controller import HARMLESS, MACHINE, POSE
-from heliotrope.links.messages import Answer, ProtocolError
+from heliotrope.links.messages import Answer, ClusterStatus, ProtocolError, Stage
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, POSE_ITEMS, Wanted, checksums
+from heliotrope.mechanism.board_items import (
+    CALIBRATION_ITEMS,
+    POSE_ITEMS,
+    Tables,
+    Wanted,
+    checksums,
+)
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant import refusals
+from heliotrope.plant.field.assigned import KINDS
 from heliotrope.plant.field.clusters import Clusters
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
+from heliotrope.plant.motion.proofs import PathProofs
 from heliotrope.plant.orders.audit import AuditError
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.tickets import Ticket
@@ -34,8 +43,6 @@ _SUNS = tuple(
     for azimuth in range(0, 360, 60)
     for elevation in (25, 50)
 )
-#: Armature (18,) and drives (2, 19) of one heliostat.
-Tables = tuple[FloatArray, FloatArray]
 
 
 def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
@@ -95,7 +102,7 @@ def stored_items(answer: Answer) -> dict[str, bytes]:
     return found
 
 
-class ParameterSync:
+class ParameterSync(Part):
     """Comparison of the stored parameters with the wanted ones, and the push of those that differ.
 
     Parameters
@@ -104,12 +111,12 @@ class ParameterSync:
         Of the plant.
     tell
         Called with each alarm.
-    proof
-        Returns why items may not be written where a heliostat stands, "" if they may.
-    stow_proof
-        Returns why a heliostat may not rest at the stow position in items, "" if it may.
+    proofs
+        Proves that a beam is free where parameters are written, and at stow.
     blocked
         Returns why nothing may be written to a heliostat, None if it may.
+    token
+        Returns the token under which differences are written, 0 if none may be written now.
     """
 
     def __init__(
@@ -119,13 +126,13 @@ class ParameterSync:
         orders: PlantOrders,
         clusters: Clusters,
         tell: Callable[[Alarm], None],
-        proof: Callable[[str, Mapping[str, bytes]], str],
-        stow_proof: Callable[[str, Mapping[str, bytes]], str],
+        proofs: PathProofs,
         blocked: Callable[[str], str | None],
+        token: Callable[[], int],
     ) -> None:
         self._field, self._wanted, self._orders = field, wanted, orders
-        self._clusters, self._tell, self._proof = clusters, tell, proof
-        self._stow_proof, self._blocked = stow_proof, blocked
+        self._clusters, self._tell, self._proofs = clusters, tell, proofs
+        self._blocked, self._token = blocked, token
         #: Heliostats to be compared, each with its time, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
         #: Those not compared since their cluster connected, or their board started.
@@ -137,6 +144,25 @@ class ParameterSync:
         """Compare a heliostat as soon as possible."""
         if heliostat in self._wanted.items:
             self._due[heliostat] = -math.inf
+
+    def on_connected(self, cluster: str, now: float) -> None:
+        """Compare the heliostats of a cluster that has connected."""
+        del now
+        self.greet(self._field.members[cluster])
+
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
+        """Compare the heliostats whose boards have started anew."""
+        del cluster, status, now
+        self.greet(self._field.restarted)
+
+    def on_stage(
+        self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
+    ) -> None:
+        """Compare heliostats that lacked parameters once they have a point."""
+        del now
+        if stage is Stage.DONE and ticket.name in KINDS:
+            for name in self._wanted.missing.keys() & heliostats:
+                self.compare(name)
 
     def greet(self, heliostats: Sequence[str]) -> None:
         """Compare heliostats before they may move, since any boards may answer there.
@@ -169,7 +195,7 @@ class ParameterSync:
             If they change its pose where it does not stand still, or where its beam is not free; or
             a stow position from which its beam would light a receiver, a target or a volume.
         """
-        if reason := self._stow_proof(heliostat, items):
+        if reason := self._proofs.resting(heliostat, items):
             raise refusals.STOW_UNPROVEN.error(heliostat=heliostat, reason=reason)
         state = int(self._field.rows["state"][self._field.place(heliostat)])
         moving = ", ".join(sorted(POSE_ITEMS.intersection(items)))
@@ -177,7 +203,7 @@ class ParameterSync:
         if moving and state not in TAKES_POSE:
             reason = f"it is {states.STATES[state]}, and {moving} would move its beam"
         elif moving and state != states.STOWED:
-            reason = self._proof(heliostat, items)
+            reason = self._proofs.rewriting(heliostat, *self._proofs.tables(heliostat, items)[1])
         if reason:
             raise refusals.PARAMETERS_NOT_HERE.error(heliostat=heliostat, reason=reason)
 
@@ -227,8 +253,8 @@ class ParameterSync:
         self._wanted.compare(heliostat, sums)
         return sums
 
-    def beat(self, now: float, token: int, allowed: bool) -> None:
-        """Ask for and push what is due; nothing is pushed unless ``allowed``."""
+    def on_second(self, now: float) -> None:
+        """Ask for what is due, and push what differs if that may be done now."""
         for name, ticket in list(self._tickets.items()):
             if ticket.finished:
                 del self._tickets[name]
@@ -239,7 +265,7 @@ class ParameterSync:
             if now >= due and live[self._field.index[name]] and name not in self._tickets:
                 self._due[name] = now + AGAIN
                 self._ask(name)
-        if token and allowed:
+        if token := self._token():
             for name, missing in list(self._wanted.missing.items()):
                 busy = name in self._tickets or name in self._due
                 if live[self._field.index[name]] and not busy and not self._blocked(name):
@@ -265,7 +291,7 @@ class ParameterSync:
             return
         self._tried[name] = now
         items = {item: self._wanted.items[name][item] for item in able}
-        if reason := self._stow_proof(name, items):
+        if reason := self._proofs.resting(name, items):
             del items["stow"]
             listed = f"stow, which is not written: {reason}"
             self._tell(alarms.PARAMETERS_DIFFER.raised(name, items=listed))

@@ -15,10 +15,12 @@ from heliotrope.links.link import SendOutcome
 from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
 from heliotrope.plant.field.assigned import AssignedError
 from heliotrope.plant.field.clusters import ClusterEnd, Clusters
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.orders.audit import Audit, AuditError, Record
 from heliotrope.plant.orders.authority import Authority, RefusedError
 from heliotrope.plant.orders.stowing import StowQueue
 from heliotrope.plant.orders.tickets import Ticket
+from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act
 
 #: Reports on a message are ignored this long after it was sent, once its ticket has ended, s.
@@ -81,7 +83,7 @@ class _Recording:
             self.store[0]()
 
 
-class PlantOrders:
+class PlantOrders(Part):
     """Accepted commands: their records, their messages and their tickets.
 
     Nothing here waits for a disk. A command waits in the plant until its record is on the disk
@@ -101,16 +103,16 @@ class PlantOrders:
         Their links carry the messages.
     prefix
         Prefix of identities; no two runs of a plant may have the same one.
-    lifetime, patience
-        Time allowed until a command is acknowledged, and from then until it is done, s.
-    stow_rate
-        Heliostats a second that `stow_in_turn` sends; 0: all at once.
+    settings
+        The plant's ``lifetime``, ``patience`` and ``stow_rate``.
     sent
         Called with name, values and heliostats of each command that is sent, DEFOCUS and STOW
         among them, the time, and whether it is a repetition.
 
     Attributes
     ----------
+    clock, authority
+        As given.
     confirmed_at
         Last time that the audit confirmed that it can write, monotonic s.
     problem
@@ -127,14 +129,13 @@ class PlantOrders:
         disk: Disk,
         clusters: Clusters,
         prefix: str,
-        lifetime: float,
-        patience: float,
-        stow_rate: float,
+        settings: PlantSettings,
         sent: Callable[[str, tuple[float, ...], tuple[str, ...], float, bool], None],
     ) -> None:
-        self._sent, self._authority = sent, authority
-        self._clock, self._audit, self._disk, self._clusters = clock, audit, disk, clusters
-        self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
+        self._sent, self.authority = sent, authority
+        self.clock, self._audit, self._disk, self._clusters = clock, audit, disk, clusters
+        self._lifetime, self._patience = settings.lifetime, settings.patience
+        self._prefix = prefix
         self._number = self._messages = 0
         self._open: dict[str, Ticket] = {}
         self.latest: Ticket | None = None
@@ -147,7 +148,7 @@ class PlantOrders:
         self._owed: deque[Work] = deque()
         self._paying = False
         self._sent_at: dict[str, float] = {}
-        self._stowing = StowQueue(stow_rate)
+        self._stowing = StowQueue(settings.stow_rate)
         self._purged_at = clock.monotonic()
         self.confirmed_at = clock.monotonic()
         self.problem = ""
@@ -199,11 +200,11 @@ class PlantOrders:
         identity = f"{self._prefix}-{self._number}"
         named = () if len(heliostats) == len(self._clusters) else tuple(heliostats)
         entry = Record(identity, who, role, what, self._utc(), tuple(values), named, note)
-        ticket = Ticket(identity, what, heliostats, self._clock, self._patience)
+        ticket = Ticket(identity, what, heliostats, self.clock, self._patience)
         if late:
             self._overtake(frozenset(heliostats), what)
             why = f"{who} ordered {what}{note and f' ({note})'}"
-            self._authority.prevail(heliostats, why, fault=fault)
+            self.authority.prevail(heliostats, why, fault=fault)
             self._owed.append(lambda: self._audit.begin(entry))
         else:
             self._record(ticket, entry, store)
@@ -212,7 +213,7 @@ class PlantOrders:
 
     def _record(self, ticket: Ticket, entry: Record, store: tuple[Work, Work] | None) -> None:
         """Give the record of a ticket to the disk."""
-        begin, until = partial(self._audit.begin, entry), self._clock.monotonic() + RECORDING
+        begin, until = partial(self._audit.begin, entry), self.clock.monotonic() + RECORDING
         recording = _Recording(ticket, ticket.heliostats, begin, store, until)
         try:
             self._write(ticket.identity, recording)
@@ -232,7 +233,7 @@ class PlantOrders:
 
         See `when_recorded`; ``store`` is as in `accept`.
         """
-        until, self._messages = self._clock.monotonic() + RECORDING, self._messages + 1
+        until, self._messages = self.clock.monotonic() + RECORDING, self._messages + 1
         recording = _Recording(ticket, heliostats, None, store, until, send)
         try:
             self._write(f"{ticket.identity}.{self._messages}", recording)
@@ -252,11 +253,11 @@ class PlantOrders:
     def _recorded(self, key: str, recording: _Recording, error: Exception | None) -> None:
         """Send a command whose record is on the disk, or end it because that failed."""
         ticket, heliostats = recording.ticket, recording.heliostats
-        self._give_up_late(recording, self._clock.monotonic())
+        self._give_up_late(recording, self.clock.monotonic())
         del self._recording[key]
         recording.error = error
         if recording.begun:
-            self.confirmed_at = self._clock.monotonic()
+            self.confirmed_at = self.clock.monotonic()
         if error is None:
             if ticket.waiting(heliostats):
                 ticket.record()
@@ -342,7 +343,7 @@ class PlantOrders:
         batch, done = tuple(islice(self._owed, _BATCH)), [0]
 
         def write() -> None:
-            until = self._clock.monotonic() + _TURN
+            until = self.clock.monotonic() + _TURN
             for each in batch:
                 done[0] += 1
                 try:
@@ -350,7 +351,7 @@ class PlantOrders:
                 except (AuditError, AssignedError):
                     done[0] -= 1  # it is tried again; what is refused for its content is not
                     raise
-                if self._clock.monotonic() >= until:
+                if self.clock.monotonic() >= until:
                     break
             self._audit.confirm()
 
@@ -365,7 +366,7 @@ class PlantOrders:
         for _ in range(count):
             self._owed.popleft()
         if error is None:
-            self.confirmed_at, self.problem = self._clock.monotonic(), ""
+            self.confirmed_at, self.problem = self.clock.monotonic(), ""
             return
         self.problem = str(error)
         if not isinstance(error, AuditError | AssignedError):
@@ -406,7 +407,7 @@ class PlantOrders:
         if name == "LOCK":
             for other, names in self._stowing.take(heliostats).items():
                 other.advance(names, Stage.FAILED, "superseded by LOCK")
-        self._sent(name, values, heliostats, self._clock.monotonic(), False)
+        self._sent(name, values, heliostats, self.clock.monotonic(), False)
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)
@@ -437,8 +438,8 @@ class PlantOrders:
                     other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
             self._supersede(ticket, frozenset(heliostats))
         # Further portions of a STOW must not put off the repetition of the first.
-        self._sent_at.setdefault(ticket.identity, self._clock.monotonic())
-        self._sent(act.name, (), tuple(heliostats), self._clock.monotonic(), again)
+        self._sent_at.setdefault(ticket.identity, self.clock.monotonic())
+        self._sent(act.name, (), tuple(heliostats), self.clock.monotonic(), again)
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part, again=again)
             named = () if len(part) == len(end.members) else part
@@ -453,7 +454,7 @@ class PlantOrders:
         if not self._stowing.staggers(heliostats):
             self.emergency(ticket, Act.STOW, heliostats)
             return
-        now = self._clock.monotonic()
+        now = self.clock.monotonic()
         self._sent_at[ticket.identity] = now
         for other, names in self._stowing.put(ticket, heliostats).items():
             other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
@@ -494,7 +495,7 @@ class PlantOrders:
             identity = self._begin(ticket, end, part)
             self._repeated(identity, token, repeat)
             life = Parameters.lifetime
-            ticket.expect(part, self._clock.monotonic() + life + GRACE)
+            ticket.expect(part, self.clock.monotonic() + life + GRACE)
 
             def message(identity: str = identity) -> Parameters | None:
                 own = self._own(identity, token)
@@ -505,7 +506,7 @@ class PlantOrders:
     def _begin(
         self, ticket: Ticket, end: ClusterEnd, part: tuple[str, ...], *, again: bool = False
     ) -> str:
-        now = self._clock.monotonic()
+        now = self.clock.monotonic()
         self._messages += 1
         identity = f"{ticket.identity}.{self._messages}"
         self._under[identity] = _Under(ticket, end.name, part, now)
@@ -521,7 +522,7 @@ class PlantOrders:
 
     def _own(self, identity: str, token: int) -> int:
         """Return the token with which a message leaves now; 0: it may not leave any more."""
-        own = self._authority.present(token)
+        own = self.authority.present(token)
         if own and identity in self._under:
             self._under[identity].token, self._under[identity].ticket.sent = own, True
         return own
@@ -563,16 +564,16 @@ class PlantOrders:
         may have been done, so a person's command is sent again only where it was refused. One of an
         earlier holder is never sent again.
         """
-        mandated = self._authority.mandate_of(under.given) is not None
+        mandated = self.authority.mandate_of(under.given) is not None
         if stage is not Stage.REFUSED and not (mandated and stage is Stage.FAILED):
             return False
-        own = self._authority.present(under.given)
-        if under.again is None or own == 0 or own != self._authority.token:
+        own = self.authority.present(under.given)
+        if under.again is None or own == 0 or own != self.authority.token:
             return False
-        young = self._clock.monotonic() - self._authority.changed_at < _HEARD
+        young = self.clock.monotonic() - self.authority.changed_at < _HEARD
         return young or under.token != own
 
-    def beat(self, now: float) -> None:
+    def on_beat(self, now: float) -> None:
         """End commands that were not answered in time; record the results of ended tickets."""
         for recording in self._recording.values():
             self._give_up_late(recording, now)
@@ -616,7 +617,7 @@ class PlantOrders:
         for recording in self._recording.values():
             text = "not sent: the plant was closed"
             recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
-        self.beat(now)
+        self.on_beat(now)
         await self._until(lambda: not self._recording, until)
         for identity, ticket in self._open.items():
             if identity not in self._recording:
@@ -633,15 +634,15 @@ class PlantOrders:
         return not (self._paying or self.owing)
 
     async def _until(self, what: Callable[[], bool], until: float) -> None:
-        while not what() and self._clock.monotonic() < until:
-            await sleep_until(self._clock, self._clock.monotonic() + 0.05)
+        while not what() and self.clock.monotonic() < until:
+            await sleep_until(self.clock, self.clock.monotonic() + 0.05)
 
     def _owe_result(self, identity: str, result: str) -> None:
         at = self._utc()
         self._owed.append(lambda: self._audit.finish(identity, result, at))
 
     def _utc(self) -> str:
-        return self._clock.utc().isoformat(timespec="milliseconds")
+        return self.clock.utc().isoformat(timespec="milliseconds")
 
 
 def whole(values: Sequence[float], codes: str, command: str) -> tuple[float, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from heliotrope.links.messages import Stage
 from heliotrope.plant.field.assigned import KINDS, Points
+from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.refusals import AIM_NOT_TAKEN, STANDBY_NOT_TAKEN
@@ -22,7 +23,7 @@ _BEFORE_START = "the plant's program ended before it was acknowledged, or its st
 _NOT_TAKEN = {"AIM": AIM_NOT_TAKEN, "STANDBY": STANDBY_NOT_TAKEN}
 
 
-class Unacknowledged:
+class Unacknowledged(Part):
     """The last ticket of each heliostat's points that may not have been taken.
 
     Parameters
@@ -45,8 +46,13 @@ class Unacknowledged:
         """Note new points that are sent now."""
         self._tickets[ticket.name].update(dict.fromkeys(heliostats, ticket))
 
-    def done(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
+    def on_stage(
+        self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
+    ) -> None:
         """Note points that were taken, unless others were sent since."""
+        del now
+        if stage is not Stage.DONE or ticket.name not in KINDS:
+            return
         last, took = self._tickets[ticket.name], self._took[ticket.name]
         for name in heliostats:
             if name not in last and took.get(name, ticket) is not ticket:

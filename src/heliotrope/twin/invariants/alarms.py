@@ -17,15 +17,14 @@ or where a fault is near.
 """
 
 import re
-from collections import Counter
 from collections.abc import Collection, Mapping
 from math import inf
 from types import MappingProxyType
 
 from heliotrope.lcu import states
-from heliotrope.safety import Alarm
+from heliotrope.safety import Act, Alarm
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.invariants.invariants import L2, InvariantError, Violation
+from heliotrope.twin.invariants.invariants import L2, Judge
 
 #: Alarms that only faults cause, and within what time they end once nothing has failed near the
 #: subject, s; inf: a person ends them, or another run of a program does.
@@ -77,7 +76,7 @@ UNLISTED_WITHIN, CONTRADICTED_WITHIN = 10.0, 10.0
 _NONSENSE = re.compile(r"[{}]|\bnan\b|\bNone\b|\binf\b|<[a-z_.]+ ")
 
 
-class AlarmObserver:
+class AlarmObserver(Judge):
     """Observes the alarms of a plant.
 
     Parameters
@@ -90,17 +89,13 @@ class AlarmObserver:
         Worlds of the run. Where a second plant runs at times, its alarms are told here too, and it
         takes lines.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(
         self, start: float, boards: Mapping[str, Collection[Board]], worlds: Collection[str]
     ) -> None:
-        self.checks: Counter[int] = Counter()
-        self._start, self._alone = start, "twice" not in worlds
+        super().__init__(start)
+        self._alone = "twice" not in worlds
         self._works, self._began_at = "days" in worlds, start
         sound = [kind for kind, causes in MISLED.items() if causes.isdisjoint(worlds)]
         self._by_faults = BY_FAULTS | dict.fromkeys(sound, inf)
@@ -118,12 +113,7 @@ class AlarmObserver:
         self._unlisted: dict[str, float] = {}
         self._called = False
 
-    def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
-        self.checks[number] += 1
-        if not good:
-            raise InvariantError(Violation(number, now - self._start, subject or "plant", saw))
-
-    def alarmed(self, alarm: Alarm, now: float) -> None:
+    def on_alarm(self, alarm: Alarm, now: float) -> None:
         """Note an alarm of the plant; it is judged at the next look.
 
         The same one may come twice: from the controller, and from the logbook, which has those of
@@ -140,19 +130,21 @@ class AlarmObserver:
             self._active.pop(key, None)
             self._called &= alarm.condition != CALLED
 
-    def called(self) -> None:
+    def on_call(self, owner: str, act: Act, now: float) -> None:
         """Note that a person has called an emergency."""
+        del owner, act, now
         self._called = True
 
-    def ended(self) -> None:
+    def on_end(self, now: float) -> None:
         """Note that the plant's program has ended, and its alarms with it."""
+        del now
         self._active.clear()
         self._last.clear()
         self._new.clear()
         self._began_at = inf
         self._runs_since = inf  # it may begin again before the next look
 
-    def heard(self, cluster: str, now: float) -> None:
+    def on_heard(self, cluster: str, now: float) -> None:
         """Note a status that has reached the plant."""
         self._heard[cluster] = now
 
@@ -205,7 +197,7 @@ class AlarmObserver:
             passed = now - (max(ends, self._wrote_at) if kind == UNWRITTEN else ends)
             limit = self._by_faults.get(kind, inf)
             saw = f"{kind} stands {passed:.0f} s after the last fault, limit {limit:g} s"
-            self._check(passed <= limit, now, subject, saw)
+            self.check(16, passed <= limit, now, subject, saw)
         for cluster, some in self._clusters.items():
             self._named_cluster(cluster, now)
             connected = cluster in carried
@@ -219,7 +211,7 @@ class AlarmObserver:
         named = any(kind == "sun_contradicted" for kind, _ in self._active)
         passed = now - self._runs_since
         saw = f"its time has been wrong for {passed:.0f} s, and no sun_contradicted says so"
-        self._check(named or passed <= CONTRADICTED_WITHIN, now, "plant", saw)
+        self.check(16, named or passed <= CONTRADICTED_WITHIN, now, "plant", saw)
 
     def _caused(
         self, alarm: Alarm, rests: Mapping[str, float], now: float, *, called: bool
@@ -228,29 +220,29 @@ class AlarmObserver:
         kind, subject = alarm.condition, alarm.subject
         saw = f"{kind} is raised: {alarm.text}"
         known = kind in BY_FAULTS or kind in BY_OTHERS
-        self._check(known, now, subject, f"{saw}: nothing in this world causes it")
-        self._check(subject in rests, now, subject, f"{saw}: there is no {subject!r}")
+        self.check(16, known, now, subject, f"{saw}: nothing in this world causes it")
+        self.check(16, subject in rests, now, subject, f"{saw}: there is no {subject!r}")
         sense = len(alarm.text) > len(kind) and not _NONSENSE.search(alarm.text)
-        self._check(sense, now, subject, f"{saw}: that says nothing")
+        self.check(16, sense, now, subject, f"{saw}: that says nothing")
         recalled = now - self._began_at <= RECALLED_WITHIN
         if kind == CALLED and self._alone:
             nobody = f"{saw}: nobody has called one since the last was over"
-            self._check(called or recalled, now, subject, nobody, L2)
+            self.check(L2, called or recalled, now, subject, nobody)
         if kind in UNORDERED and self._works:
             calm = now - rests[""]
             good = calm <= UNORDERED[kind] or recalled
             own = f"nothing has failed for {calm:.0f} s; its cause is the plant's own act"
-            self._check(good, now, subject, f"{saw}: {own}", L2)
+            self.check(L2, good, now, subject, f"{saw}: {own}")
         if kind in self._by_faults:
             calm = now - rests[subject]
             good = calm <= RAISED_WITHIN
-            self._check(good, now, subject, f"{saw}: the last fault ended {calm:.1f} s ago")
+            self.check(16, good, now, subject, f"{saw}: the last fault ended {calm:.1f} s ago")
 
     def _named_cluster(self, cluster: str, now: float) -> None:
         silent = now - max(self._heard[cluster], self._runs_since)
         named = ("cluster_silent", cluster) in self._active
         saw = f"the plant has heard nothing of it for {silent:.1f} s, and no alarm says so"
-        self._check(named or silent <= UNHEARD_WITHIN, now, cluster, saw)
+        self.check(16, named or silent <= UNHEARD_WITHIN, now, cluster, saw)
 
     def _named(self, name: str, well: float, now: float, files: Mapping[str, str]) -> None:
         """Check that a board without power, one in FAULT, and one without a row are named."""
@@ -266,4 +258,4 @@ class AlarmObserver:
             passed = now - max(since.setdefault(name, now), well)
             named = (alarm, name) in self._active
             saw = f"it is {what} for {passed:.1f} s, and no {alarm} names it"
-            self._check(named or passed <= within, now, name, saw)
+            self.check(16, named or passed <= within, now, name, saw)

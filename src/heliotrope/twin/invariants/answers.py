@@ -8,7 +8,7 @@ time (invariant 11). The meaning of each bit, and all limits, are the observer's
 """
 
 import zlib
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from math import inf
@@ -18,7 +18,7 @@ from heliotrope.lcu import states, wire
 from heliotrope.links.messages import NEVER, ClusterStatus
 from heliotrope.twin.boards.outfit import RANGES
 from heliotrope.twin.invariants._account import HeliostatAccount
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import Judge
 
 #: Bits of the flags in STATUS.
 _MOVING, _SUN_FRESH, _CLOCK_SET, _CONFIGURED, _READY, _AT_STOW = (1 << i for i in range(6))
@@ -72,7 +72,7 @@ class _Board:
     steps: deque[tuple[float, tuple[int, ...]]] = field(default_factory=lambda: deque(maxlen=64))
 
 
-class AnswerObserver:
+class AnswerObserver(Judge):
     """Observes the answers on one bus, and the statuses of its cluster.
 
     Parameters
@@ -86,8 +86,6 @@ class AnswerObserver:
 
     Attributes
     ----------
-    checks
-        Number of checks of each invariant.
     quiet
         Returns the heliostats in a quiet stretch; see `QuietObserver`.
     utc
@@ -95,10 +93,10 @@ class AnswerObserver:
     """
 
     def __init__(self, cluster: str, accounts: Sequence[HeliostatAccount], start: float) -> None:
-        self.checks: Counter[int] = Counter()
+        super().__init__(start)
         self.quiet: Callable[[], Collection[str]] = frozenset
         self.utc: Callable[[], float] = lambda: 0.0
-        self._cluster, self._start = cluster, start
+        self._cluster = cluster
         self._boards = {account.address: _Board(account) for account in accounts}
         self._late_at = -inf
         self._later: list[tuple[bool, str, str]] = []
@@ -119,12 +117,7 @@ class AnswerObserver:
         whole = all(board.account.name in calm for board in self._boards.values())
         for good, subject, saw in later:
             if subject in calm or (subject == self._cluster and whole):
-                self._check(good, now, subject, saw)
-
-    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[11] += 1
-        if not good:
-            raise InvariantError(Violation(11, now - self._start, subject, saw))
+                self.check(11, good, now, subject, saw)
 
     # -- the bus ---------------------------------------------------------------------------
 
@@ -158,7 +151,7 @@ class AnswerObserver:
         name = account.name
 
         def check(good: bool, saw: str) -> None:
-            self._check(good, now, name, prefix + saw)
+            self.check(11, good, now, name, prefix + saw)
 
         check(state == account.state, f"state {state}, and it is {account.state}")
         check((supply, warmth) == (0, 0), f"{supply} mV, {warmth} °C; it measures neither")
@@ -192,14 +185,14 @@ class AnswerObserver:
             saw = f"{boots} boots, after {before}; it has booted {least} times since"
             # A boot that the supply cuts short may have been counted.
             good = account.unsure or least <= boots - before <= most
-            self._check(good, now, account.name, saw)
+            self.check(11, good, now, account.name, saw)
 
     def _flags(self, board: _Board, flags: int, now: float) -> None:
         account = board.account
         name, state = account.name, account.state
 
         def check(good: bool, saw: str) -> None:
-            self._check(good, now, name, f"flags {flags:#x} as {states.STATES[state]}: {saw}")
+            self.check(11, good, now, name, f"flags {flags:#x} as {states.STATES[state]}: {saw}")
 
         check(not flags & _NEVER_SET, "a fault, a switch or a key that it does not have")
         turns = now - account.stepped_at < TURNS
@@ -247,9 +240,9 @@ class AnswerObserver:
         counts, goals = tuple(values[:2]), tuple(values[2:])
         place = account.place()
         saw = f"STEPS says {counts}, and it is at {place}"
-        self._check(counts == place, now, account.name, saw)
+        self.check(11, counts == place, now, account.name, saw)
         inside = all(low <= goal <= high for goal, (low, high) in zip(goals, RANGES, strict=True))
-        self._check(inside, now, account.name, f"STEPS says goals {goals} beyond its range")
+        self.check(11, inside, now, account.name, f"STEPS says goals {goals} beyond its range")
         held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and goals != place
         # A boot ends the motion; what has the same goals afterwards is another one.
         goes_on = goals == board.goals and board.off_since > account.booted_at
@@ -257,21 +250,21 @@ class AnswerObserver:
         board.goals, board.off_since = goals, min(before, now) if held else inf
         rests = now - max(account.stepped_at, account.changed_at, board.off_since)
         saw = f"it rests at {place}, and STEPS says goals {goals}"
-        self._check(account.ticks_jumped or rests <= RESTS, now, account.name, saw)
+        self.check(11, account.ticks_jumped or rests <= RESTS, now, account.name, saw)
 
     # -- the line --------------------------------------------------------------------------
 
-    def status(self, message: ClusterStatus, names: Sequence[str], now: float) -> None:
+    def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
         """Judge a status of the cluster as it reaches the plant."""
         by_name = {known.account.name: known for known in self._boards.values()}
-        for name, row in zip(names, message.nodes(), strict=True):
+        for name, row in zip(names, status.nodes(), strict=True):
             board = by_name.get(name)
             if board is None:
                 continue
             reported = tuple(int(row[column]) for column in _STEPS)
             if int(row["steps_ms"]) == NEVER:
-                self._check(
-                    not any(reported), now, name, f"steps {reported} that were never asked for"
+                self.check(
+                    11, not any(reported), now, name, f"steps {reported} that were never asked for"
                 )
                 continue
             at = now - int(row["steps_ms"]) / 1000.0
@@ -279,10 +272,10 @@ class AnswerObserver:
             saw = (
                 f"steps {reported} are reported, of {now - at:.2f} s ago, and it did not answer so"
             )
-            self._check(reported in near, now, name, saw)
+            self.check(11, reported in near, now, name, saw)
             asked, answered = int(row["asked"]), int(row["answered"])
-            self._check(answered <= asked, now, name, f"{answered} answers to {asked} questions")
-        self._numbers(message)
+            self.check(11, answered <= asked, now, name, f"{answered} answers to {asked} questions")
+        self._numbers(status)
 
     def _numbers(self, message: ClusterStatus) -> None:
         """Judge the numbers of a cluster near which nothing has failed."""

@@ -7,7 +7,7 @@ It checks invariants 12 to 15.
 """
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
@@ -20,11 +20,13 @@ from heliotrope.links.messages import ClusterStatus, Command, Progress, Stage
 from heliotrope.mechanism.tracking import TrackingStatus, track
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
+from heliotrope.plant.orders.authority import Person
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Act, Alarm, alarms
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
 from heliotrope.twin.invariants._account import NEAR_STOW, steps_from_stow
-from heliotrope.twin.invariants.invariants import OFF, InvariantError, Violation
+from heliotrope.twin.invariants.invariants import OFF, Judge
 
 Point = tuple[float, ...]
 
@@ -170,7 +172,7 @@ def _since(holds: bool, before: float | None, now: float) -> float | None:
     return None if not holds else now if before is None else before
 
 
-class BeamObserver:
+class BeamObserver(Judge):
     """Observes beams, alarms and proofs.
 
     Parameters
@@ -192,8 +194,6 @@ class BeamObserver:
 
     Attributes
     ----------
-    checks
-        Number of checks of each invariant.
     losses
         Number of losses after which the field waits for a person.
     proofs
@@ -212,9 +212,9 @@ class BeamObserver:
         losses: int | None = None,
         unsurveyed: Collection[str] = (),
     ) -> None:
-        self.checks: Counter[int] = Counter()
+        super().__init__(start)
         self.losses = 0
-        self._start, self._sun, self._most = start, sun, losses
+        self._sun, self._most = sun, losses
         self._keep_outs, self._unsurveyed = tuple(keep_outs), set(unsurveyed)
         self._mirrors = {
             board.outfit.name: _Mirror(board, cluster)
@@ -230,14 +230,9 @@ class BeamObserver:
         self._stalled, self._exchanged = set[str](), set[str]()
         self.proofs, self._complete_order, self.contradicted = 0, "", False
 
-    def _check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[number] += 1
-        if not good:
-            raise InvariantError(Violation(number, now - self._start, subject, saw))
-
     # -- orders, reports and alarms ----------------------------------------------------------
 
-    def sent(self, message: Command, heliostats: Iterable[str], now: float) -> None:
+    def on_command(self, message: Command, heliostats: Sequence[str], now: float) -> None:
         """Note a command that has left the plant."""
         for name in heliostats:
             mirror = self._mirrors[name]
@@ -255,14 +250,33 @@ class BeamObserver:
             elif message.name in _ELSEWHERE:
                 mirror.elsewhere = True
 
-    def ordered_off(self, heliostats: Iterable[str], now: float) -> None:
+    def on_emergency(self, name: str, heliostats: Sequence[str], now: float) -> None:
         """Note DEFOCUS or STOW from the plant."""
-        for name in heliostats or self._mirrors:
-            mirror = self._mirrors[name]
+        del name
+        for heliostat in heliostats or self._mirrors:
+            mirror = self._mirrors[heliostat]
             mirror.ordered_at = mirror.off_at = now
             mirror.seen_up &= not mirror.up  # what is up leaves by this order, and is not lost
             if mirror.state == states.LOCKED:  # it has left when it is unlocked, unless it is IDLE
                 mirror.reports = 0
+
+    def on_accepted(
+        self, person: Person, token: int, ticket: Ticket, what: str, now: float
+    ) -> None:
+        """Note a command of a person that the plant has accepted."""
+        del person, token
+        if what not in ("ROUGH", "PARAMETERS"):
+            self.resumed(ticket.heliostats, what, now)
+
+    def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
+        """Note DEFOCUS or STOW by a person: the mirrors are not automatic control's any more."""
+        del person, what, now
+        self.taken(ticket.heliostats)
+
+    def on_call(self, owner: str, act: Act, now: float) -> None:
+        """Note an emergency that a person has raised: after it no mirror is automatic control's."""
+        del owner, act, now
+        self.taken(self._mirrors)
 
     def resumed(self, heliostats: Iterable[str], what: str, now: float) -> None:
         """Note a command of a person that the plant has accepted."""
@@ -292,7 +306,7 @@ class BeamObserver:
             if mirror.board.state not in _UP:  # it has left since the last look: lost before
                 mirror.seen_up = False
 
-    def reported(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
+    def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
         """Note a report that has come to the plant: what automatic control can know by it.
 
         What is lost is told by the true states; the report only tells since when that is known.
@@ -322,8 +336,9 @@ class BeamObserver:
             self._lost_at, self._lost_known_at = max(together)[0], now
             self.losses += 1
 
-    def progress(self, message: Progress) -> None:
+    def on_progress(self, message: Progress, now: float) -> None:
         """Forget the points before the one that is reported as done."""
+        del now
         if message.stage is not Stage.DONE:
             return
         for name in message.heliostats:
@@ -333,7 +348,7 @@ class BeamObserver:
                     while points[0][0] != message.identity:
                         points.popleft()
 
-    def alarmed(self, alarm: Alarm, now: float) -> None:
+    def on_alarm(self, alarm: Alarm, now: float) -> None:
         """Note an alarm of the plant."""
         self._alarms[alarm.condition, alarm.subject] = (now, alarm.active)
 
@@ -345,12 +360,13 @@ class BeamObserver:
         """Note that another mirror's board is at a mirror: the place of its beam is unknown."""
         self._exchanged.add(heliostat)
 
-    def ended(self) -> None:
+    def on_end(self, now: float) -> None:
         """Note that the plant's program has ended, and its alarms with it.
 
         A mirror whose step counts were in doubt must be named anew by the next one, in the time
         that any mirror has.
         """
+        del now
         for mirror in self._mirrors.values():
             if self._doubted(mirror):
                 mirror.astray_since = None
@@ -413,7 +429,7 @@ class BeamObserver:
         points = [point for _, point in mirror.aims] or [RECEIVER]
         joins = self.contradicted and any(math.dist(point, RECEIVER) <= OFF for point in points)
         good = mirror.state not in _ON or not (foreign or joins)
-        self._check(12, good, now, mirror.name, f"{states.STATES[mirror.state]}, by {by}")
+        self.check(12, good, now, mirror.name, f"{states.STATES[mirror.state]}, by {by}")
 
     def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
         """Note a new state."""
@@ -445,7 +461,7 @@ class BeamObserver:
         aside = [m.node for m in self._mirrors.values() if m.board.state == states.DEFOCUSED]
         turns = {node.journal.items.get("defocus") for node in aside if node is not None}
         saw = f"{len(aside)} heliostats turned away by the same angles"
-        self._check(13, len(aside) < _MANY or len(turns) > 1, now, mirror.name, saw)
+        self.check(13, len(aside) < _MANY or len(turns) > 1, now, mirror.name, saw)
 
     def _returns(self, mirror: _Mirror, now: float) -> None:
         """Check that a mirror returns to the receiver by a person's will, if one is needed."""
@@ -462,7 +478,7 @@ class BeamObserver:
             unknowing = mirror.called_at <= known_at
             late = unknowing and now - mirror.called_at <= UNDER_WAY
             good = late or mirror.resumed_at >= lost_at
-            self._check(14, good, now, mirror.name, saw)
+            self.check(14, good, now, mirror.name, saw)
 
     def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
         """Check that a beam that was sent to a point is there, or named and off.
@@ -495,11 +511,11 @@ class BeamObserver:
         beside = f"{state}, its beam {where} for {passed:.1f} s"
         unnamed = 0.0 if since is None else now - max(since, mirror.named_at)
         saw = f"{beside}, and no alarm names it"
-        self._check(12, unnamed <= NAMED_WITHIN, now, mirror.name, saw)
+        self.check(12, unnamed <= NAMED_WITHIN, now, mirror.name, saw)
         off = (
             self._doubted(mirror) and mirror.state == states.IDLE and not self._lights(mirror, sun)
         )
-        self._check(12, off or passed <= OFF_WITHIN, now, mirror.name, beside)
+        self.check(12, off or passed <= OFF_WITHIN, now, mirror.name, beside)
 
     def _doubted(self, mirror: _Mirror) -> bool:
         """Whether an alarm names a mirror for its step counts."""
@@ -524,7 +540,7 @@ class BeamObserver:
         ):
             passed = 0.0 if since is None else now - since
             saw = f"{state}, its beam {where} for {passed:.1f} s"
-            self._check(13, passed <= OFF_WITHIN, now, mirror.name, saw)
+            self.check(13, passed <= OFF_WITHIN, now, mirror.name, saw)
 
     def _loss(self, on: int, now: float) -> None:
         """Note a loss that took every mirror off the receiver, two at least."""
@@ -565,7 +581,7 @@ class BeamObserver:
                 self._proved[key] = float("inf")
                 good = True
             saw = f"{order.act.name} is proven for it, and its beam or mirror is {saw}"
-            self._check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
+            self.check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
 
     def _complete(self, order: EmergencyOrder, sun: FloatArray, now: float, *, holds: bool) -> None:
         """Check that no beam is on the receiver that the proof calls done, alone or with all."""
@@ -580,7 +596,7 @@ class BeamObserver:
             shines = f"and its beam has been on the receiver for {passed:.1f} s"
             if complete:
                 saw = f"every heliostat is said to have done {order.act.name}, {shines}"
-                self._check(15, passed <= DONE_WITHIN, now, mirror.name, saw)
+                self.check(15, passed <= DONE_WITHIN, now, mirror.name, saw)
             if holds and mirror.name in done:
                 saw = f"{order.act.name} is proven for it, {shines}"
-                self._check(15, passed <= DONE_WITHIN, now, mirror.name, saw)
+                self.check(15, passed <= DONE_WITHIN, now, mirror.name, saw)

@@ -5,7 +5,6 @@ these persons; the height of the sun, the boards, and which stretches are quiet 
 no limit with the code under test (invariant 16).
 """
 
-from collections import Counter
 from collections.abc import Iterable, Sequence, Set
 from math import inf, radians, sin
 
@@ -13,7 +12,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import Judge
 
 #: Elevation of the sun below which the field belongs at stow, rad.
 LOWEST = radians(8.0)
@@ -29,7 +28,7 @@ _UP = (
 )
 
 
-class DayObserver:
+class DayObserver(Judge):
     """Observes that the field is at stow while the sun is low; see the module.
 
     Parameters
@@ -41,16 +40,12 @@ class DayObserver:
     lowest
         Elevation of the sun below which the field belongs at stow, rad.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(self, start: float, boards: Sequence[Board], lowest: float = LOWEST) -> None:
-        self.checks: Counter[int] = Counter()
+        super().__init__(start)
         self._low = sin(lowest)
-        self._start, self._boards = start, {board.outfit.name: board for board in boards}
+        self._boards = {board.outfit.name: board for board in boards}
         self._assigned: dict[str, float] = {}
         self._calm: dict[str, float] = {}
         self._low_at, self._acted_at = inf, -inf
@@ -65,7 +60,7 @@ class DayObserver:
         for name in heliostats:
             self._assigned.pop(name, None)
 
-    def on_duty(self, now: float) -> None:
+    def took(self, now: float) -> None:
         """Note that a person has the command authority, or asks for it."""
         self._acted_at = now
 
@@ -94,8 +89,6 @@ class DayObserver:
             since = max(self._low_at, given_at, self._acted_at, self._calm.get(name, inf))
             if now - since > AWAY_WITHIN:
                 state = self._boards[name].state
-                self.checks[16] += 1
-                if state in _UP:
-                    saw = f"{states.STATES[state]}, and the sun has been low for "
-                    saw += f"{now - self._low_at:.0f} s"
-                    raise InvariantError(Violation(16, now - self._start, name, saw))
+                saw = f"{states.STATES[state]}, and the sun has been low for "
+                saw += f"{now - self._low_at:.0f} s"
+                self.check(16, state not in _UP, now, name, saw)

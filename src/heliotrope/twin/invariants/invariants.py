@@ -65,7 +65,10 @@ from typing import Any
 from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states, wire
-from heliotrope.links.messages import NEVER, ClusterStatus, Progress, Stage
+from heliotrope.links.messages import NEVER, ClusterStatus, Command, Progress, Stage
+from heliotrope.plant.orders.authority import Person
+from heliotrope.plant.orders.tickets import Ticket
+from heliotrope.safety import Act, Alarm
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, Ball
 from heliotrope.twin.invariants._account import UNLISTED, HeliostatAccount, fingerprint
@@ -218,7 +221,90 @@ class Violation:
         return f"{what}: at {self.at:.3f} s, {self.subject}: {self.saw}"
 
 
-class Observer:
+class Judge:
+    """Base of the observers: counts checks, and raises at the first broken invariant.
+
+    What happens at a plant comes by the hooks ``on_…``, which do nothing here: an observer replaces
+    those that concern it, and whoever sees an event calls its hook of every observer in turn.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    start
+        As given.
+    """
+
+    def __init__(self, start: float) -> None:
+        self.checks: Counter[int] = Counter()
+        self.start = start
+
+    def check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
+        """Count a check, and raise if it fails.
+
+        Raises
+        ------
+        InvariantError
+            If ``good`` is False.
+        """
+        self.checks[number] += 1
+        if not good:
+            raise InvariantError(Violation(number, now - self.start, subject, saw))
+
+    # -- the plant's end of a line -----------------------------------------------------------
+
+    def on_lease(self, token: int, now: float) -> None:
+        """Note a lease that has left the plant."""
+
+    def on_emergency(self, name: str, heliostats: Sequence[str], now: float) -> None:
+        """Note DEFOCUS or STOW from the plant."""
+
+    def on_command(self, message: Command, heliostats: Sequence[str], now: float) -> None:
+        """Note a command that has left the plant."""
+
+    def on_write(self, heliostat: str, what: str, now: float) -> None:
+        """Note what has left the plant to be stored by a heliostat."""
+
+    def on_heard(self, cluster: str, now: float) -> None:
+        """Note a status, of whatever content, that has reached the plant."""
+
+    def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
+        """Note the reports of named heliostats that have reached the plant."""
+
+    def on_progress(self, message: Progress, now: float) -> None:
+        """Note a report to the plant about a command."""
+
+    # -- the plant's program and its persons -------------------------------------------------
+
+    def on_alarm(self, alarm: Alarm, now: float) -> None:
+        """Note an alarm of the plant."""
+
+    def on_end(self, now: float) -> None:
+        """Note that the plant's program has ended."""
+
+    def on_accepted(
+        self, person: Person, token: int, ticket: Ticket, what: str, now: float
+    ) -> None:
+        """Note a command of a person that the plant has accepted."""
+
+    def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
+        """Note DEFOCUS or STOW by a person, which needs no authority."""
+
+    def on_refused(
+        self, person: Person, token: int, asked: tuple[str, Sequence[str]], reason: str, now: float
+    ) -> None:
+        """Note a refusal of a command (name and heliostats), and its reason."""
+
+    def on_call(self, owner: str, act: Act, now: float) -> None:
+        """Note an emergency that a person has raised."""
+
+
+class Observer(Judge):
     """Listens to bus, boards and plant, and raises at the first broken invariant.
 
     It is a `twin.boards.bus.Tap` and a `twin.boards.board.Witness`; `look` is called every half
@@ -237,8 +323,6 @@ class Observer:
 
     Attributes
     ----------
-    checks
-        Number of checks of each invariant.
     frames, orders, runs
         The ledgers, and the account of the plants' runs.
     leased_at
@@ -249,15 +333,13 @@ class Observer:
         Autonomy that the plant's leases grant, s.
     entered
         How often each state was entered.
-    start
-        As given.
     """
 
     def __init__(
         self, boards: Sequence[Board], start: float, sun: SunAt, keep_outs: Sequence[Ball] = ()
     ) -> None:
+        super().__init__(start)
         self._keep_outs = tuple(keep_outs)
-        self.checks: Counter[int] = Counter(dict.fromkeys(TITLES, 0))
         self.frames = FrameLedger()
         self.orders = OrderLedger()
         self.runs = RunAccount()
@@ -266,7 +348,6 @@ class Observer:
         self.jumped_at = self.disturbed_at = float("-inf")
         self.autonomy = 0.0
         self.accounts = [HeliostatAccount(board, start) for board in boards]
-        self.start = start
         self._sun = sun
         self._by_address = {account.address: account for account in self.accounts}
         self._emergencies: list[tuple[str, float]] = []
@@ -295,20 +376,6 @@ class Observer:
         for account in self.accounts:
             account.written = file.get(account.name, account.name)
             account.unlisted_at = None if account.written else now
-
-    # -- verdicts --------------------------------------------------------------------------
-
-    def check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
-        """Count a check, and raise if it fails.
-
-        Raises
-        ------
-        InvariantError
-            If ``good`` is False.
-        """
-        self.checks[number] += 1
-        if not good:
-            raise InvariantError(Violation(number, now - self.start, subject, saw))
 
     def _lease_number(self, now: float, usual: int) -> int:
         return 9 if now - self.jumped_at < JUMP_COUNTS else usual
@@ -557,8 +624,9 @@ class Observer:
 
     # -- the plant -------------------------------------------------------------------------
 
-    def leased(self, now: float) -> None:
+    def on_lease(self, token: int, now: float) -> None:
         """Note a lease that the plant has sent on a working line."""
+        del token
         self.leased_at = now
 
     def ordered(self, order: PlantCommand) -> None:
@@ -606,7 +674,7 @@ class Observer:
             for account in self.accounts:
                 account.forget()
 
-    def progress(self, message: Progress, now: float) -> None:
+    def on_progress(self, message: Progress, now: float) -> None:
         """Judge a report to the plant about a command."""
         order = self.orders.by_identity.get(message.identity)
         if order is None:
@@ -626,10 +694,10 @@ class Observer:
                     saw = f"{order.name} of {account.name} is reported as done and never was"
                     self.check(11, reached, now, subject, saw)
 
-    def status(self, message: ClusterStatus, names: Iterable[str], now: float) -> None:
+    def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
         """Judge a report to the plant about each heliostat: no younger and no other than it is."""
         by_name = {account.name: account for account in self.accounts}
-        for name, row in zip(names, message.nodes(), strict=True):
+        for name, row in zip(names, status.nodes(), strict=True):
             account = by_name.get(name)
             if account is None or int(row["heard_ms"]) == NEVER:
                 continue

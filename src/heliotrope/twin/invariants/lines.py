@@ -6,9 +6,7 @@ must be connected within a time, and the plant's leases must come at their rate,
 command authority. Its times are its own.
 """
 
-from collections import Counter
-
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import Judge
 
 #: A line on which nothing fails is connected within this, s.
 REJOINS_WITHIN = 20.0
@@ -16,7 +14,7 @@ REJOINS_WITHIN = 20.0
 LEASE_EVERY = 3.0
 
 
-class LineObserver:
+class LineObserver(Judge):
     """Observes one line.
 
     Parameters
@@ -26,19 +24,16 @@ class LineObserver:
     start
         Zero of the times that it reports, s.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(self, cluster: str, start: float) -> None:
-        self.checks: Counter[int] = Counter()
-        self._cluster, self._start = cluster, start
+        super().__init__(start)
+        self._cluster = cluster
         self._apart_since = self._whole_since = self._leased_at = start
 
-    def leased(self, now: float) -> None:
+    def on_lease(self, token: int, now: float) -> None:
         """Note a lease that has left the plant."""
+        del token
         self._leased_at = now
 
     def look(self, now: float, *, clear: bool, connected: bool) -> None:
@@ -59,12 +54,7 @@ class LineObserver:
             self._whole_since = now
         apart = now - self._apart_since
         saw = f"nothing stands between it and the plant, and for {apart:.1f} s it has not rejoined"
-        self._check(apart <= REJOINS_WITHIN, now, saw)
+        self.check(16, apart <= REJOINS_WITHIN, now, self._cluster, saw)
         age = now - max(self._leased_at, self._whole_since)
         saw = f"the plant's last lease left {age:.1f} s ago, limit {LEASE_EVERY:g} s"
-        self._check(age <= LEASE_EVERY, now, saw)
-
-    def _check(self, good: bool, now: float, saw: str) -> None:
-        self.checks[16] += 1
-        if not good:
-            raise InvariantError(Violation(16, now - self._start, self._cluster, saw))
+        self.check(16, age <= LEASE_EVERY, now, self._cluster, saw)

@@ -11,7 +11,6 @@ A board that starts anew is left out until it stands still again: what it does a
 can prevent, which is why a person at a mirror uses its switch.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -20,7 +19,7 @@ from heliotrope.lcu.node import Node
 from heliotrope.plant.controller import PlantController
 from heliotrope.safety import Act
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.invariants.invariants import WORDS, InvariantError, Violation
+from heliotrope.twin.invariants.invariants import WORDS, Judge
 
 #: A new program goes on with what holds within this, and an order shows within this, s.
 RECALLED_WITHIN, SHOWN_WITHIN = 2.0, 1.0
@@ -52,7 +51,7 @@ class Words:
     locks: dict[str, tuple[str, ...]]
 
 
-class PersonsObserver:
+class PersonsObserver(Judge):
     """Observes what becomes of persons' orders and locks; see the module.
 
     Parameters
@@ -66,29 +65,22 @@ class PersonsObserver:
 
     Attributes
     ----------
-    checks
-        Number of checks of each invariant.
     orders
         Emergency orders that stand: act and time, s, by owner.
     """
 
     def __init__(self, start: float, boards: Sequence[Board], *, alone: bool = True) -> None:
-        self.checks: Counter[int] = Counter()
+        super().__init__(start)
         self.orders: dict[str, tuple[Act, float]] = {}
-        self._start, self._alone = start, alone
+        self._alone = alone
         self._boards = {board.outfit.name: board for board in boards}
         self._locks: dict[str, _Lock] = {}
         self._plant: PlantController | None = None
         self._since, self._confirmed = float("inf"), True
 
-    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[WORDS] += 1
-        if not good:
-            raise InvariantError(Violation(WORDS, now - self._start, subject, saw))
-
     # -- what persons do -----------------------------------------------------------------------
 
-    def ordered(self, owner: str, act: Act, now: float) -> None:
+    def on_call(self, owner: str, act: Act, now: float) -> None:
         """Note an emergency order; a person has one, of the stronger act."""
         before, at = self.orders.get(owner, (act, now))
         self.orders[owner] = max(act, before), at
@@ -99,19 +91,21 @@ class PersonsObserver:
 
     def withdrawal_refused(self, owner: str, reason: str, now: float) -> None:
         """Check the refusal of a withdrawal: no plant refuses that of an order that stands."""
-        self._check(False, now, "plant", f"the withdrawal of {owner}'s order is refused: {reason}")
+        self.check(
+            WORDS, False, now, "plant", f"the withdrawal of {owner}'s order is refused: {reason}"
+        )
 
     def locked(self, owner: str, heliostats: Sequence[str], now: float) -> None:
         """Note that a person has locked heliostats."""
         for name in heliostats:
             self._locks.setdefault(name, _Lock()).owners[owner] = now
 
-    def written(self, heliostat: str, what: str, now: float) -> None:
+    def on_write(self, heliostat: str, what: str, now: float) -> None:
         """Check that nothing is written to a locked heliostat: its next STOW would move it."""
         lock = self._locks.get(heliostat)
         since = now - min(lock.owners.values()) if lock is not None else 0.0
         saw = f"{what} is sent to it {since:.1f} s after it was locked"
-        self._check(since <= UNDER_WAY, now, heliostat, saw)
+        self.check(WORDS, since <= UNDER_WAY, now, heliostat, saw)
 
     def returned(self, owner: str, heliostats: Sequence[str]) -> None:
         """Note that a person's locks are returned, by that person or by an engineer."""
@@ -180,14 +174,14 @@ class PersonsObserver:
             if now - at <= SHOWN_WITHIN:
                 continue
             saw = f"{owner} ordered {act.name} {now - at:.1f} s ago and has not withdrawn it, and "
-            self._check(owner in shown, now, "plant", f"{saw}the plant names no such order")
+            self.check(WORDS, owner in shown, now, "plant", f"{saw}the plant names no such order")
             order = plant.sentinel.order
             holds = plant.sentinel.on and order is not None and order.act >= act
             does = f"{order.act.name} holds" if order and plant.sentinel.on else "none holds"
-            self._check(holds, now, "plant", f"{saw}{does}")
+            self.check(WORDS, holds, now, "plant", f"{saw}{does}")
         for owner in shown:
             saw = f"an emergency order of {owner} stands, which is withdrawn"
-            self._check(owner in self.orders, now, "plant", saw)
+            self.check(WORDS, owner in self.orders, now, "plant", saw)
 
     def _shown(self, plant: PlantController, now: float) -> None:
         """Check that the plant has the locks of each person, and no others."""
@@ -195,8 +189,8 @@ class PersonsObserver:
         required = {(name, owner) for name, lock in self._locks.items() for owner in lock.owners}
         for name, owner in sorted(required ^ present):
             what = "is not there" if (name, owner) in required else "is there, and was returned"
-            self._check(False, now, name, f"the lock of {owner} {what}")
-        self._check(True, now, "plant", "")
+            self.check(WORDS, False, now, name, f"the lock of {owner} {what}")
+        self.check(WORDS, True, now, "plant", "")
 
     def _down(self, now: float) -> None:
         """Check that no mirror is up while somebody's order stands."""
@@ -205,7 +199,7 @@ class PersonsObserver:
         owner, (act, at) = min(self.orders.items(), key=lambda order: order[1][1])
         for name, board in self._boards.items():
             saw = f"{states.STATES[board.state]} {now - at:.1f} s after {owner} ordered {act.name}"
-            self._check(now - at <= DOWN_WITHIN or board.state not in _UP, now, name, saw)
+            self.check(WORDS, now - at <= DOWN_WITHIN or board.state not in _UP, now, name, saw)
 
     def _still(self, name: str, lock: _Lock, now: float) -> None:
         """Check that a locked heliostat stands still once it has come to stow."""
@@ -223,4 +217,4 @@ class PersonsObserver:
         moved = max(abs(azimuth - lock.place[0]), abs(elevation - lock.place[1]))
         saw = f"{states.STATES[board.state]}, {moved} steps from where it stood when it was locked "
         saw += f"by {', '.join(lock.owners)}"
-        self._check(moved <= STANDS, now, name, saw)
+        self.check(WORDS, moved <= STANDS, now, name, saw)

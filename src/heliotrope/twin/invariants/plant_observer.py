@@ -18,7 +18,8 @@ from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.twin.invariants.invariants import InvariantError, Observer, Violation
+from heliotrope.safety import Act
+from heliotrope.twin.invariants.invariants import Judge, Observer
 from heliotrope.twin.records import RecordsDisk
 
 #: A status waits up to a second, may be in transit for another, and ages are rounded: a value may
@@ -63,7 +64,7 @@ _MOTIONS = ("APPROACH", "IDLE", "LOCK", *_JOINING)
 _SETTINGS = ("LOCK_AIM", "ROUGH")
 
 
-class PlantObserver:
+class PlantObserver(Judge):
     """Observes the plant.
 
     Parameters
@@ -81,8 +82,6 @@ class PlantObserver:
 
     Attributes
     ----------
-    checks
-        Number of checks of each invariant.
     old
         Void tokens, and since when, s.
     """
@@ -96,9 +95,9 @@ class PlantObserver:
         *,
         automatic: bool = False,
     ) -> None:
-        self.checks: Counter[int] = Counter()
+        super().__init__(start)
         self.old: dict[int, float] = {}
-        self._start, self._disk, self._settings = start, disk, settings
+        self._disk, self._settings = disk, settings
         self._clusters, self._automatic = clusters, automatic
         self._accounts = {a.name: a for cluster in clusters for a in cluster.accounts}
         self._holder: tuple[Person, int, float] | None = None
@@ -130,18 +129,6 @@ class PlantObserver:
         self._proved: set[tuple[str, str]] = set()
         self._hangs, self._hung_at = False, float("-inf")
         self._stands, self._stood_at = False, float("-inf")
-
-    def check(self, number: int, good: bool, now: float, saw: str) -> None:
-        """Count a check, and raise if it fails.
-
-        Raises
-        ------
-        InvariantError
-            If ``good`` is False.
-        """
-        self.checks[number] += 1
-        if not good:
-            raise InvariantError(Violation(number, now - self._start, "plant", saw))
 
     # -- authority -------------------------------------------------------------------------
 
@@ -178,7 +165,7 @@ class PlantObserver:
             if person != AUTOMATIC:
                 self._noted(person.name, "AUTHORITY", now)
             self._end(now)
-        self.check(4, good, now, saw)
+        self.check(4, good, now, "plant", saw)
         self._holder, self._granted_at = (person, token, now), now
         self._from_nobody = before is None
 
@@ -254,15 +241,17 @@ class PlantObserver:
 
     # -- accepted commands -----------------------------------------------------------------
 
-    def accepted(self, person: Person, token: int, ticket: Ticket, what: str, now: float) -> None:
+    def on_accepted(
+        self, person: Person, token: int, ticket: Ticket, what: str, now: float
+    ) -> None:
         """Judge a command that the plant has accepted."""
         holder = self._live(now)
         held = holder is not None and holder[:2] == (person, token)
         saw = f"{what} by {person.name} was accepted without the authority"
-        self.check(4, held, now, saw)
+        self.check(4, held, now, "plant", saw)
         enough = person.role >= (Role.OPERATOR if what in _OPERATORS else Role.ENGINEER)
         saw = f"{what} was accepted from {person.name}, role {person.role.name.lower()}"
-        self.check(4, enough, now, saw)
+        self.check(4, enough, now, "plant", saw)
         self.kept(now)
         if ticket.identity in self._disk.records or not self._disk.busy(now):
             self._kept_record(ticket.identity, person.name, what, now)
@@ -275,32 +264,44 @@ class PlantObserver:
                     self._taken.setdefault(name, now)
         self._count(now)
 
-    def refused(self, person: Person, token: int, what: str, reason: str, now: float) -> None:
+    def on_refused(
+        self, person: Person, token: int, asked: tuple[str, Sequence[str]], reason: str, now: float
+    ) -> None:
         """Judge the reason of a refusal, where it names the command authority or the role.
 
         A command that its holder may give is refused for other reasons after it has renewed the
         authority, or before.
         """
-        holder = self._live(now)
+        holder, what = self._live(now), asked[0]
         # An authority that nobody has renewed for a while may be over a moment earlier or later.
         sure = holder is not None and now - holder[2] < self._settings.authority - _AT_ONCE
         saw = f"{what} was refused: {reason}; "
         if ROLE_REASON in reason:
             least = Role.OPERATOR if what in _OPERATORS else Role.ENGINEER
-            self.check(16, person.role < least, now, f"{saw}{least.title} is enough")
+            self.check(16, person.role < least, now, "plant", f"{saw}{least.title} is enough")
         elif NOBODY_REASON in reason:
-            self.check(16, not sure, now, f"{saw}{holder[0].name if holder else 'nobody'} has it")
+            self.check(
+                16, not sure, now, "plant", f"{saw}{holder[0].name if holder else 'nobody'} has it"
+            )
         elif OTHER_REASON in reason:
             if sure and holder is not None:
                 right = holder[:2] != (person, token) and f"{holder[0].name} has it" in reason
-                self.check(16, right, now, f"{saw}{holder[0].name} has it")
+                self.check(16, right, now, "plant", f"{saw}{holder[0].name} has it")
         elif holder is not None and holder[:2] == (person, token):
             self._perhaps = now
 
     def _kept_record(self, identity: str, who: str, what: str, now: float) -> None:
         record = self._disk.records.get(identity)
         right = record is not None and (record.who, record.what) == (who, what)
-        self.check(11, right, now, f"{what} by {who} was accepted without its record")
+        self.check(11, right, now, "plant", f"{what} by {who} was accepted without its record")
+
+    def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
+        """Note DEFOCUS or STOW, which the plant must take from anybody."""
+        self.obeyed(person.name, what, now, ticket.identity)
+
+    def on_call(self, owner: str, act: Act, now: float) -> None:
+        """Note an emergency, which the plant must take from anybody."""
+        self.obeyed(owner, act.name, now)
 
     def obeyed(self, who: str, what: str, now: float, identity: str = "") -> None:
         """Note a command that the plant must take from anybody, and may record later.
@@ -316,7 +317,7 @@ class PlantObserver:
         self._accepted[who, what] += 1
         self._noted_at[who, what] = now
 
-    def ended(self, now: float) -> None:
+    def on_end(self, now: float) -> None:
         """Note that the plant's program has ended: records that it still owed are lost."""
         self._end(now)
         self._count(now)
@@ -355,7 +356,9 @@ class PlantObserver:
         what = message.name if isinstance(message, Command) else "PARAMETERS"
         record = self._disk.records.get(identity)
         good = record is not None and record.what == what
-        self.check(11, good, now, f"{what} {message.identity} is sent before its record is kept")
+        self.check(
+            11, good, now, "plant", f"{what} {message.identity} is sent before its record is kept"
+        )
         if not isinstance(message, Command):
             return
         whom = message.heliostats or members
@@ -379,7 +382,7 @@ class PlantObserver:
         for name in heliostats:
             passed = now - self._taken.get(name, now)
             saw = f"automatic control sends {name} {what}; {holder[0].name} took it {passed:.1f} s"
-            self.check(4, passed <= _AT_ONCE, now, f"{saw} ago")
+            self.check(4, passed <= _AT_ONCE, now, "plant", f"{saw} ago")
 
     def aimed(self, name: str) -> float:
         """Return when an aim was last sent to a heliostat, s; -inf if never."""
@@ -402,7 +405,7 @@ class PlantObserver:
             held = min(abs(now - self._hung_at), abs(at - self._hung_at)) < 2.0 * life
             most = burst + rate * (span + slack + life * held) + 1e-6
             saw = f"{count} mirrors {how} within {span:.2f} s, at most {most:.1f} may join"
-            self.check(10, count <= most, now, saw)
+            self.check(10, count <= most, now, "plant", saw)
             if span > 60.0:
                 break
 
@@ -444,7 +447,7 @@ class PlantObserver:
         for identity in self._own.keys() & waits:
             since = self._own[identity][0]
             saw = f"record {identity} has waited for its turn for {now - since:.0f} s"
-            self.check(11, now - since <= TURN_WITHIN, now, saw)
+            self.check(11, now - since <= TURN_WITHIN, now, "plant", saw)
             self._own[identity] = since, now
         well_since = max(self._disk.well_since, self._stood_at)
         if now - well_since > RECORD_WITHIN and not (self._disk.full or self._disk.busy(now)):
@@ -467,7 +470,7 @@ class PlantObserver:
         for key in self._recorded if self._counted_records < len(records) else ():
             count, most = self._recorded[key], self._accepted[key]
             saw = f"{count} records of {key[1]} by {key[0]}, who ordered it {most} times"
-            self.check(11, count <= most, now, saw)
+            self.check(11, count <= most, now, "plant", saw)
         self._counted_records = len(records)
 
     def _complete(self, now: float) -> None:
@@ -477,7 +480,7 @@ class PlantObserver:
                 del self._noted_at[key]
                 count, most = self._recorded[key], self._accepted[key]
                 saw = f"{count} records of {key[1]} by {key[0]}, who ordered it {most} times"
-                self.check(11, count == most, now, saw)
+                self.check(11, count == most, now, "plant", saw)
         for identity, (at, who, what) in list(self._awaited.items()):
             if now - at > RECORD_WITHIN:
                 del self._awaited[identity]
@@ -486,14 +489,16 @@ class PlantObserver:
             if now - at > RECORD_WITHIN:
                 del self._following[identity]
                 good = identity in self._disk.records
-                self.check(11, good, now, f"order {identity} has no record {now - at:.1f} s later")
+                self.check(
+                    11, good, now, "plant", f"order {identity} has no record {now - at:.1f} s later"
+                )
         for identity, (_, at) in list(self._own.items()):
             if now - max(at, self._hung_at) > RECORD_WITHIN:
                 del self._own[identity]
                 # A command that waited too long for the disk is given up; its record says so.
                 given_up = "not sent" in self._disk.records[identity].result
                 saw = f"record {identity} belongs to nothing that was sent, and does not say so"
-                self.check(11, given_up, now, saw)
+                self.check(11, given_up, now, "plant", saw)
 
     def _boards(self, now: float) -> None:
         """Note the mirrors that join, by the boards themselves."""
@@ -516,15 +521,15 @@ class PlantObserver:
             shown = plant.field.of(name, now)
             row = plant.field.index[name]
             saw = f"{name} is {'live' if shown.live else 'stale'} in one place, not in the other"
-            self.check(11, shown.live == live[row], now, saw)
+            self.check(11, shown.live == live[row], now, "plant", saw)
             if not shown.live:
                 continue
             age = now - heard[-1][0] if heard else float("inf")
             saw = f"{name} is shown as live, last heard {age:.2f} s ago, limit {limit:.2f} s"
-            self.check(11, age <= limit, now, saw)
+            self.check(11, age <= limit, now, "plant", saw)
             reported = {states.STATES[state] for at, state in heard if now - at <= limit}
             saw = f"{name} is shown as {shown.state}; it reported {', '.join(sorted(reported))}"
-            self.check(11, shown.state in reported, now, saw)
+            self.check(11, shown.state in reported, now, "plant", saw)
 
     def _proofs(self, plant: PlantController, now: float) -> None:
         """Check that everything a proof calls done was done."""
@@ -536,4 +541,4 @@ class PlantObserver:
             if key not in self._proved and order.is_done(name):
                 self._proved.add(key)
                 saw = f"{order.act.name} is proven for {name}, which has not left its beam"
-                self.check(11, account.was_in(_OFF, order.at - YOUNGER), now, saw)
+                self.check(11, account.was_in(_OFF, order.at - YOUNGER), now, "plant", saw)

@@ -24,7 +24,7 @@ from heliotrope.plant.operations.views import Running
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import RECEIVER
 from heliotrope.twin.invariants.day import LOWEST
-from heliotrope.twin.invariants.invariants import L1, L3, L4, OFF, InvariantError, Violation
+from heliotrope.twin.invariants.invariants import L1, L3, L4, OFF, Judge
 
 #: The field belongs up once the sun is this much higher than the elevation below which it belongs
 #: at stow, rad, or if it was never below it.
@@ -54,7 +54,7 @@ FAILED, BLOCKED, NOBODY = "work", "beam_blocked", "authority_lost"
 PHOTOGRAPH = "photograph "
 
 
-class ProgressObserver:
+class ProgressObserver(Judge):
     """Observes the progress of automatic control; see the module.
 
     Parameters
@@ -75,10 +75,6 @@ class ProgressObserver:
         Heliostats whose beams no camera sees: the plant file is wrong about them, so that they
         go beside the receiver and the targets, or the mirror is covered.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(
@@ -92,8 +88,8 @@ class ProgressObserver:
         lowest: float = LOWEST,
         dark: Collection[str] = (),
     ) -> None:
-        self.checks: Counter[int] = Counter()
-        self._start, self._targets = start, {target.name: target for target in targets}
+        super().__init__(start)
+        self._targets = {target.name: target for target in targets}
         self._boards = {board.outfit.name: board for board in boards}
         self._together, self._across = together, across
         self._assigned: set[str] = set()
@@ -105,11 +101,6 @@ class ProgressObserver:
         self._calibrates, self._measured = True, 0.0
         self._took_at, self._begun = -inf, dict[str, tuple[str, ...]]()
         self._emergency = self._called = self._ended = False
-
-    def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
-        self.checks[number] += 1
-        if not good:
-            raise InvariantError(Violation(number, now - self._start, subject, saw))
 
     # -- persons -----------------------------------------------------------------------------
 
@@ -142,8 +133,9 @@ class ProgressObserver:
         """Note that a person has raised an emergency, or that it was cleared."""
         self._called = on
 
-    def ended(self) -> None:
+    def on_end(self, now: float) -> None:
         """Note that the plant's program has ended."""
+        del now
         self._ended, self._calibrates = True, True
         self._since.clear()
         self._assigned.clear()
@@ -189,7 +181,7 @@ class ProgressObserver:
         rows = operations.logbook.alarms()
         self._recalled(operations, now)
         failures = [row.text for row in rows if row.condition == FAILED]
-        self._check(not failures, now, "automatic control", failures[0] if failures else "")
+        self.check(16, not failures, now, "automatic control", failures[0] if failures else "")
         if operations.plant.sentinel.order is not None:
             self._assigned.clear()
         running = operations.automatic.view().running
@@ -267,11 +259,11 @@ class ProgressObserver:
             self._ended = False
             saw = "a person's emergency held when the last program ended, and the new one goes on"
             good = on or bool(operations.automatic.waits) or not self._called
-            self._check(good, now, "plant", saw, L4)
+            self.check(L4, good, now, "plant", saw)
             out = {lockout.name for lockout in operations.automatic.service.out}
             lost = sorted(self._out.keys() - out)
             saw = f"a restart has put back in service: {', '.join(lost)}"
-            self._check(not lost, now, "plant", saw, L4)
+            self.check(L4, not lost, now, "plant", saw)
         self._emergency = on
 
     def _go_on(self, operations: Operations, untouched: Set[str], now: float) -> None:
@@ -287,7 +279,7 @@ class ProgressObserver:
             off = all(ends.get(name) is CalibrationOutcome.REFUSED for name in names)
             saw = f"a person took the command authority {now - self._took_at:.1f} s ago, and "
             saw += f"a visit of {', '.join(names)}, which nobody has touched, has broken off"
-            self._check(not (off and untouched >= set(names)), now, place, saw)
+            self.check(16, not (off and untouched >= set(names)), now, place, saw)
 
     def _step_finely(
         self, running: Sequence[Running], quiet: Set[str], sun: FloatArray, now: float
@@ -302,7 +294,7 @@ class ProgressObserver:
                 photographed = board.state == states.TRACKING and self._on(board, target, sun)
                 rough = board.node is not None and board.node.controller.motion.rough > 0
                 saw = f"it is photographed on {run.target}, and steps roughly"
-                self._check(not (photographed and rough), now, name, saw)
+                self.check(16, not (photographed and rough), now, name, saw)
 
     def _measures(
         self, operations: Operations, working: Sequence[str], *, may: bool, now: float
@@ -334,7 +326,7 @@ class ProgressObserver:
             return
         passed = now - self._since.setdefault(key, now)
         saw = f"{what} for {passed:.0f} s, limit {limit:.0f} s"
-        self._check(passed <= limit, now, name, saw, number)
+        self.check(number, passed <= limit, now, name, saw)
 
     def _on(self, board: Board, target: Target, sun: FloatArray) -> bool:
         """Whether a beam is within a target, by the steps that were made."""
@@ -345,7 +337,7 @@ class ProgressObserver:
         """Check the visits that are shown as under way."""
         counted = Counter(name for run in running for name in run.heliostats)
         for name, count in counted.items():
-            self._check(count == 1, now, name, f"it is shown in {count} visits at once")
+            self.check(16, count == 1, now, name, f"it is shown in {count} visits at once")
         kept = {("visit", run.target, *run.heliostats) for run in running}
         for key in [key for key in self._since if key[0] == "visit" and key not in kept]:
             del self._since[key]
@@ -357,4 +349,4 @@ class ProgressObserver:
             for name in run.heliostats:
                 out_at = self._out.get(name, inf)
                 saw = f"it was taken out of service {now - out_at:.1f} s ago, and a visit begins"
-                self._check(not (fresh and now - out_at > 1.0), now, name, saw)
+                self.check(16, not (fresh and now - out_at > 1.0), now, name, saw)

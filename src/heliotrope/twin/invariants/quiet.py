@@ -8,8 +8,7 @@ that the plant is told so (invariant 16). It knows the orders from the line, the
 faults of the run; its times are its own.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from math import inf
 
@@ -21,11 +20,12 @@ from heliotrope.lcu.node import Node
 from heliotrope.links.messages import Command, Progress, Stage
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.orders.authority import Person
 from heliotrope.safety import Act, Alarm
 from heliotrope.twin.boards.outfit import RECEIVER, STANDBY
 from heliotrope.twin.invariants._account import HeliostatAccount
 from heliotrope.twin.invariants.beams import slew
-from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
+from heliotrope.twin.invariants.invariants import OFF, Judge, Observer
 
 #: A stretch is quiet this long after the last fault, a board's boot, and the end of the last alarm
 #: that names a heliostat or its cluster, s.
@@ -131,7 +131,7 @@ class _Mirror:
         return self.account.name
 
 
-class QuietObserver:
+class QuietObserver(Judge):
     """Observes what is done in quiet stretches; see the module.
 
     Parameters
@@ -147,10 +147,6 @@ class QuietObserver:
     near
         A beam is this near its point, as a share of its length, rad.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(
@@ -162,8 +158,8 @@ class QuietObserver:
         reaches: bool,
         near: float = NEAR,
     ) -> None:
-        self.checks: Counter[int] = Counter()
-        self._start, self._sun, self._reaches, self._near = start, sun, reaches, near
+        super().__init__(start)
+        self._sun, self._reaches, self._near = sun, reaches, near
         self._clusters = clusters
         self._mirrors = {
             account.name: _Mirror(account, cluster)
@@ -180,13 +176,9 @@ class QuietObserver:
         self._named_at: dict[str, float] = {}
         self._token, self._token_at = 0, -inf
 
-    def _check(self, good: bool, now: float, mirror: _Mirror, saw: str) -> None:
-        self.checks[16] += 1
-        if not good:
-            state = states.STATES[mirror.state]
-            raise InvariantError(
-                Violation(16, now - self._start, mirror.name, f"{state} in a quiet stretch: {saw}")
-            )
+    def _calmly(self, good: bool, now: float, mirror: _Mirror, saw: str) -> None:
+        state = states.STATES[mirror.state]
+        self.check(16, good, now, mirror.name, f"{state} in a quiet stretch: {saw}")
 
     @property
     def stretches(self) -> frozenset[str]:
@@ -199,12 +191,12 @@ class QuietObserver:
 
     # -- orders and reports ------------------------------------------------------------------
 
-    def leased(self, token: int, now: float) -> None:
+    def on_lease(self, token: int, now: float) -> None:
         """Note a lease that has left the plant."""
         if token != self._token:
             self._token, self._token_at = token, now
 
-    def sent(self, message: Command, heliostats: Iterable[str], now: float) -> None:
+    def on_command(self, message: Command, heliostats: Sequence[str], now: float) -> None:
         """Note a command that has left the plant."""
         for name in heliostats:
             mirror = self._mirrors[name]
@@ -228,7 +220,7 @@ class QuietObserver:
         """Whether the clusters must have the authority of a command."""
         return message.token == self._token != 0 and now - self._token_at > GRANTED
 
-    def ordered_off(self, name: str, heliostats: Iterable[str], now: float) -> None:
+    def on_emergency(self, name: str, heliostats: Sequence[str], now: float) -> None:
         """Note DEFOCUS or STOW from the plant."""
         begins, ends, within = SAFE_ORDERS[name]
         for heliostat in heliostats:
@@ -258,14 +250,18 @@ class QuietObserver:
         else:
             mirror.standby = point
 
-    def refused(self, heliostat: str, reason: str, now: float) -> None:
-        """Note the reason of a refusal, where it names what this observer knows.
+    def on_refused(
+        self, person: Person, token: int, asked: tuple[str, Sequence[str]], reason: str, now: float
+    ) -> None:
+        """Note why one heliostat is refused, where the reason names what this observer knows.
 
         It is judged at the next look, which knows of a fault that has just begun.
         """
-        mirror = self._mirrors[heliostat]
+        del person, token
+        heliostat = asked[1][0] if len(asked[1]) == 1 else ""
         if heliostat not in self._quiet:
             return
+        mirror = self._mirrors[heliostat]
         calm = now - mirror.quiet_since
         saw = f"refused: {reason}; it has been quiet for {calm:.0f} s"
         good = True
@@ -279,24 +275,27 @@ class QuietObserver:
             good = sure <= STATUS_EVERY
         self._refusals.append((mirror, good, saw))
 
-    def progress(self, message: Progress) -> None:
+    def on_progress(self, message: Progress, now: float) -> None:
         """Note that the plant is told that orders are done."""
+        del now
         if message.stage is Stage.DONE:
             for name in message.heliostats:
                 order = self._mirrors[name].order if name in self._mirrors else None
                 if order is not None and order.identity == message.identity:
                     order.identity = ""
 
-    def alarmed(self, alarm: Alarm) -> None:
+    def on_alarm(self, alarm: Alarm, now: float) -> None:
         """Note an alarm of the plant: whom it names need not work."""
+        del now
         key = alarm.condition, alarm.subject
         if alarm.active:
             self._alarms[key] = alarm.subject
         else:
             self._alarms.pop(key, None)
 
-    def ended(self) -> None:
+    def on_end(self, now: float) -> None:
         """Note that the plant's program has ended, and its alarms with it."""
+        del now
         self._alarms.clear()
 
     # -- judgement ---------------------------------------------------------------------------
@@ -349,7 +348,7 @@ class QuietObserver:
         refusals, self._refusals = self._refusals, []
         for mirror, good, saw in refusals:
             if mirror.name in self._quiet:
-                self._check(good, now, mirror, saw)
+                self._calmly(good, now, mirror, saw)
 
     def _notes(self, mirror: _Mirror, now: float) -> None:
         board = mirror.account.board
@@ -372,10 +371,10 @@ class QuietObserver:
         account = mirror.account
         age = now - account.sun_at
         saw = f"the last sun has reached it {age:.1f} s ago, limit {SUN_EVERY:g} s"
-        self._check(age <= SUN_EVERY, now, mirror, saw)
+        self._calmly(age <= SUN_EVERY, now, mirror, saw)
         age = now - (account.statuses[-1][0] if account.statuses else -inf)
         saw = f"its cluster has last heard its state {age:.1f} s ago, limit {STATUS_EVERY:g} s"
-        self._check(age <= STATUS_EVERY, now, mirror, saw)
+        self._calmly(age <= STATUS_EVERY, now, mirror, saw)
 
     def _told_off(self, mirror: _Mirror) -> float:
         """Return when the cluster last sent DEFOCUS or STOW to it, s."""
@@ -400,14 +399,14 @@ class QuietObserver:
                 order.done_at = now
             passed = now - order.at
             saw = f"{order.name} was ordered {passed:.1f} s ago, limit {order.within:g} s"
-            self._check(passed <= order.within, now, mirror, saw)
+            self._calmly(passed <= order.within, now, mirror, saw)
             return
         if mirror.state not in order.ends:
             mirror.order = None
             return
         passed = now - order.done_at
         saw = f"{order.name} was done {passed:.1f} s ago, and the plant has not been told"
-        self._check(not order.identity or passed <= TOLD_WITHIN, now, mirror, saw)
+        self._calmly(not order.identity or passed <= TOLD_WITHIN, now, mirror, saw)
 
     def _stays(self, mirror: _Mirror, before: int, now: float) -> None:
         """Check that a mirror does not leave its work by itself."""
@@ -415,7 +414,7 @@ class QuietObserver:
         if falls and self._reaches and self._is_own(mirror):
             passed = now - self._told_off(mirror)
             saw = f"it has left {states.STATES[before]} by itself"
-            self._check(passed <= CROSSING, now, mirror, saw)
+            self._calmly(passed <= CROSSING, now, mirror, saw)
 
     def _on_point(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
         """Check that the beam is on its aim, or at standby, by the steps that were made."""
@@ -436,7 +435,7 @@ class QuietObserver:
         elif mirror.due_at == inf:
             mirror.due_at = now + slew(board, sun, goal)
         saw = f"its beam is {miss:.2f} m beside its point, limit {limit:.2f} m"
-        self._check(miss <= limit or now < mirror.due_at, now, mirror, saw)
+        self._calmly(miss <= limit or now < mirror.due_at, now, mirror, saw)
 
     def _proven(self, mirror: _Mirror, plant: PlantController, sun: FloatArray, now: float) -> None:
         """Check that an emergency that has been carried out is proven."""
@@ -453,4 +452,4 @@ class QuietObserver:
         mirror.off_since = now if mirror.off_since is None else mirror.off_since
         passed = now - max(mirror.off_since, order.at)
         saw = f"{order.act.name} was done {passed:.1f} s ago, and is not proven for it"
-        self._check(passed <= PROVEN_WITHIN or order.is_done(mirror.name), now, mirror, saw)
+        self._calmly(passed <= PROVEN_WITHIN or order.is_done(mirror.name), now, mirror, saw)

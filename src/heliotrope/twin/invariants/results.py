@@ -7,7 +7,6 @@ two calibrations, before and after. The store and the logbook must have it, and 
 know what the one before it knew (16). Visits that bring nothing do not go on without end (L2).
 """
 
-from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
@@ -22,7 +21,7 @@ from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry, EventRow
 from heliotrope.store.records import Records
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.invariants.invariants import L2, InvariantError, Violation
+from heliotrope.twin.invariants.invariants import L2, Judge
 
 #: Times of a sighting and of its photograph agree to within this, s.
 SAME = 1e-3
@@ -79,7 +78,7 @@ class _Account:
     typed: bool = False  # a person has set parameters, which the plant will believe
 
 
-class ResultObserver:
+class ResultObserver(Judge):
     """Observes sightings and results; see the module.
 
     Parameters
@@ -100,10 +99,6 @@ class ResultObserver:
     together
         Whether heliostats are measured at once: that one lamp or cloud spoils all is seldom.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(
@@ -117,8 +112,8 @@ class ResultObserver:
         *,
         together: bool = False,
     ) -> None:
-        self.checks: Counter[int] = Counter()
-        self._start, self._records, self._sun, self._zero = start, records, sun, zero
+        super().__init__(start)
+        self._records, self._sun, self._zero = records, sun, zero
         self._boards = {board.outfit.name: board for board in boards}
         self._accounts = {name: _Account() for name in self._boards}
         self._dark, self._together = frozenset(dark), together
@@ -126,11 +121,6 @@ class ResultObserver:
         self._results: set[tuple[str, float]] = set()
         self._program: Operations | None = None
         self._checked_at = start
-
-    def _check(self, good: bool, now: float, subject: str, saw: str, number: int = 16) -> None:
-        self.checks[number] += 1
-        if not good:
-            raise InvariantError(Violation(number, now - self._start, subject, saw))
 
     def photographed(self, heliostat: str, target: str, point: FloatArray, now: float) -> None:
         """Note a photograph at the moment of its exposure."""
@@ -161,10 +151,10 @@ class ResultObserver:
         for entry in reversed(new):
             self._results.add((entry.heliostat, entry.at))
             # One from just before the program stood still is seen once it goes on.
-            old = max(self._checked_at, self._start) - (entry.at - self._zero)
+            old = max(self._checked_at, self.start) - (entry.at - self._zero)
             passed = now - self._checked_at
             saw = f"a result that was not there {passed:.1f} s ago is {old:.1f} s older"
-            self._check(old <= SHOWN_WITHIN, now, entry.heliostat, saw)
+            self.check(16, old <= SHOWN_WITHIN, now, entry.heliostat, saw)
             self._concluded(operations, entry, now)
         self._checked_at = now
 
@@ -182,15 +172,15 @@ class ResultObserver:
         if begins:
             # Sightings come back with the calibration that they led to.
             saw = f"a new program knows calibration {version}, that before it {account.version}"
-            self._check(version >= account.version, now, name, saw)
+            self.check(16, version >= account.version, now, name, saw)
             saw = f"a new program knows {count} sightings, that before it {account.kept}"
-            self._check(count >= account.kept or version == 0, now, name, saw)
+            self.check(16, count >= account.kept or version == 0, now, name, saw)
             account.last, account.result_version, account.searched = count, version, 0
         elif count > account.kept and stored is not None:
             new = stored.sightings.take(np.arange(account.kept, count))
             self._photographs(name, new, stored.targets[account.kept :], now)
         saw = f"the plant knows {count} sightings, and knew {account.kept}"
-        self._check(begins or count >= account.kept, now, name, saw)
+        self.check(16, begins or count >= account.kept, now, name, saw)
         if account.before is None or begins:
             account.before = beliefs.present(name)
         account.kept, account.version = count, version
@@ -202,19 +192,19 @@ class ResultObserver:
             at = float(new.time[k]) - self._zero
             away = float(np.linalg.norm(new.source[k] - self._sun(at)))
             saw = f"a sighting has a sun {1e3 * away:.2f} mrad from the true one"
-            self._check(away <= SUN_WITHIN, now, name, saw)
+            self.check(16, away <= SUN_WITHIN, now, name, saw)
             own = [shot for shot in account.pictures if abs(shot.at - at) < SAME]
             if not own:
                 continue  # of a stack, which `VisitObserver` judges
             picture = own[0]
             saw = f"a sighting on {target} is a photograph of {picture.target}"
-            self._check(target == picture.target, now, name, saw)
+            self.check(16, target == picture.target, now, name, saw)
             off = float(np.linalg.norm(new.destination[k] - picture.point))
             saw = f"a sighting is {off:.3f} m from the point that was photographed"
-            self._check(off <= POINT_WITHIN, now, name, saw)
+            self.check(16, off <= POINT_WITHIN, now, name, saw)
             steps = float(np.abs(new.counts[k] - picture.counts).max())
             saw = f"a sighting's counts are {steps:.0f} steps from those at its photograph"
-            self._check(steps <= COUNTS_WITHIN, now, name, saw)
+            self.check(16, steps <= COUNTS_WITHIN, now, name, saw)
 
     # -- results -----------------------------------------------------------------------------
 
@@ -222,7 +212,7 @@ class ResultObserver:
         name, account = entry.heliostat, self._accounts[entry.heliostat]
         plant, at = operations.plant, entry.at - self._zero
         record, stored = plant.beliefs.record(name), plant.beliefs.seen(name)
-        self._check(at <= now + SAME, now, name, f"a result is dated {at - now:.1f} s ahead")
+        self.check(16, at <= now + SAME, now, name, f"a result is dated {at - now:.1f} s ahead")
         brought = account.kept - account.last
         new, version = account.version != account.result_version, account.version
         before = account.before
@@ -233,31 +223,31 @@ class ResultObserver:
         )
         self._noted(operations, entry, now)
         saw = f"a visit to {entry.target} failed with an error: {entry.text}"
-        self._check(entry.outcome is not CalibrationOutcome.ERROR, now, name, saw)
+        self.check(16, entry.outcome is not CalibrationOutcome.ERROR, now, name, saw)
         if entry.outcome in _BROKEN:
             return
         account.vain = 0 if entry.new else account.vain + 1
         saw = f"{account.vain} visits in a row have brought nothing, the last: {entry.text}"
-        self._check(account.vain <= RETRIES, now, name, saw, L2)
+        self.check(L2, account.vain <= RETRIES, now, name, saw)
         missed = entry.outcome is CalibrationOutcome.NO_BEAM
         account.searched = account.searched + 1 if missed else 0
         saw = f"its beam was searched for in vain {account.searched} times in a row"
-        self._check(account.searched <= SEARCHES, now, name, saw, L2)
+        self.check(L2, account.searched <= SEARCHES, now, name, saw)
         if name not in self._dark:
             self._barren = [] if entry.new else [*self._barren, entry]
             count = len(self._barren)
             saw = f"{count} results in a row have brought nothing, the last: {entry.text}"
             few = count < max(BARREN, len(self._boards) - 1)
             few |= _visits(self._barren) < BARREN_VISITS
-            self._check(few or not self._together, now, name, saw)
+            self.check(16, few or not self._together, now, name, saw)
         saw = f"a result counts {entry.new} new sightings; {brought} came"
-        self._check(entry.new == brought, now, name, saw)
+        self.check(16, entry.new == brought, now, name, saw)
         saw = f"a result counts {entry.sightings} sightings; {account.kept} are known"
-        self._check(entry.sightings == account.kept, now, name, saw)
+        self.check(16, entry.sightings == account.kept, now, name, saw)
         saw = f"a result is {entry.outcome.value}; calibration {version} is believed"
-        self._check(entry.good == new, now, name, saw)
+        self.check(16, entry.good == new, now, name, saw)
         saw = f"a result names calibration {entry.version}; {version} is believed"
-        self._check(entry.version == (version if new else 0), now, name, saw)
+        self.check(16, entry.version == (version if new else 0), now, name, saw)
         if stored is None or before is None or brought == 0:
             return
         latest = stored.sightings.take(np.arange(len(stored) - brought, len(stored)))
@@ -278,7 +268,7 @@ class ResultObserver:
         near = min(abs(said - rms) for rms in own)
         words = " or ".join(f"{1e3 * rms:.2f}" for rms in own)
         saw = f"a result says {what} by {1e3 * said:.2f} mrad; by the observer it is {words} mrad"
-        self._check(near <= ERROR_WITHIN + SHARE * max(own), now, name, saw)
+        self.check(16, near <= ERROR_WITHIN + SHARE * max(own), now, name, saw)
 
     def _noted(self, operations: Operations, entry: CalibrationEntry, now: float) -> None:
         """Check that logbook and store have a result."""
@@ -290,7 +280,7 @@ class ResultObserver:
             for record in events
             if abs(record.at - entry.at) < SHOWN_WITHIN
         )
-        self._check(logged, now, name, "a result is not in the logbook")
+        self.check(16, logged, now, name, "a result is not in the logbook")
         # Visits to two targets may be refused at once.
         kept = [
             record
@@ -298,17 +288,17 @@ class ResultObserver:
             if abs(record.finished - entry.at) < SAME and record.begun <= record.finished
             if record.target == entry.target
         ]
-        self._check(bool(kept), now, name, "a result is not in the store")
+        self.check(16, bool(kept), now, name, "a result is not in the store")
         expected = entry.outcome, entry.new, entry.version
         same = any(
             (record.outcome, record.sightings, record.version) == expected for record in kept
         )
-        self._check(same, now, name, f"the store has a result as {kept[0]}")
+        self.check(16, same, now, name, f"the store has a result as {kept[0]}")
         kept_sightings = self._records.sightings((name,))
         count = len(kept_sightings)
         known = self._accounts[name].kept
         saw = f"the store has {count} sightings; the plant knows {known}"
-        self._check(count >= known, now, name, saw)
+        self.check(16, count >= known, now, name, saw)
 
 
 def _visits(results: Sequence[CalibrationEntry]) -> int:

@@ -7,14 +7,13 @@ could know.
 """
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 
 from heliotrope.lcu import states
 from heliotrope.safety import Alarm
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.invariants.beams import NAMED_WITHIN, OFF_WITHIN
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import Judge
 
 #: By reading: names of the alarms any of which names it, the limit, and for how long beyond it, s.
 LIMITS = {
@@ -26,7 +25,7 @@ LIMITS = {
 GONE = 5.0
 
 
-class SensorObserver:
+class SensorObserver(Judge):
     """Observes what sensors gave the plant, and the mirrors that should have left.
 
     Parameters
@@ -36,19 +35,15 @@ class SensorObserver:
     boards
         Boards by name of the cluster.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(self, start: float, boards: Mapping[str, Sequence[Board]]) -> None:
-        self.checks: Counter[int] = Counter()
-        self._start, self._boards = start, boards
+        super().__init__(start)
+        self._boards = boards
         self._value: dict[str, tuple[float, float]] = {}
         self._since: dict[str, float | None] = dict.fromkeys(LIMITS)
         self._alarms: set[str] = set()
-        self._started_at = start
+        self.started_at = start
         self._cut_at = dict.fromkeys(boards, start)
 
     def fed(self, name: str, value: float, now: float) -> None:
@@ -56,11 +51,12 @@ class SensorObserver:
         if math.isfinite(value):
             self._value[name] = value, now
 
-    def alarmed(self, alarm: Alarm) -> None:
+    def on_alarm(self, alarm: Alarm, now: float) -> None:
         """Note an alarm of the plant."""
+        del now
         (self._alarms.add if alarm.active else self._alarms.discard)(alarm.condition)
 
-    def ended(self, now: float) -> None:
+    def on_end(self, now: float) -> None:
         """Note that the plant's program has ended, its alarms too; one that is frozen has them."""
         self._alarms.clear()
         self._rests(now)
@@ -68,7 +64,7 @@ class SensorObserver:
     def _rests(self, now: float) -> None:
         """Begin anew: a plant that starts has given its sensors no time yet."""
         self._since, self._value = dict.fromkeys(LIMITS), {}
-        self._started_at = now
+        self.started_at = now
 
     def look(self, carried: Set[str], now: float, *, runs: bool) -> None:
         """Judge all readings; ``carried``: clusters that the plant reaches."""
@@ -79,7 +75,7 @@ class SensorObserver:
             self._rests(now)
             return
         for name, (alarms, limit, delay) in LIMITS.items():
-            value, at = self._value.get(name, (0.0, self._started_at))
+            value, at = self._value.get(name, (0.0, self.started_at))
             bad = value >= limit or now - at > GONE
             before = self._since[name]
             since = self._since[name] = None if not bad else now if before is None else before
@@ -88,7 +84,7 @@ class SensorObserver:
             passed = now - since - delay
             saw = f"{name} is {value:.3g}, {now - at:.1f} s old, for {passed:.1f} s, and no alarm"
             named = bool(self._alarms.intersection(alarms))
-            self._check(named or passed <= NAMED_WITHIN, now, "plant", f"{saw} names it")
+            self.check(2, named or passed <= NAMED_WITHIN, now, "plant", f"{saw} names it")
             self._off(name, since + delay, now)
 
     def _off(self, reading: str, since: float, now: float) -> None:
@@ -98,9 +94,4 @@ class SensorObserver:
                 on = board.state in (states.TRACKING, states.SEARCHING)
                 saw = f"{states.STATES[board.state]} {passed:.1f} s after {reading} demanded it off"
                 good = not on or passed <= OFF_WITHIN
-                self._check(good, now, board.outfit.name, saw)
-
-    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[2] += 1
-        if not good:
-            raise InvariantError(Violation(2, now - self._start, subject, saw))
+                self.check(2, good, now, board.outfit.name, saw)

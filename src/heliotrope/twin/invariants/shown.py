@@ -7,7 +7,7 @@ with the error that its own covariance gives; each act of a person is an event, 
 names a person who did nothing (11).
 """
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence, Set
 from math import inf, isfinite
 
@@ -21,7 +21,7 @@ from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.views import FieldFrame, HeliostatView
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import RECEIVER
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import Judge
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.visits import across, slope_of
 
@@ -51,7 +51,7 @@ SHARE = 0.25
 NOTED_WITHIN = 1.0
 
 
-class ShownObserver:
+class ShownObserver(Judge):
     """Observes what is shown; see the module.
 
     Parameters
@@ -71,10 +71,6 @@ class ShownObserver:
     dark
         Heliostats about which the plant file is wrong: the places of their beams are unknown.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(
@@ -87,8 +83,8 @@ class ShownObserver:
         persons: Sequence[str],
         dark: Collection[str] = (),
     ) -> None:
-        self.checks: Counter[int] = Counter()
-        self._start, self._plant, self._persons = start, plant, tuple(persons)
+        super().__init__(start)
+        self._plant, self._persons = plant, tuple(persons)
         self._dark = frozenset(dark)
         self._boards = {board.outfit.name: board for board in boards}
         self._homes = {name: cluster for cluster, names in homes.items() for name in names}
@@ -108,11 +104,6 @@ class ShownObserver:
         self._begun = self._judged_at = -inf
         self._frame = 0
         self._turn = 0
-
-    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[11] += 1
-        if not good:
-            raise InvariantError(Violation(11, now - self._start, subject, saw))
 
     # -- persons -----------------------------------------------------------------------------
 
@@ -171,11 +162,11 @@ class ShownObserver:
             self._judged.add(key)
             own = [act for act in self._acts if act[1] == row.who and act[2] in row.text]
             saw = f"an event of {row.who}, who did nothing like it: {row.text}"
-            self._check(bool(own), now, "logbook", saw)
+            self.check(11, bool(own), now, "logbook", saw)
             self._acts.remove(own[0])
         for at, who, word, _ in self._acts:
             saw = f"{who} did {word!r} {now - at:.1f} s ago, and no event says so"
-            self._check(now - at <= NOTED_WITHIN, now, "logbook", saw)
+            self.check(11, now - at <= NOTED_WITHIN, now, "logbook", saw)
 
     def _rows(
         self,
@@ -186,26 +177,26 @@ class ShownObserver:
         now: float,
     ) -> None:
         fresh = frame.number > self._frame
-        self._check(frame.number >= self._frame, now, "frame", "its number falls")
+        self.check(11, frame.number >= self._frame, now, "frame", "its number falls")
         self._frame = frame.number
         made = now if fresh else now - FRAME
         for row, name in enumerate(operations.names):
             age, state = float(frame.age[row]), int(frame.state[row])
             home = operations.plant.field.clusters[int(frame.cluster[row])]
             saw = f"it is shown in {home}; it is in {self._homes[name]}"
-            self._check(home == self._homes[name], now, name, saw)
+            self.check(11, home == self._homes[name], now, name, saw)
             if now - self._changed.get(name, -inf) > FRAME:
                 held = bool(frame.held[row])
                 saw = f"it is shown as {'out of' if held else 'in'} service, and is not"
-                self._check(held == (name in self._out), now, name, saw)
+                self.check(11, held == (name in self._out), now, name, saw)
             if state == STALE:
                 saw = f"it is shown as stale, {age:.1f} s old"
                 calm = name in quiet and now - self._begun > OLD
-                self._check(not calm, now, name, saw)
+                self.check(11, not calm, now, name, saw)
                 continue
             reported = self._plant.reports(name, made - age - TRANSIT - FRAME)
             saw = f"it is shown as {states.STATES[state]}; it has not reported that"
-            self._check(state in reported, now, name, saw)
+            self.check(11, state in reported, now, name, saw)
             if name in quiet:  # on a bad bus answers are lost, one after the other
                 self._counted(name, frame.counts[row], made - age, now)
             place = operations.viewer.aim_names[int(frame.on[row])]
@@ -217,7 +208,7 @@ class ShownObserver:
         low, high = self._span(name, at)
         shown = ", ".join(str(int(count)) for count in counts)
         saw = f"its counts are shown as {shown}; they were {low} to {high}"
-        self._check(bool(((counts >= low) & (counts <= high)).all()), now, name, saw)
+        self.check(11, bool(((counts >= low) & (counts <= high)).all()), now, name, saw)
 
     def _span(self, name: str, at: float) -> tuple[FloatArray, FloatArray]:
         """Return the least and the greatest step counts, (2,) each, that a row of a time shows.
@@ -244,13 +235,13 @@ class ShownObserver:
             return
         works = state in (states.TRACKING, states.SEARCHING)
         saw = f"{states.STATES[state]}, and its beam is shown on {place or 'nothing'}"
-        self._check(works == (place != NOWHERE), now, name, saw)
+        self.check(11, works == (place != NOWHERE), now, name, saw)
         known = place in self._middles and name not in self._dark
         if state == states.TRACKING and known and self._came(name, now):
             x, y, z = (float(coordinate) for coordinate in self._middles[place])
             miss = self._boards[name].miss(sun, (x, y, z), believed=True)
             saw += f", {miss:.1f} m from its middle"
-            self._check(miss <= NEAR, now, name, saw)
+            self.check(11, miss <= NEAR, now, name, saw)
 
     def _came(self, name: str, now: float) -> bool:
         """Whether a mirror follows its aim by now, or has had the time of the longest way.
@@ -275,11 +266,11 @@ class ShownObserver:
             at = float(frame.calibrated_at[row])
             saw = f"it is shown with{'' if isfinite(at) else 'out'} a calibration"
             if record is None:
-                self._check(not isfinite(at), now, name, saw)
+                self.check(11, not isfinite(at), now, name, saw)
                 continue
             if now - (record.at - self._zero(operations)) < FRAME + 1.0 or now - self._begun < 15.0:
                 continue
-            self._check(at == record.at, now, name, saw)
+            self.check(11, at == record.at, now, name, saw)
             state, since = self._states[name]
             # What its error is depends on the pose: it stands near that of its work.
             works = state in (states.IDLE, states.TRACKING) and now - since > SETTLED
@@ -289,7 +280,7 @@ class ShownObserver:
             said = float(frame.error[row])
             saw = f"its predicted error is shown as {1e3 * said:.3f} mrad; it is {1e3 * own:.3f}"
             good = not isfinite(own) or abs(said - own) <= SHARE * own
-            self._check(good, now, name, saw)
+            self.check(11, good, now, name, saw)
 
     def _zero(self, operations: Operations) -> float:
         clock = operations.plant.clock
@@ -300,20 +291,20 @@ class ShownObserver:
         total = sum(head.states.values())
         count = len(self._boards)
         saw = f"{total} of {count} heliostats are counted in a state, {head.heliostats} in all"
-        self._check(total == count == head.heliostats, now, "summary", saw)
+        self.check(11, total == count == head.heliostats, now, "summary", saw)
         holder = self._plant.holder(now)
         saw = f"{head.holder or 'nobody'} is shown with the command authority; {holder} has it"
-        self._check(holder is None or head.holder == holder, now, "summary", saw)
+        self.check(11, holder is None or head.holder == holder, now, "summary", saw)
         rows = operations.logbook.alarms()
         still = sum(row.active or not row.acknowledged_by for row in rows)
         saw = f"{head.alarms} alarms are counted, {still} shown"
-        self._check(head.alarms == still, now, "summary", saw)
+        self.check(11, head.alarms == still, now, "summary", saw)
         for row in operations.logbook.cluster_rows(operations.plant):
             members = [name for name, home in self._homes.items() if home == row.name]
             saw = f"{row.heliostats} heliostats are shown, {len(members)} are there"
-            self._check(row.heliostats == len(members), now, row.name, saw)
+            self.check(11, row.heliostats == len(members), now, row.name, saw)
             good = not isfinite(row.answered) or 0.0 <= row.answered <= 1.0
-            self._check(good, now, row.name, f"it is shown to have answered {row.answered:.2f}")
+            self.check(11, good, now, row.name, f"it is shown to have answered {row.answered:.2f}")
 
     def _detail(
         self, operations: Operations, view: HeliostatView, quiet: Set[str], now: float
@@ -321,12 +312,14 @@ class ShownObserver:
         name, board = view.name, self._boards[view.name]
         where = board.outfit.mechanism.position
         off = float(np.linalg.norm(view.position - np.asarray(where).reshape(-1)[:3]))
-        self._check(off < 1.0, now, name, f"it is shown {off:.1f} m from where it is")
+        self.check(11, off < 1.0, now, name, f"it is shown {off:.1f} m from where it is")
         if view.live:
             reported = {
                 states.STATES[state] for state in self._plant.reports(name, now - view.age - 3.3)
             }
-            self._check(view.state in reported, now, name, f"it is shown as {view.state} in detail")
+            self.check(
+                11, view.state in reported, now, name, f"it is shown as {view.state} in detail"
+            )
             for drive, axis in zip(view.drives, (0, 1), strict=True):
                 if name in quiet:
                     self._drive(name, drive.count, axis, now - view.age, now)
@@ -334,18 +327,18 @@ class ShownObserver:
             for key, value in view.calibration.parameters.items():
                 shown = view.parameters.get(key)
                 saw = f"its parameter {key} is shown as {shown}; it is {value}"
-                self._check(shown is not None and shown.value == value, now, name, saw)
+                self.check(11, shown is not None and shown.value == value, now, name, saw)
         saw = f"why it is out of service is shown as {view.hold!r}"
-        self._check(bool(view.hold) == (name in self._out), now, name, saw)
+        self.check(11, bool(view.hold) == (name in self._out), now, name, saw)
         if view.planned is not None:
             at = view.planned.at - self._zero(operations)
             saw = f"its next visit is shown as planned {now - at:.0f} s ago"
-            self._check(at >= now - 1800.0 and view.planned.heliostat == name, now, name, saw)
+            self.check(11, at >= now - 1800.0 and view.planned.heliostat == name, now, name, saw)
 
     def _drive(self, name: str, count: int, axis: int, at: float, now: float) -> None:
         low, high = self._span(name, at)
         saw = f"drive {axis} is shown at {count}; it was {low[axis]:.0f} to {high[axis]:.0f}"
-        self._check(bool(low[axis] <= count <= high[axis]), now, name, saw)
+        self.check(11, bool(low[axis] <= count <= high[axis]), now, name, saw)
 
 
 def _expected(operations: Operations, name: str, present: FloatArray, sun: FloatArray) -> float:

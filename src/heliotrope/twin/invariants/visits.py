@@ -5,7 +5,6 @@ its aim within the calibration's own covariance (12), and a sighting, which must
 own beam (16).
 """
 
-from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
@@ -20,7 +19,7 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import RECEIVER
 from heliotrope.twin.invariants.beams import ASTRAY
-from heliotrope.twin.invariants.invariants import InvariantError, Violation
+from heliotrope.twin.invariants.invariants import Judge
 
 #: A sighting this far from the beam's true place is not of that beam, m: the noise of centroids,
 #: play of the gears and counts that are interpolated stay below it.
@@ -34,7 +33,7 @@ DEVIATIONS, FLOOR = 3.0, 1e-4
 SAME_TIME = 1.0
 
 
-class VisitObserver:
+class VisitObserver(Judge):
     """Observes calibrations and sightings.
 
     Parameters
@@ -54,10 +53,6 @@ class VisitObserver:
         Heliostats that are wrong by far more than the priors allow: a covariance that stands on
         these is not judged.
 
-    Attributes
-    ----------
-    checks
-        Number of checks of each invariant.
     """
 
     def __init__(
@@ -70,21 +65,17 @@ class VisitObserver:
         followed: bool,
         dark: Collection[str] = (),
     ) -> None:
-        self.checks: Counter[int] = Counter()
-        self._start, self._away, self._followed = start, away, followed
+        super().__init__(start)
+        self._away, self._followed = away, followed
         self._dark = frozenset(dark)
         self._boards, self._targets = {b.outfit.name: b for b in boards}, tuple(targets)
         self._judged: set[tuple[str, int, float]] = set()
         self._kept: dict[str, int] = {}
         self._slipped: set[str] = set()  # sightings from before tell nothing of now
 
-    def _check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
-        self.checks[number] += 1
-        if not good:
-            raise InvariantError(Violation(number, now - self._start, subject, saw))
-
-    def ended(self) -> None:
+    def on_end(self, now: float) -> None:
         """Note that the plant's program has ended; the next one knows what the store has kept."""
+        del now
         self._kept.clear()
 
     def look(self, plant: PlantController | None, sun: FloatArray, now: float) -> None:
@@ -142,17 +133,17 @@ class VisitObserver:
             off = sideways @ ray
             deviations = float(np.sqrt(off @ np.linalg.solve(spread, off)))
             saw = f"by the calibration that the plant believes its beam is {miss:.1f} m astray"
-            self._check(12, miss <= ASTRAY, now, name, saw)
+            self.check(12, miss <= ASTRAY, now, name, saw)
             if self._followed and name not in self._dark:
                 saw = f"its calibration misses by {deviations:.1f} of its own standard deviations"
-                self._check(12, deviations <= DEVIATIONS, now, name, saw)
+                self.check(12, deviations <= DEVIATIONS, now, name, saw)
 
     def _dated(self, name: str, sightings: Sightings, now: float) -> None:
         """Check that sightings have the times of photographs, from which their suns follow."""
         for at in sightings.time:
             away = self._away(float(at))
             saw = f"a sighting that the plant keeps is dated {away:.1f} s from any photograph"
-            self._check(16, away <= SAME_TIME, now, name, saw)
+            self.check(16, away <= SAME_TIME, now, name, saw)
 
     def _own(self, board: Board, sightings: Sightings, now: float) -> None:
         """Check that sightings show the beam of the mirror itself."""
@@ -161,7 +152,7 @@ class VisitObserver:
         for vertex, ray, point in zip(pose.vertex, rays, sightings.destination, strict=True):
             miss = _passes(vertex, ray, point)
             saw = f"a sighting that the plant keeps is {miss:.1f} m from its true beam"
-            self._check(16, miss <= FOREIGN, now, board.outfit.name, saw)
+            self.check(16, miss <= FOREIGN, now, board.outfit.name, saw)
 
 
 def across(direction: FloatArray) -> FloatArray:

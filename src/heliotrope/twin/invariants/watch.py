@@ -1,12 +1,12 @@
 """The observers of automatic control of a run, and the reports of persons that they need."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from heliotrope.plant.operations import Operations
 from heliotrope.plant.orders.authority import Person
 from heliotrope.twin.invariants.day import DayObserver
+from heliotrope.twin.invariants.invariants import Judge
 from heliotrope.twin.invariants.progress import ProgressObserver
 from heliotrope.twin.invariants.results import ResultObserver
 from heliotrope.twin.invariants.shown import ShownObserver
@@ -24,10 +24,9 @@ class Watch:
     shown: ShownObserver
 
     @property
-    def checks(self) -> Counter[int]:
-        """Number of checks of each invariant, of all of them."""
-        some = (self.visits, self.day, self.results, self.progress, self.shown)
-        return sum((observer.checks for observer in some), Counter())
+    def each(self) -> tuple[Judge, ...]:
+        """All observers, in the order in which their hooks are called."""
+        return self.visits, self.day, self.results, self.progress, self.shown
 
     # -- reports of persons -------------------------------------------------------------------
 
@@ -64,17 +63,12 @@ class Watch:
 
     def took(self, operations: Operations, now: float) -> None:
         """Note that a person has taken the command authority."""
-        self.day.on_duty(now)
+        self.day.took(now)
         self.progress.took(operations, now)
 
     def switched(self, *, on: bool) -> None:
         """Note that a person switches calibration on or off."""
         self.progress.switched(on=on)
-
-    def ended(self) -> None:
-        """Note that the plant's program has ended."""
-        self.visits.ended()
-        self.progress.ended()
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
         """Note that heliostats go out of service, or come back."""

@@ -18,8 +18,6 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Act
 from heliotrope.twin.boards.outfit import RECEIVER, STANDBY
 from heliotrope.twin.invariants.alarms import CALLED
-from heliotrope.twin.invariants.beams import BeamObserver
-from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.watch import Watch
 from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
 from heliotrope.twin.world.work import Work
@@ -44,8 +42,8 @@ class Acts:
         Automatic control.
     operator
         Its persons' means: clears what latches, raises emergencies.
-    observer, beams, watch
-        Told of each act.
+    watch
+        Observers of automatic control, which hear of each act.
     truth
         True imperfections of each heliostat, rad, by name and parameter.
     clock
@@ -65,17 +63,15 @@ class Acts:
         self,
         work: Work,
         operator: Operator,
-        observer: PlantObserver,
-        beams: BeamObserver,
         watch: Watch,
         truth: Mapping[str, Mapping[str, float]],
         clock: Clock,
         seed: int,
     ) -> None:
         self._work, self._operator = work, operator
-        self._observer, self._beams, self._watch = observer, beams, watch
+        panel, self._watch = operator.panel, watch
+        self._observer, self._beams, self._persons = panel.plant, panel.beams, panel.persons
         self.names, self._truth, self._clock = tuple(truth), truth, clock
-        self._persons = operator.persons
         self.chance = random.Random(f"shift {seed}")
         self._others = random.Random(f"locks {seed}")
         self._withheld: set[str] = set()  # what a person keeps from automatic control
@@ -166,7 +162,7 @@ class Acts:
             while self.now() < until and self.present() is operations:
                 operations.plant.authority.keep(person, token)
                 self._observer.kept(self.now())
-                self._watch.day.on_duty(self.now())
+                self._watch.day.took(self.now())
                 if self.chance.random() < 0.2:
                     commands(operations, person, token)
                 await asyncio.sleep(1.0)
@@ -276,13 +272,8 @@ class Acts:
 
     def accepted(self, person: Person, token: int, ticket: Ticket, what: str) -> None:
         """Report a command that the plant has accepted."""
-        some = ticket.heliostats
-        self.acted(f"{what} {some[0]}", person)
-        self._observer.accepted(person, token, ticket, what, self.now())
-        if what not in ("ROUGH", "PARAMETERS"):
-            self._beams.resumed(some, what, self.now())
-        if self._operator.tickets is not None:
-            self._operator.tickets.accepted(ticket, self.now())
+        self.acted(f"{what} {ticket.heliostats[0]}", person)
+        self._operator.accepted(person, token, ticket, what)
 
     # -- what anybody may do -----------------------------------------------------------------
 
@@ -291,12 +282,9 @@ class Acts:
         name = self.chance.choice(self.names)
         self._watch.taken((name,))
         what = self.chance.choice(["DEFOCUS", "STOW"])
-        self._beams.taken((name,))
         ticket = (operations.defocus if what == "DEFOCUS" else operations.stow)(VIEWER, (name,))
         self.acted(f"{what} {name}", VIEWER)
-        self._observer.obeyed(VIEWER.name, what, self.now(), ticket.identity)
-        if self._operator.tickets is not None:
-            self._operator.tickets.accepted(ticket, self.now())
+        self._operator.took_off(ticket, what)
         self._withheld.add(name)
 
     async def holds(self, operations: Operations, person: Person = ENGINEER) -> None:

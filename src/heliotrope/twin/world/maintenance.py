@@ -21,8 +21,7 @@ from heliotrope.store.backup import OWNER
 from heliotrope.store.records import Kind
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import MACHINE
-from heliotrope.twin.invariants.beams import BeamObserver
-from heliotrope.twin.invariants.plant_observer import MOMENT, PlantObserver
+from heliotrope.twin.invariants.plant_observer import MOMENT
 from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER, Operator
 
 #: Share of the locks that are put on a mirror which somebody has locked already.
@@ -42,8 +41,6 @@ class Maintenance:
     ----------
     operator
         The persons who command; one of them writes and declares counts.
-    observer, beams
-        Told of what the plant accepts.
     boards
         All heliostats.
     clock
@@ -60,18 +57,16 @@ class Maintenance:
     def __init__(
         self,
         operator: Operator,
-        observer: PlantObserver,
-        beams: BeamObserver,
         boards: Sequence[Board],
         clock: Clock,
         seed: int,
     ) -> None:
         self.service: Service | None = None
-        self._operator, self._observer, self._beams = operator, observer, beams
+        self._operator, panel = operator, operator.panel
+        self._observer, self._beams, self._persons = panel.plant, panel.beams, panel.persons
         self._boards, self._clock = tuple(boards), clock
         self._names = tuple(board.outfit.name for board in boards)
         self._chance = random.Random(f"maintenance {seed}")
-        self._persons = operator.persons
         self._put_at, self._written = -math.inf, ""
 
     def acts(self, plant: PlantController) -> None:

@@ -28,12 +28,8 @@ from heliotrope.plant.orders.parameters import TAKES_POSE
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import FLUX_READING, Act, alarms
 from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY, Outfit
-from heliotrope.twin.invariants.alarms import AlarmObserver
-from heliotrope.twin.invariants.beams import BeamObserver
-from heliotrope.twin.invariants.persons import PersonsObserver
-from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
-from heliotrope.twin.invariants.quiet import QuietObserver
-from heliotrope.twin.invariants.tickets import TicketObserver
+from heliotrope.twin.invariants.panel import Panel
+from heliotrope.twin.invariants.plant_observer import VOID_WITHIN
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.worlds import Habits, narrow_limits
 
@@ -81,8 +77,8 @@ class Operator:
         True time.
     seed, habits
         Seed of their actions, and how often they take each.
-    observer, beams, persons
-        Told of each accepted command, and of what persons order and withdraw.
+    panel
+        Observers of the plant, which hear of each accepted command and of what persons order.
     fits
         The heliostats.
     pods
@@ -106,13 +102,11 @@ class Operator:
         Number of actions of each kind.
     refusal
         Why the plant refused last.
-    quiet, tickets, alarms
-        Observers of reasons, tickets and alarms; None: these are not judged. Set by the owner.
     maintenance
         The persons who work at the mirrors; None: there are none. Set by the owner.
     points
         Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
-    persons
+    panel
         As given.
     """
 
@@ -121,9 +115,7 @@ class Operator:
         clock: Clock,
         seed: int,
         habits: Habits,
-        observer: PlantObserver,
-        beams: BeamObserver,
-        persons: PersonsObserver,
+        panel: Panel,
         fits: Sequence[Outfit],
         pods: Sequence[Pod],
         keep_out: tuple[float, float, float],
@@ -134,13 +126,10 @@ class Operator:
         self.commands = True
         self.counts: Counter[str] = Counter()
         self.refusal = ""
-        self.quiet: QuietObserver | None = None
-        self.tickets: TicketObserver | None = None
-        self.alarms: AlarmObserver | None = None
         self.maintenance: Maintenance | None = None
         self.points: dict[tuple[str, str], Point] = {}
-        self._clock, self._observer, self._flux = clock, observer, flux
-        self._beams, self.persons, self._habits = beams, persons, habits
+        self._clock, self._flux, self._habits = clock, flux, habits
+        self.panel, self._observer, self._persons = panel, panel.plant, panel.persons
         self._chance = random.Random(f"operator {seed}")
         self._others = random.Random(f"others {seed}")
         self._fits, self._names = {fit.name: fit for fit in fits}, sorted(fit.name for fit in fits)
@@ -281,18 +270,18 @@ class Operator:
         self.counts["refused"] += 1
         self.refusal = str(error)
         now = self._clock.monotonic()
-        self._observer.refused(who, token, what, self.refusal, now)
-        if self.quiet is not None and len(heliostats) == 1:
-            self.quiet.refused(heliostats[0], self.refusal, now)
+        for each in self.panel.each:
+            each.on_refused(who, token, (what, heliostats), self.refusal, now)
 
     def _accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> Ticket:
         self.counts["accepted"] += 1
-        now = self._clock.monotonic()
-        self._observer.accepted(who, token, ticket, what, now)
-        self._beams.resumed(ticket.heliostats, what, now)
-        if self.tickets is not None:
-            self.tickets.accepted(ticket, now)
+        self.accepted(who, token, ticket, what)
         return ticket
+
+    def accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> None:
+        """Report a command that the plant has accepted."""
+        for each in self.panel.each:
+            each.on_accepted(who, token, ticket, what, self._clock.monotonic())
 
     def _into_keep_out(self, plant: PlantController) -> None:
         """Ask for a motion that leads a beam through the keep-out volume; it must be refused."""
@@ -454,12 +443,8 @@ class Operator:
     def raised(self, who: Person, act: Act) -> None:
         """Note an emergency that a person has raised."""
         self.counts["emergencies"] += 1
-        self._beams.taken(self._names)  # after it none is automatic control's
-        now = self._clock.monotonic()
-        self._observer.obeyed(who.name, act.name, now)
-        self.persons.ordered(who.name, act, now)
-        if self.alarms is not None:
-            self.alarms.called()
+        for each in self.panel.each:
+            each.on_call(who.name, act, self._clock.monotonic())
 
     def _one_safe(self, plant: PlantController) -> None:
         what = self._chance.choice(["DEFOCUS", "STOW"])
@@ -468,8 +453,13 @@ class Operator:
     def safe(self, plant: PlantController, what: str, name: str) -> Ticket:
         """Defocus or stow one heliostat, which anybody may do."""
         ticket = (plant.defocus if what == "DEFOCUS" else plant.stow)(VIEWER.name, (name,))
-        self._observer.obeyed(VIEWER.name, what, self._clock.monotonic(), ticket.identity)
+        self.took_off(ticket, what)
         return ticket
+
+    def took_off(self, ticket: Ticket, what: str) -> None:
+        """Report DEFOCUS or STOW by the viewer."""
+        for each in self.panel.each:
+            each.on_safe(VIEWER, ticket, what, self._clock.monotonic())
 
     def clear(self, plant: PlantController) -> set[str]:
         """Withdraw one emergency order, acknowledge all that waits for it; return what was taken.
@@ -478,8 +468,8 @@ class Operator:
         """
         if self.maintenance is not None:
             self.maintenance.confirms(plant)
-        if self.persons.orders:
-            self.withdraws(plant, next(iter(self.persons.orders)))
+        if self._persons.orders:
+            self.withdraws(plant, next(iter(self._persons.orders)))
         return self._acknowledge(plant)
 
     def withdraws(self, plant: PlantController, owner: str) -> None:
@@ -489,9 +479,9 @@ class Operator:
         try:
             plant.withdraw_emergency(who, owner)
         except RefusedError as error:
-            self.persons.withdrawal_refused(owner, str(error), now)
+            self._persons.withdrawal_refused(owner, str(error), now)
         self._observer.obeyed(who.name, "WITHDRAW", now)
-        self.persons.withdrew(owner)
+        self._persons.withdrew(owner)
 
     def _acknowledge(self, plant: PlantController) -> set[str]:
         """Acknowledge every latched condition; return those for which the plant takes it.
@@ -540,7 +530,7 @@ class Operator:
         whom = (self._chance.choice(pod.boards).outfit.name,)
         what = self._chance.choice(["TRACK", "APPROACH", "REFOCUS", "IDLE"])
         command = Command(f"rogue-{self._number}", what, (), whom, token, 5.0)
-        ear = PlantEar(pod, self._observer, self._beams)
+        ear = PlantEar(pod, self.panel)
         pod.observer.ordered(ear.order(command, now, known=False))
         with contextlib.suppress(LinkClosedError):
             await tap.inner.send(encode(command), expires=now + 5.0)

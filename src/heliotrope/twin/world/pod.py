@@ -33,15 +33,12 @@ from heliotrope.sun import Site
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime
-from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.answers import AnswerObserver
-from heliotrope.twin.invariants.beams import BeamObserver
-from heliotrope.twin.invariants.invariants import Observer
+from heliotrope.twin.invariants.invariants import Judge, Observer
 from heliotrope.twin.invariants.ledger import PlantCommand
 from heliotrope.twin.invariants.lines import LineObserver
-from heliotrope.twin.invariants.persons import PersonsObserver
+from heliotrope.twin.invariants.panel import Panel
 from heliotrope.twin.invariants.plant_observer import PlantObserver
-from heliotrope.twin.invariants.quiet import QuietObserver
 from heliotrope.twin.world.intruder import Intruder
 from heliotrope.twin.world.worlds import PodErrors
 
@@ -207,10 +204,10 @@ class Pod:
             self.lines.look(now, clear=both and not hindered, connected=whole)
 
     @property
-    def checks(self) -> Counter[int]:
-        """Number of checks of each invariant, of the cluster and of its line."""
-        own = self.observer.checks + self.answers.checks
-        return own + (Counter() if self.lines is None else self.lines.checks)
+    def judges(self) -> tuple[Judge, ...]:
+        """The observers of the cluster and of its line."""
+        both = self.observer, self.answers
+        return both if self.lines is None else (*both, self.lines)
 
     def carried(self, now: float) -> bool:
         """Whether an order given now must be carried out."""
@@ -269,31 +266,19 @@ class _ClusterEar:
 
 
 class PlantEar:
-    """Listens at the plant's end of one line, reports to both observers, and can freeze the plant.
+    """Listens at the plant's end of one line, reports to the observers, and can freeze the plant.
 
     Parameters
     ----------
     pod
         Cluster of the line.
-    plant
-        Observer of the plant.
-    beams
-        Observer of the beams.
-    quiet, alarms, persons
-        Observers of what is done, of alarms, and of locks; None: it is not judged.
+    panel
+        Observers of the plant.
     """
 
-    def __init__(
-        self,
-        pod: Pod,
-        plant: PlantObserver,
-        beams: BeamObserver,
-        quiet: QuietObserver | None = None,
-        alarms: AlarmObserver | None = None,
-        persons: PersonsObserver | None = None,
-    ) -> None:
-        self._pod, self._plant, self._beams, self._quiet = pod, plant, beams, quiet
-        self._alarms, self._persons = alarms, persons
+    def __init__(self, pod: Pod, panel: Panel) -> None:
+        self._pod, self._plant = pod, panel.plant
+        self._panel, self._judges = panel.each, (*pod.judges, *panel.each)
         self._addresses = pod.addresses
         self._names: tuple[str, ...] = ()
         self._goes = asyncio.Event()
@@ -326,50 +311,40 @@ class PlantEar:
         """Note a message that has left for the cluster."""
         message, observer = decode(data), self._pod.observer
         if isinstance(message, Lease):
-            observer.leased(now)
-            if self._pod.lines is not None:
-                self._pod.lines.leased(now)
-            if self._quiet is not None:
-                self._quiet.leased(message.token, now)
+            for each in self._judges:
+                each.on_lease(message.token, now)
         elif isinstance(message, Emergency):
             whom = message.heliostats or tuple(self._addresses)
             addressed = tuple(name for name in whom if name not in self._pod.file)
             carried = self._pod.carried(now)
             if addressed:
                 observer.emergency(message.name, now, carried=carried, heliostats=addressed)
-            self._beams.ordered_off(whom, now)
-            if self._quiet is not None:
-                self._quiet.ordered_off(message.name, whom, now)
+            for each in self._panel:
+                each.on_emergency(message.name, whom, now)
         elif isinstance(message, Acknowledge) and message.condition == "clock_jump":
             observer.time_acknowledged()
         elif isinstance(message, Command | Parameters):
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
-            self._writes(message, now)
+            what, whom = self._asked(message)
+            for name in whom if what in ("PARAMETERS", "ZERO") else ():
+                for each in self._panel:
+                    each.on_write(name, what, now)
             if isinstance(message, Parameters) and (stow := message.items().get("stow")):
                 azimuth, elevation = struct.unpack(CODES_OF["stow"], stow)
                 observer.given_stow(message.heliostat, (azimuth, elevation))
             if isinstance(message, Command):
-                whom = message.heliostats or tuple(self._addresses)
-                self._beams.sent(message, whom, now)
-                if self._quiet is not None:
-                    self._quiet.sent(message, whom, now)
+                for each in self._panel:
+                    each.on_command(message, whom, now)
 
-    def _writes(self, message: Command | Parameters, now: float) -> None:
-        """Judge what is written to heliostats."""
-        if self._persons is None:
-            return
-        if isinstance(message, Parameters):
-            self._persons.written(message.heliostat, "PARAMETERS", now)
-        elif message.name == "ZERO":
-            for name in message.heliostats or tuple(self._addresses):
-                self._persons.written(name, message.name, now)
+    def _asked(self, message: Command | Parameters) -> tuple[str, tuple[str, ...]]:
+        """Return what is ordered, and of which heliostats."""
+        if isinstance(message, Command):
+            return message.name, message.heliostats or tuple(self._addresses)
+        return "PARAMETERS", (message.heliostat,)
 
     def order(self, message: Command | Parameters, now: float, *, known: bool) -> PlantCommand:
         """Return an order for the ledger; ``known``: its token was once issued."""
-        if isinstance(message, Command):
-            name, whom = message.name, message.heliostats or tuple(self._addresses)
-        else:
-            name, whom = "PARAMETERS", (message.heliostat,)
+        name, whom = self._asked(message)
         until = self._plant.until(message.token, now + message.lifetime + UNDER_WAY)
         addresses = frozenset(self._addresses[heliostat] for heliostat in whom)
         return PlantCommand(message.identity, name, addresses, now, until, known, message.token)
@@ -377,21 +352,18 @@ class PlantEar:
     def received(self, data: bytes, now: float) -> None:
         """Judge a message to the plant."""
         message: Message = decode(data)
-        observer, counts = self._pod.observer, self._pod.counts
+        counts = self._pod.counts
         if isinstance(message, ClusterStatus):
             counts["status"] += 1
-            if self._alarms is not None:
-                self._alarms.heard(self._pod.name, now)
+            for each in self._panel:
+                each.on_heard(self._pod.name, now)
             self._names = message.names or self._names
             if len(self._names) == len(message.nodes()):
-                observer.status(message, self._names, now)
-                self._beams.reported(message, self._names, now)
-                self._pod.answers.status(message, self._names, now)
+                for each in self._judges:
+                    each.on_status(message, self._names, now)
         elif isinstance(message, Progress):
             counts[f"progress {message.stage.value}"] += 1
-            observer.progress(message, now)
-            self._beams.progress(message)
-            if self._quiet is not None:
-                self._quiet.progress(message)
+            for each in self._judges:
+                each.on_progress(message, now)
         elif isinstance(message, Alarm):
             counts["alarms"] += 1

@@ -11,7 +11,7 @@ import contextlib
 import random
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,11 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.common_settings import CommonSettings
+from heliotrope.links.link import Link
 from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted, packed
 from heliotrope.mechanism.tracking import track
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.emergency import EmergencyRecord
 from heliotrope.plant.field.assigned import Assigned
 from heliotrope.plant.field.witnesses import SENSOR_ERROR
@@ -48,6 +49,7 @@ from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
+from heliotrope.twin.invariants.panel import Panel
 from heliotrope.twin.invariants.persons import PersonsObserver
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.invariants.progress import ProgressObserver
@@ -329,7 +331,8 @@ class Simulation:
             self._assigned, self._emergency = self._store.points, self._store.keeper
         self._assigned.keep({"STANDBY": {outfit.name: STANDBY for outfit in fits}})
         self.disk = RecordsDisk()
-        self._employ(fits, scene)
+        self._outfits = fits
+        self._employ()
         self.plant: PlantController | None = None
         self._program: list[asyncio.Task[None]] = []
 
@@ -354,47 +357,38 @@ class Simulation:
                 pod.answers.quiet = self.quiet.calm
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
 
-    def _employ(self, fits: Sequence[Outfit], scene: Scene) -> None:
+    def _employ(self) -> None:
         """Let persons, automatic control and the tour work at the plant, before its observer."""
         plan = self.plan
         observers = [pod.observer for pod in self.pods]
         self.observer = PlantObserver(
             self.begin, self.disk, SETTINGS, observers, automatic=works(plan.worlds)
         )
-        self.operator = self._new_operator(fits, scene.keep_outs[0][0])
-        self.operator.quiet, self.operator.tickets = self.quiet, self.tickets
-        self.operator.alarms = self.alarms
+        others = (self.readings, self.alarms, self.tickets)
+        panel = Panel(
+            self.observer,
+            self.beams,
+            self.persons,
+            others if self.quiet is None else (*others, self.quiet),
+        )
+        self.operator = self._people(
+            plan.seed, Habits.of(plan.worlds, plan.seed), panel, not self._measured
+        )
         self._maintenance: Maintenance | None = None
         if self._store is not None:
             self._maintenance = self.operator.maintenance = Maintenance(
-                self.operator, self.observer, self.beams, self.boards, self._clock, plan.seed
+                self.operator, self.boards, self._clock, plan.seed
             )
         self._work = self._new_work() if works(plan.worlds) else None
         self._tour: Tour | None = None
         if TOUR in plan.worlds:
-            self._tour = Tour(
-                self.operator, self.observer, self.boards, self._clock, self.sun, plan.seed
-            )
-        self._second = self._second_plant(fits) if "twice" in plan.worlds else None
+            self._tour = Tour(self.operator, self.boards, self._clock, self.sun, plan.seed)
+        self._second = self._second_plant() if "twice" in plan.worlds else None
+        self._judges = panel.each
+        if self._work is not None:
+            self._judges += self._work.watch.each
         for pod in self.pods:
             pod.plant = self.observer
-
-    def _new_operator(
-        self, fits: Sequence[Outfit], keep_out: tuple[float, float, float]
-    ) -> Operator:
-        """Return the persons who command."""
-        return Operator(
-            self._clock,
-            self.plan.seed,
-            Habits.of(self.plan.worlds, self.plan.seed),
-            self.observer,
-            self.beams,
-            self.persons,
-            fits,
-            self.pods,
-            keep_out,
-            None if self._measured else self._flux,
-        )
 
     def _quiet_observer(self) -> QuietObserver | None:
         """Return the observer of work; None: what is wrong from the start hinders it."""
@@ -424,7 +418,7 @@ class Simulation:
         work = Work(plan.seed, sight, self._exits, kind)
         watch = self._new_watch(work, together=together)
         truth = {name: board.outfit.causes for name, board in boards.items()}
-        acts = Acts(work, self.operator, self.observer, self.beams, watch, truth, clock, plan.seed)
+        acts = Acts(work, self.operator, watch, truth, clock, plan.seed)
         if DAYS in plan.worlds:
             crew = Crew(acts, self.boards, plan.seconds, rough=self._coarse, planned=plan.acts)
             return Working(work, crew, watch)
@@ -507,11 +501,9 @@ class Simulation:
 
     @property
     def checks(self) -> Counter[int]:
-        """Number of checks of each invariant by the observers of work, alarms and tickets."""
-        counts = self.alarms.checks + self.tickets.checks + self.persons.checks
-        if self._work is not None:
-            counts += self._work.watch.checks
-        return counts if self.quiet is None else counts + self.quiet.checks
+        """Number of checks of each invariant."""
+        judges = (*self._judges, *(judge for pod in self.pods for judge in pod.judges))
+        return sum((judge.checks for judge in judges), Counter())
 
     # -- the plant -------------------------------------------------------------------------
 
@@ -521,34 +513,20 @@ class Simulation:
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
             link = pod.line.end(0, pod.name, self._clock, seed=seed)
-            pod.ear = PlantEar(
-                pod, self.observer, self.beams, self.quiet, self.alarms, self.persons
-            )
+            pod.ear = PlantEar(pod, self.operator.panel)
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
         if self._work is not None:
             self._wanted = wanted_of(self._fits)  # the store knows better; see `Work.begins`
-            noted = self.alarms.alarmed
+            noted = self.alarms.on_alarm
             self._work.control.opens(lambda alarm: noted(alarm, self._clock.monotonic()))
         if self._store is not None:
             self._read_plant_file()
         context = context_of(_PLANT)
-        plant = self.plant = PlantController(
-            self._design,
-            links,
-            self._clock,
-            audit,
-            clusters=self._homes,
-            settings=self._settings(),
-            wanted=self._wanted,
-            assigned=self._assigned,
-            table=TABLE,
-            entropy=self._chance.randbytes,
-            on_alarm=self._alarmed,
-            disk=self.disk.queue(self._clock, context) if "disk" in self.plan.worlds else None,
-            record=self._emergency,
-        )
+        slow = self.disk.queue(self._clock, context) if "disk" in self.plan.worlds else None
+        stores = Stores(audit, self._wanted, self._assigned, self._emergency, slow)
+        plant = self.plant = self._begins(links, stores, self._chance.randbytes, self._settings())
         self.operator.begins(plant)
         self.instruments.plant = plant
         parts = [*(link.run() for link in links.values()), plant.run()]
@@ -559,6 +537,38 @@ class Simulation:
         if self._work is not None:
             parts.append(self._work.control.begins(plant).run())
         self._program = [group.create_task(part, context=context) for part in parts]
+
+    def _begins(
+        self,
+        links: Mapping[str, Link],
+        stores: Stores,
+        entropy: Callable[[int], bytes],
+        settings: PlantSettings = SETTINGS,
+    ) -> PlantController:
+        """Return a new program of the plant."""
+        return PlantController(
+            self._design,
+            links,
+            self._clock,
+            stores,
+            settings=settings,
+            table=TABLE,
+            entropy=entropy,
+            on_alarm=self._alarmed,
+        )
+
+    def _people(self, seed: int, habits: Habits, panel: Panel, feeds: bool) -> Operator:
+        """Return the persons who command a plant."""
+        return Operator(
+            self._clock,
+            seed,
+            habits,
+            panel,
+            self._outfits,
+            self.pods,
+            self._scene.keep_outs[0][0],
+            self._flux if feeds else None,
+        )
 
     def _settings(self) -> PlantSettings:
         """Return the settings of the plant."""
@@ -608,22 +618,20 @@ class Simulation:
             self._store.restore()
             self._assigned, self._emergency = self._store.points, self._store.keeper
 
-    def _second_plant(self, fits: Sequence[Outfit]) -> SecondPlant:
+    def _second_plant(self) -> SecondPlant:
+        def observers(disk: RecordsDisk) -> Panel:
+            own = PlantObserver(self.begin, disk, SETTINGS, [pod.observer for pod in self.pods])
+            return Panel(own, self.beams, PersonsObserver(self.begin, ()))
+
         return SecondPlant(
             self._clock,
             self.plan.seed,
-            self._design,
-            self._homes,
-            SETTINGS,
-            TABLE,
             self._wanted,
             self._assigned,
             self.pods,
-            fits,
-            self._scene.keep_outs[0],
-            self.beams,
-            self._flux,
-            self._alarmed,
+            observers,
+            self._people,
+            self._begins,
         )
 
     def run_twice(self, group: asyncio.TaskGroup, *, on: bool) -> None:
@@ -634,11 +642,8 @@ class Simulation:
     def _alarmed(self, alarm: Alarm) -> None:
         if self._work is not None:
             self._work.control.take_alarm(alarm)
-        self.beams.alarmed(alarm, self._clock.monotonic())
-        self.readings.alarmed(alarm)
-        self.alarms.alarmed(alarm, self._clock.monotonic())
-        if self.quiet is not None:
-            self.quiet.alarmed(alarm)
+        for each in self._judges:
+            each.on_alarm(alarm, self._clock.monotonic())
 
     def crash_plant(self, now: float) -> None:
         """Kill the plant's program wherever it is; the network tells the clusters."""
@@ -647,7 +652,6 @@ class Simulation:
                 pod.ear.end()
         if self._work is not None:
             self._work.control.ends()
-            self._work.watch.ended()
         if self.plant is not None:
             self._audit.lose()
         for task in self._program:
@@ -660,13 +664,8 @@ class Simulation:
         if self._maintenance is not None:
             self._maintenance.service = None
         self.instruments.plant = None
-        self.observer.ended(now)
-        self.beams.ended()
-        self.readings.ended(now)
-        self.alarms.ended()
-        self.tickets.ended()
-        if self.quiet is not None:
-            self.quiet.ended()
+        for each in self._judges:
+            each.on_end(now)
         for pod in self.pods:
             pod.tap = pod.ear = None
             pod.line.drop()
@@ -719,7 +718,7 @@ class Simulation:
                     pod.freeze(on=False)
             if self._tour is not None and self.plan.seconds >= TOUR_LENGTH:
                 saw = f"the tour is not over after {self.plan.seconds:g} s"
-                self.observer.check(11, self._tour.over, self._clock.monotonic(), saw)
+                self.observer.check(11, self._tour.over, self._clock.monotonic(), "plant", saw)
             self.crash_plant(self._clock.monotonic())
             self.run_twice(group, on=False)
             for pod in self.pods:
@@ -809,11 +808,7 @@ def run(plan: RunPlan) -> RunResult:
         runner.close()
     except RuntimeError as error:  # a task does not end, such as one of a program that is frozen
         outcome.problem = outcome.problem or f"the run does not end: {error}"
-    outcome.checks = sum(
-        (pod.checks for pod in simulation.pods),
-        simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
-    )
-    outcome.checks += simulation.checks
+    outcome.checks = simulation.checks
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
     outcome.counts["proofs"] = simulation.beams.proofs

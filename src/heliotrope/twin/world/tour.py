@@ -23,7 +23,6 @@ from heliotrope.safety import Act
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, RECEIVER, STANDBY
 from heliotrope.twin.invariants.invariants import OFF
-from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator, Point
 
 #: Name of the world, and how long it takes, s.
@@ -68,8 +67,6 @@ class Tour:
     ----------
     operator
         Gives the commands.
-    observer
-        Told of what fails.
     boards
         The heliostats.
     clock
@@ -88,13 +85,13 @@ class Tour:
     def __init__(
         self,
         operator: Operator,
-        observer: PlantObserver,
         boards: Sequence[Board],
         clock: Clock,
         sun: Callable[[float], FloatArray],
         seed: int,
     ) -> None:
-        self._operator, self._observer, self._clock, self._sun = operator, observer, clock, sun
+        self._operator, self._observer = operator, operator.panel.plant
+        self._clock, self._sun = clock, sun
         self._boards = {board.outfit.name: board for board in boards}
         self._chance = random.Random(f"tour {seed}")
         self.over = False
@@ -122,7 +119,7 @@ class Tour:
         return plant
 
     def _check(self, good: bool, saw: str, number: int = 11) -> None:
-        self._observer.check(number, good, self._clock.monotonic(), saw)
+        self._observer.check(number, good, self._clock.monotonic(), "plant", saw)
 
     async def _lead(self, name: str) -> None:
         for what, state in STEPS:

@@ -8,18 +8,13 @@ import asyncio
 import random
 from collections.abc import Callable, Mapping, Sequence
 
-from heliotrope.field.plant import Plant
 from heliotrope.links.clock import VirtualClock
+from heliotrope.links.link import Link
 from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted
-from heliotrope.plant.controller import PlantController
+from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.field.assigned import Assigned
-from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety import Alarm, Condition
-from heliotrope.twin.boards.outfit import Ball, Outfit
-from heliotrope.twin.invariants.beams import BeamObserver
-from heliotrope.twin.invariants.persons import PersonsObserver
-from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.panel import Panel
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
@@ -29,6 +24,13 @@ from heliotrope.twin.world.worlds import Habits
 _PAUSE = 1.5
 
 
+#: Makes a program of a plant from its links, its stores, and a source of random bytes.
+Begins = Callable[[Mapping[str, Link], Stores, Callable[[int], bytes]], PlantController]
+#: Makes the people of a plant from a seed, their habits, its observers, and whether they give the
+#: plant the flux on the receiver.
+People = Callable[[int, Habits, Panel, bool], Operator]
+
+
 class SecondPlant:
     """The second plant, which runs now and then.
 
@@ -36,16 +38,16 @@ class SecondPlant:
     ----------
     clock, seed
         True time; seed of everything that it draws.
-    design, homes, settings, table
-        As of the first plant.
     wanted, assigned
-        Of the first plant, copied at each start.
-    pods, fits, keep_out
-        Clusters, heliostats, and the middle of a keep-out volume.
-    beams, flux
-        Observer of the beams; returns the share of the beams on the receiver.
-    on_alarm
-        Called with each alarm.
+        Parameters and points of the first plant, copied at each start.
+    pods
+        The clusters, whose lines it takes.
+    observers
+        Makes the observers of a plant with records on a disk.
+    people
+        Makes the people of a plant.
+    begins
+        Makes a program of the plant from its links, its stores, and a source of random bytes.
 
     Attributes
     ----------
@@ -61,41 +63,20 @@ class SecondPlant:
         self,
         clock: VirtualClock,
         seed: int,
-        design: Plant,
-        homes: Mapping[str, Sequence[str]],
-        settings: PlantSettings,
-        table: tuple[Condition, ...],
         wanted: Wanted,
         assigned: Assigned,
         pods: Sequence[Pod],
-        fits: Sequence[Outfit],
-        keep_out: Ball,
-        beams: BeamObserver,
-        flux: Callable[[], float],
-        on_alarm: Callable[[Alarm], None],
+        observers: Callable[[RecordsDisk], Panel],
+        people: People,
+        begins: Begins,
     ) -> None:
         self._clock, self._chance = clock, random.Random(f"twice {seed}")
-        self._design, self._homes, self._settings, self._table = design, homes, settings, table
-        self._wanted, self._assigned, self._pods = wanted, assigned, pods
-        self._beams, self._on_alarm = beams, on_alarm
+        self._wanted, self._assigned, self._pods, self._begins = wanted, assigned, pods, begins
         self.plant: PlantController | None = None
         self._disk = RecordsDisk()
-        self.observer = PlantObserver(
-            clock.monotonic(), self._disk, settings, [pod.observer for pod in pods]
-        )
-        self._persons = PersonsObserver(clock.monotonic(), ())
-        self.operator = Operator(
-            clock,
-            -1 - seed,
-            Habits(),
-            self.observer,
-            beams,
-            self._persons,
-            fits,
-            pods,
-            keep_out[0],
-            flux,
-        )
+        panel = observers(self._disk)
+        self.observer, self._persons = panel.plant, panel.persons
+        self.operator = people(-1 - seed, Habits(), panel, True)
         self._program: list[asyncio.Task[None]] = []
 
     async def work(self) -> None:
@@ -117,24 +98,15 @@ class SecondPlant:
         links = {}
         for pod in self._pods:
             link = pod.line.end(0, pod.name, self._clock, seed=self._chance.getrandbits(31))
-            links[pod.name] = TappedLink(
-                link, self._clock, PlantEar(pod, self.observer, self._beams)
-            )
-        assigned = AssignedDisk()
+            links[pod.name] = TappedLink(link, self._clock, PlantEar(pod, self.operator.panel))
+        assigned, wanted = AssignedDisk(), self._wanted.items
         assigned.keep(self._assigned.read())
-        self.plant = PlantController(
-            self._design,
-            links,
-            self._clock,
+        stores = Stores(
             SimulatedAudit(self._disk, self._clock.utc().isoformat()),
-            clusters=self._homes,
-            settings=self._settings,
-            wanted=Wanted({name: dict(some) for name, some in self._wanted.items.items()}),
-            assigned=assigned,
-            table=self._table,
-            entropy=self._chance.randbytes,
-            on_alarm=self._on_alarm,
+            Wanted({name: dict(some) for name, some in wanted.items()}),
+            assigned,
         )
+        self.plant = self._begins(links, stores, self._chance.randbytes)
         self.operator.begins(self.plant)
         parts = (*(link.run() for link in links.values()), self.plant.run())
         self._program = [group.create_task(part) for part in parts]
@@ -146,4 +118,4 @@ class SecondPlant:
         self._disk.lose()
         self.operator.begins(None)
         self._persons.forget()
-        self.observer.ended(self._clock.monotonic())
+        self.observer.on_end(self._clock.monotonic())

@@ -22,7 +22,8 @@ from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.assembly import CYCLE
 from heliotrope.plant.attempts import Attempts
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.operations import AutomaticSettings, Logbook, Operations
+from heliotrope.plant.operations import AutomaticControl, AutomaticSettings, Logbook, Operations
+from heliotrope.plant.operations.calibrating import Visits
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
 from heliotrope.plant.schedule.scheduler import VISITS, Scheduler
@@ -176,16 +177,16 @@ class Work:
         centring = SEARCH if self.centred else None
         cycle = CalibrationCycle(plant, self.camera, VISIT, centring)
         rounds = _Rounds(plant.field.names, self._clock)
-        self.operations = Operations(
-            plant,
-            self.logbook,
+        visits = Visits(
             cycle,
-            scheduler=self._schedule(plant) if self._together else rounds,
-            records=self.records,
-            settings=self._settings,
-            joint=self._joint(plant, cycle),
-            receiver=self._receiver(plant, cycle),
+            self._schedule(plant) if self._together else rounds,
+            self._joint(plant, cycle),
+            self._receiver(plant, cycle),
         )
+        automatic = AutomaticControl(
+            plant, self.logbook, visits, records=self.records, settings=self._settings
+        )
+        self.operations = Operations(plant, self.logbook, automatic, records=self.records)
         for name in plant.field.names:
             believed = plant.beliefs.present(name)[0]
             plant.wanted.set(name, items_of(believed, plant.design.machine(name)))

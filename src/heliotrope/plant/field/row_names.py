@@ -1,0 +1,39 @@
+"""The names of the rows of a cluster's status, asked for where the message with them was lost."""
+
+import math
+
+from heliotrope.links.messages import Answer, ClusterStatus
+from heliotrope.plant.field.clusters import Clusters
+from heliotrope.plant.field.part import Part
+from heliotrope.plant.field.state import FieldState
+
+#: A cluster is asked again for the names of its rows after this time, s.
+_AGAIN = 5.0
+
+
+class RowNames(Part):
+    """The questions for the names of rows.
+
+    Parameters
+    ----------
+    field, clusters
+        The state of the field, which learns the names; the clusters, which are asked.
+    """
+
+    def __init__(self, field: FieldState, clusters: Clusters) -> None:
+        self._field, self._clusters = field, clusters
+        self._asked_at = dict.fromkeys(field.clusters, -math.inf)
+
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
+        """Ask for the names of rows that nobody can read."""
+        del status
+        if self._field.knows_order(cluster) or now - self._asked_at[cluster] < _AGAIN:
+            return
+        self._asked_at[cluster] = now
+
+        def learn(answer: Answer) -> None:
+            if "error" not in answer.data:
+                self._field.learn_order(cluster, tuple(answer.data))
+
+        # The statistics come in the same order.
+        self._clusters.ask(self._clusters.ends[cluster], "statistics", learn)

@@ -1,0 +1,51 @@
+"""What visits have taken, and the record of it that outlives the plant's program."""
+
+from collections.abc import Callable
+
+from heliotrope.files.disk import Work
+from heliotrope.plant.field.assigned import Points
+from heliotrope.plant.field.locks import Locks
+from heliotrope.plant.field.part import Part
+from heliotrope.plant.orders.movements import Movements
+from heliotrope.plant.orders.stepping import Stepping
+
+
+class Taken(Part):
+    """Aims that visits have moved, heliostats that they have locked, fine steps that they need.
+
+    Parameters
+    ----------
+    movements, locks, stepping
+        The three kinds; what their records name is recalled by the owner.
+    points
+        The records, beside assigned points (`assigned.HELD`).
+    owe
+        Gives work to the disk.
+
+    Attributes
+    ----------
+    movements, locks, stepping
+        As given.
+    """
+
+    def __init__(
+        self,
+        movements: Movements,
+        locks: Locks,
+        stepping: Stepping,
+        points: Points,
+        owe: Callable[[Work], None],
+    ) -> None:
+        self.movements, self.locks, self.stepping = movements, locks, stepping
+        self._points, self._owe = points, owe
+
+    def on_second(self, now: float) -> None:
+        """Settle the points that are taken, and remove the records of what no visit holds."""
+        held = {
+            "LOCKED": self.locks.names,
+            "LENT": self.movements.names,
+            "ROUGH": self.stepping.lent,
+        }
+        for work in (self._points.settling(), self._points.released(held, now)):
+            if work is not None:
+                self._owe(work)
