@@ -6,8 +6,9 @@ import io
 import random
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "plan": ("plant.toml", "--heliostat", "A1", "--from", NOON, "--days", "0.5", "--every", "3h"),
     "commission": ("plant.toml", "--from", NOON, "--days", "0.5", "--every", "3h"),
     "run": ("plant.toml",),
+    "twin": ("plant.toml", "--folder", "twin"),
     "cluster": ("no.toml",),
     "simulate": ("--hours", "0.001"),
     "demo": ("--into", "demo"),
@@ -207,10 +209,21 @@ def cases(seed: int, count: int, asked: list[tuple[str, Any]]) -> Iterator[list[
         yield words(rng, *asked[k % len(asked)])
 
 
+@contextlib.contextmanager
+def not_begun(options: Sequence[str], seed: int, measured: int) -> Iterator[Any]:
+    """Yield a simulated field of the plant, without its process."""
+    del options, seed, measured
+    yield SimpleNamespace(folder=Path.cwd(), begin=None)
+
+
 def _faults(lines: Iterator[list[str]], place: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     # A plant that may run would do so until Ctrl-C.
-    simulated = importlib.import_module("heliotrope.cli.run.simulated")
-    monkeypatch.setattr(simulated, "run_plant", lambda *_: None)
+    run = importlib.import_module("heliotrope.cli.run.plant")
+    monkeypatch.setattr(run, "run_plant", lambda *_: None)
+    process = importlib.import_module("heliotrope.cli.run.twin_process")
+    monkeypatch.setattr(process, "twin_process", not_begun)
+    field = importlib.import_module("heliotrope.cli.twin")
+    monkeypatch.setattr(field, "_run", lambda *_, **__: None)
     ends = ((line, outcome(line, place, monkeypatch)) for line in lines)
     return [f"{' '.join(line)}: {fault}" for line, fault in ends if fault]
 
