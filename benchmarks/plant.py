@@ -68,7 +68,7 @@ _AWAY = (0.1, 0.05)
 CHECKS_BUDGET_S = 0.1
 #: The checks: classes and methods.
 CHECKS: tuple[tuple[type[Any], str], ...] = (
-    (Agreement, "take"),
+    (Agreement, "on_status"),
     (Agreement, "readings"),
     (BeamWatch, "readings"),
     (Identities, "on_status"),
