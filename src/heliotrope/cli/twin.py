@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from heliotrope.cli._common import open_plant
 from heliotrope.cli._plants import design_of, one_plant, start_of
 
 if TYPE_CHECKING:
@@ -62,24 +63,38 @@ def twin(
     """Simulate a field that a plant reaches as a real one: over TCP, HTTP and files of sensors.
 
     It writes what the plant needs into a folder, and runs until Ctrl-C. The plant is then started
-    with heliotrope run FOLDER/plant.toml --clusters FOLDER/links.toml.
+    with heliotrope run FOLDER/plant.toml --clusters FOLDER/links.toml. A folder that is there
+    already is that of a field that ran before: it runs again.
     """
     from heliotrope.errors import InputError
     from heliotrope.twin.live.live import steps_every
-    from heliotrope.twin.program import LINKS, PLANT, TwinOptions, TwinProgram, write_folder
+    from heliotrope.twin.program import (
+        LINKS,
+        PLANT,
+        TwinOptions,
+        TwinProgram,
+        read_folder,
+        write_folder,
+    )
 
     one_plant("twin", field, heliostats, prototype=prototype)
-    if start == "now" and speed != 1.0:
-        raise InputError("twin: --speed needs a --start; with the clock of this machine it is 1")
-    design = design_of(field, heliostats, prototype=prototype)
-    begins = None if start == "now" else start_of("twin", start, design)
-    files = write_folder(
-        design,
-        folder,
-        _address(plant, "--plant"),
-        _free(_address(serve, "--serve")),
-        steps_every=steps_every(len(design)),
-    )
+    if start == "now" and (speed != 1.0 or up):
+        raise InputError("twin: --speed and --up need a --start: else it keeps this machine's time")
+    if field is None and (folder / LINKS).exists():
+        if start != "now":
+            raise InputError(f"twin: {folder}: it ran before, and runs again with --start now only")
+        design, files = open_plant(folder / PLANT), read_folder(folder)
+        begins = None
+    else:
+        design = design_of(field, heliostats, prototype=prototype)
+        begins = None if start == "now" else start_of("twin", start, design)
+        files = write_folder(
+            design,
+            folder,
+            _address(plant, "--plant"),
+            _free(_address(serve, "--serve")),
+            steps_every=steps_every(len(design)),
+        )
     options = TwinOptions(begins, speed, seed, boards or prototype, up, waits=child)
     program = TwinProgram(design, files, options)
     if child:

@@ -6,7 +6,15 @@ state of its clock and the true errors over HTTP. `heliotrope twin` starts it, a
 starts one where no links are given.
 """
 
-from heliotrope.twin.program.folder import LINKS, PLANT, TwinFolder, write_folder
+from heliotrope.twin.program.folder import LINKS, PLANT, TwinFolder, read_folder, write_folder
 from heliotrope.twin.program.program import TwinOptions, TwinProgram
 
-__all__ = ["LINKS", "PLANT", "TwinFolder", "TwinOptions", "TwinProgram", "write_folder"]
+__all__ = [
+    "LINKS",
+    "PLANT",
+    "TwinFolder",
+    "TwinOptions",
+    "TwinProgram",
+    "read_folder",
+    "write_folder",
+]

@@ -4,14 +4,15 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import tomli_w
 
-from heliotrope.errors import InputError
+from heliotrope.errors import FormatError, InputError
 from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.plant import Plant
 from heliotrope.links.keys import KeyFile
+from heliotrope.plant.io.links_file import read_links
 from heliotrope.plant.settings import clusters_of
 from heliotrope.safety import FLUX_READING
 
@@ -96,6 +97,26 @@ def write_folder(
     }
     (folder / LINKS).write_text(tomli_w.dumps(document), encoding="utf-8")
     return TwinFolder(folder, keys, plant, serves, secret)
+
+
+def read_folder(folder: Path) -> TwinFolder:
+    """Return the files of a simulated field that ran before, to run it again.
+
+    Raises
+    ------
+    FormatError
+        If they are not those of a simulated field.
+    """
+    file = read_links(folder / LINKS)
+    found = urlsplit(file.document.twin)
+    if file.document.tcp is None or not found.hostname or not found.port:
+        raise FormatError(
+            folder / LINKS, "it is not of a simulated field; give a new folder", "twin"
+        )
+    host, _, port = file.document.tcp.listen.rpartition(":")
+    keys = {name: ring.newest for name, ring in file.keys.items()}
+    serves = found.hostname, found.port
+    return TwinFolder(folder, keys, (host.strip("[]"), int(port)), serves, found.path.strip("/"))
 
 
 def _address(serves: tuple[str, int], secret: str) -> str:

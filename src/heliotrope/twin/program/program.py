@@ -138,9 +138,10 @@ class TwinProgram:
                 running(*world.far),
                 asyncio.TaskGroup() as group,
             ):
-                tasks = [group.create_task(self._sense(world))]
-                if paced is not None:
-                    tasks.append(group.create_task(self._lead(world, paced)))
+                tasks = [
+                    group.create_task(self._sense(world)),
+                    group.create_task(self._lead(world, paced)),
+                ]
                 await ending.wait()
                 for task in tasks:
                     task.cancel()
@@ -166,7 +167,7 @@ class TwinProgram:
             raise FetchError("the simulated field has not begun")
         return self._parts
 
-    async def _lead(self, world: World, loop: PacedLoop) -> None:
+    async def _lead(self, world: World, loop: PacedLoop | None) -> None:
         """Let the field begin once the plant leads it, and slow time down while the plant is late.
 
         Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A
@@ -175,7 +176,8 @@ class TwinProgram:
         # To connect takes wall time, to be led takes simulated time.
         while not all(cluster.connected for cluster in world.clusters):
             await _wall(_CHECKED)
-        loop.speed = self._options.speed
+        if loop is not None:
+            loop.speed = self._options.speed
         while min(cluster.lease_left for cluster in world.clusters) < _SHORT:
             await _wall(_CHECKED)
         await asyncio.sleep(_BEGUN)
@@ -183,7 +185,7 @@ class TwinProgram:
             world.put_up()
         await asyncio.sleep(_REPORTED)
         self._begun = True
-        while True:
+        while loop is not None:
             left = [cluster.lease_left for cluster in world.clusters]
             short = min(left) < _SHORT and max(left) > 0.0
             speed = self._options.speed * (_SLOW if short else 1.0)

@@ -1,0 +1,231 @@
+"""A simulated field as a program: its folder, its server, its clock, and its death."""
+
+import asyncio
+import signal
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from heliotrope.errors import FetchError, FormatError, InputError
+from heliotrope.field.formats.plant_file import read_plant, write_plant
+from heliotrope.field.layouts import malan_plant
+from heliotrope.field.plant import Plant
+from heliotrope.imaging.files import read_image
+from heliotrope.imaging.frame import Frame
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.io.followed_clock import ClockReader, FollowedLoop
+from heliotrope.plant.io.links_file import read_links
+from heliotrope.twin.live import PacedLoop, World, WorldOptions
+from heliotrope.twin.live.live import true_mechanisms
+from heliotrope.twin.program import read_folder, write_folder
+from heliotrope.twin.program.boards import read_boards, write_boards
+from heliotrope.twin.program.server import TwinServer
+from heliotrope.twin.yesterday import measure_yesterday, with_records
+from support.program import MAIN, Program
+
+START = datetime(2026, 6, 21, 10, tzinfo=UTC)
+SECRET = "secret"
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def at_noon(heliostats: int) -> Plant:
+    """Return a plant where it is about noon now."""
+    design, now = malan_plant(heliostats), datetime.now(UTC)
+    hour = now.hour + now.minute / 60.0
+    return replace(design, site=replace(design.site, longitude_deg=15.0 * (12.0 - hour)))
+
+
+# -- the folder ----------------------------------------------------------------------------
+
+
+def test_a_folder_is_read_as_it_was_written(tmp_path: Path) -> None:
+    design, serves = malan_plant(40), ("127.0.0.1", 8090)
+    made = write_folder(design, tmp_path / "f", ("127.0.0.1", 4840), serves, steps_every=1)
+    assert read_folder(tmp_path / "f") == made
+    known = read_plant(tmp_path / "f" / "plant.toml")
+    assert [camera.source for camera in known.cameras] == [
+        f"http://127.0.0.1:8090/{made.secret}/cameras/camera-{side}.png"
+        for side in ("left", "right")
+    ]
+    with pytest.raises(InputError, match="it exists; give another folder"):
+        write_folder(design, tmp_path / "f", ("127.0.0.1", 4840), serves, steps_every=1)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('C001 = "tcp"', 'C001 = "C001.toml"', "beside twin"),
+        ("none = true", "photographs = true", "no witness sees the sun of a simulated field"),
+    ],
+)
+def test_nothing_real_stands_beside_a_simulated_field(
+    tmp_path: Path, before: str, after: str, message: str
+) -> None:
+    design = malan_plant(40)
+    write_folder(design, tmp_path, ("127.0.0.1", 4840), ("127.0.0.1", 8090), steps_every=1)
+    path = tmp_path / "links.toml"
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+    (tmp_path / "C001.toml").write_text("")
+    with pytest.raises(FormatError, match=message):
+        read_links(path)
+
+
+def test_boards_store_what_the_plant_has_kept(tmp_path: Path) -> None:
+    design = malan_plant(12)
+    truth = true_mechanisms(design, WorldOptions(3))
+    day = measure_yesterday(design, truth, START, count=5, seed=3)
+    newest = list({record.heliostat: record for record in day.calibrations}.values())
+    write_boards(tmp_path / "boards.npz", newest)
+    stored = read_boards(tmp_path / "boards.npz", design)
+    (group,), (expected,) = stored.groups.values(), with_records(design, newest).groups.values()
+    table = group.calibrated.armature.table
+    np.testing.assert_allclose(table, expected.calibrated.armature.table, atol=1e-12)
+    (nominal,) = design.groups.values()
+    moved = (np.abs(table - nominal.calibrated.armature.table) > 1e-6).any(axis=-1)
+    assert {name for name, new in zip(design.names, moved, strict=True) if new} == {
+        record.heliostat for record in newest
+    }
+
+
+# -- what it serves ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[str, dict[str, Any]]]:
+    """The address of a server, and the state of its clock, which may be changed."""
+    state = {
+        "now": 1000.0, "utc": START.timestamp(), "speed": 0.0, "asked": 2.0,
+        "waits": True, "begun": False,
+    }  # fmt: skip
+    frame = Frame(np.full((16, 24), 9, dtype=np.uint8), "eye", START)
+    loop, port = asyncio.new_event_loop(), free_port()
+    server = TwinServer(
+        ("127.0.0.1", port), SECRET, lambda: state, loop, lambda _: frame, bytes, bytes
+    )
+    server.start()
+    yield f"http://127.0.0.1:{port}/{SECRET}", state
+    server.close()
+    loop.close()
+
+
+def test_a_photograph_has_the_time_of_its_exposure(
+    served: tuple[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    answer = httpx.get(f"{served[0]}/cameras/eye.png", trust_env=False)
+    (tmp_path / "a.png").write_bytes(answer.content)
+    frame = read_image(tmp_path / "a.png")
+    assert frame.time == START
+    assert frame.pixels.tolist() == [[9] * 24] * 16
+
+
+@pytest.mark.parametrize("path", ["", "/..", "/cameras", "/cameras/eye", "/other"])
+def test_other_paths_are_not_found(served: tuple[str, dict[str, Any]], path: str) -> None:
+    assert httpx.get(f"{served[0]}{path}", trust_env=False).status_code == 404
+    guessed = served[0].replace(SECRET, "guess")
+    assert httpx.get(f"{guessed}/clock", trust_env=False).status_code == 404
+
+
+def test_a_plant_follows_the_clock_of_its_field(served: tuple[str, dict[str, Any]]) -> None:
+    address, state = served
+    reader = ClockReader(address)
+    with asyncio.Runner(loop_factory=lambda: FollowedLoop(reader)) as runner:
+        loop = runner.get_loop()
+        clock = reader.clock(loop)
+        assert (clock.monotonic(), clock.utc()) == (1000.0, START), "it stands still"
+        state.update(now=1100.0, speed=50.0, begun=True)
+
+        async def wait() -> float:
+            while not reader.state.begun:
+                await asyncio.to_thread(lambda: None)
+            begun = loop.time()
+            await asyncio.sleep(5.0)
+            return loop.time() - begun
+
+        assert runner.run(wait()) >= 5.0
+        passed = clock.utc().timestamp() - START.timestamp()
+        assert passed == pytest.approx(clock.monotonic() - 1000.0, abs=5.0), "0.1 s of this machine"
+    reader.close()
+
+
+def test_a_field_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("heliotrope.plant.io.followed_clock._STARTING", 0.0)
+    with pytest.raises(FetchError, match="simulated field: no answer"):
+        ClockReader(f"http://127.0.0.1:{free_port()}/{SECRET}")
+
+
+# -- the field -----------------------------------------------------------------------------
+
+
+def test_a_field_that_is_put_up_tracks_as_one_that_was_raised() -> None:
+    async def main(clock: VirtualClock) -> None:
+        world = World(malan_plant(12), clock, WorldOptions(rendered=False))
+        world.put_up()
+        assert (world.field.state == states.TRACKING).all()
+        # The mirrors are as far off as they are installed, about 10 mrad.
+        assert 1e-3 < np.median(world.errors()) < 3e-2
+        world.field.advance(1000)
+        assert (world.field.state == states.TRACKING).all()
+
+    run_virtual(main, start=START)
+
+
+def test_a_loop_stands_still_and_goes_on_at_another_speed() -> None:
+    with asyncio.Runner(loop_factory=lambda: PacedLoop(20.0)) as runner:
+        loop = runner.get_loop()
+        assert isinstance(loop, PacedLoop)
+
+        async def main() -> None:
+            loop.speed = 0.0
+            begun = loop.time()
+            await asyncio.to_thread(lambda: None)
+            assert loop.time() == begun
+            loop.speed = 40.0
+            await asyncio.sleep(1.0)
+            assert loop.time() >= begun + 1.0
+
+        runner.run(main())
+
+
+# -- real processes ------------------------------------------------------------------------
+
+
+def test_a_plant_outlives_its_field_and_leads_it_again(tmp_path: Path) -> None:
+    write_plant(at_noon(6), tmp_path / "plant.toml")
+    folder = tmp_path / "desk"
+    # A new field begins at stow, as boards do whose supply was cut there.
+    words = ["twin", "--folder", str(folder), "--plant", f"127.0.0.1:{free_port()}"]
+    field = Program(MAIN, *words, str(tmp_path / "plant.toml"))
+    plant = None
+    try:
+        field.says("now start")
+        plant = Program(
+            MAIN, "run", str(folder / "plant.toml"), "--clusters", str(folder / "links.toml"),
+            "--no-console", "--data", str(tmp_path / "data"), "--every", "1", "--automatic",
+        )  # fmt: skip
+        plant.says("[1-6] of 6 track")
+        field.process.send_signal(signal.SIGKILL)
+        plant.says("1 of 1 clusters silent.*alarm")
+        field.close()
+        field = Program(MAIN, *words)
+        plant.says(r"UTC: (?!.*silent).*6 in stow")
+        plant.process.send_signal(signal.SIGINT)
+        assert plant.ends() == 0
+        assert plant.text.endswith("ended\n")
+    finally:
+        field.close()
+        if plant is not None:
+            plant.close()
