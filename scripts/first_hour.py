@@ -97,7 +97,9 @@ def main() -> None:
     parser.add_argument("--learnt", type=int, default=6, help="heliostats to wait for")
     parser.add_argument("--into", type=Path, default=Path("docs/images"))
     given = parser.parse_args()
-    plant = Plant("--heliostats", str(given.heliostats), "--speed", str(given.speed))
+    plant = Plant(
+        "--heliostats", str(given.heliostats), "--speed", str(given.speed), "--from", "stow"
+    )
     try:
         link = plant.told(r"console: (\S+)")
         with sync_playwright() as playwright:

@@ -24,7 +24,7 @@ class RunningPlant:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        words = ["run", "--heliostats", "4", "--exact", "--port", "0", "--data", str(folder)]
+        words = ["run", "--heliostats", "4", "--port", "0", "--data", str(folder)]
         self._lines: queue.Queue[str] = queue.Queue()
         self._popen = subprocess.Popen([*MAIN, *words], stdout=subprocess.PIPE, text=True)
         self._reader = threading.Thread(target=self._read)

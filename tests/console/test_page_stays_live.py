@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from heliotrope.console.client import Client
 from support.live_console import PASSWORD
+from support.one_time_link import set_password
 from support.pages import NEEDS_BROWSER, entering, until
 from support.program import MAIN, Program
 
@@ -27,15 +27,12 @@ ENOUGH = """() => [...document.querySelectorAll(".hx-calibration li")].some(
 @pytest.fixture
 def address(tmp_path: Path) -> Iterator[str]:
     """Twelve new heliostats that go to the targets together, at eight times real time."""
-    words = "--heliostats", "12", "--speed", "8", "--port", "0", "--no-browser"
+    words = "--heliostats", "12", "--speed", "8", "--port", "0", "--no-browser", "--from", "new"
     plant = Program(MAIN, "run", *words, "--data", str(tmp_path / "data"))
     try:
-        found = plant.says(r"console: (\S+)")[1]
-        first = Path(plant.says(r"password in (\S+)")[1]).read_text("utf-8").strip()
-        with Client(url=found) as client:
-            client.sign_in("engineer", first)
-            client.change_password(first, PASSWORD)
-        yield found
+        link = plant.says(r"console: (\S+)")[1]
+        set_password(link, PASSWORD)
+        yield link.partition("enter")[0]
     finally:
         plant.close()
 

@@ -32,8 +32,8 @@ from support.midsummer import SITE, START
 TOKEN, COUNT = 0xF1E1D, 3
 
 
-def field_of(mechanism: Mechanism, **options: Any) -> Field:
-    return Field(mechanism, MACHINE, **options)
+def field_of(mechanism: Mechanism, machine: Any = MACHINE, **options: Any) -> Field:
+    return Field(mechanism, machine, **options)
 
 
 class Both:
@@ -53,6 +53,7 @@ class Both:
             perfect.with_parameters(
                 {name: np.array([outfit.causes[name] for outfit in made]) for name in CAUSES}
             ),
+            [outfit.machine for outfit in made],
             play=play,
             wind=wind,
         )

@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from heliotrope.field import layouts
+from heliotrope.field.coded_visits import JointSettings
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.layout_tower import square_target, watching_camera
 from heliotrope.field.plant import Plant
@@ -56,6 +57,8 @@ def prototype() -> Plant:
     )
     lower = _standing("target", _LOWER, bearing)
     return Plant(
+        # All 18 together, in 32 photographs.
+        joint_visits=JointSettings(first=63),
         name="Malan's prototype",
         site=Site(-33.93, 18.87, 120.0, name="Stellenbosch"),
         groups={

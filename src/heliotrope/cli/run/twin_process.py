@@ -97,9 +97,11 @@ def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["
     finally:
         # It ends when its standard input ends.
         assert process.stdin is not None
+        assert process.stdout is not None
         process.stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(_ENDING)
         process.kill()
         process.wait()
+        process.stdout.close()
         shutil.rmtree(home, ignore_errors=True)

@@ -459,9 +459,10 @@ class BeamObserver(Judge):
     def _parted(self, mirror: _Mirror, now: float) -> None:
         """Check that beams do not turn away together: they would make a hot spot elsewhere."""
         aside = [m.node for m in self._mirrors.values() if m.board.state == states.DEFOCUSED]
-        turns = {node.journal.items.get("defocus") for node in aside if node is not None}
-        saw = f"{len(aside)} heliostats turned away by the same angles"
-        self.check(13, len(aside) < _MANY or len(turns) > 1, now, mirror.name, saw)
+        turns = [node.journal.items.get("defocus") for node in aside if node is not None]
+        known = [turn for turn in turns if turn is not None]
+        saw = f"{len(known)} heliostats turned away by the same angles"
+        self.check(13, len(known) < _MANY or len(set(known)) > 1, now, mirror.name, saw)
 
     def _returns(self, mirror: _Mirror, now: float) -> None:
         """Check that a mirror returns to the receiver by a person's will, if one is needed."""
