@@ -21,6 +21,7 @@ from heliotrope.imaging.files import read_image
 from heliotrope.imaging.frame import Frame
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.io.followed_clock import ClockReader, FollowedLoop
 from heliotrope.plant.io.links_file import read_links
 from heliotrope.twin.live import PacedLoop, World, WorldOptions
@@ -179,6 +180,20 @@ def test_a_field_that_is_put_up_tracks_as_one_that_was_raised() -> None:
         assert 1e-3 < np.median(world.errors()) < 3e-2
         world.field.advance(1000)
         assert (world.field.state == states.TRACKING).all()
+
+    run_virtual(main, start=START)
+
+
+def test_a_plant_knows_the_aims_of_a_field_that_is_up() -> None:
+    async def main(clock: VirtualClock) -> None:
+        design = malan_plant(12)
+        ports = World(design, clock, WorldOptions(rendered=False)).ports()
+        made = PlantAssembly(design, ports, AssemblySettings(machines=MachineTables.HELD))
+        assert np.isnan(made.plant.aims).all()
+        made.plant.aims[3] = (1.0, 2.0, 3.0)
+        made.aim_as_designed()
+        assert np.isfinite(made.plant.aims).all()
+        assert made.plant.aims[3].tolist() == [1.0, 2.0, 3.0], "an assigned aim stays"
 
     run_virtual(main, start=START)
 

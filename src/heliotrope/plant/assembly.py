@@ -220,6 +220,12 @@ class PlantAssembly:
         for row, name in enumerate(self.names):
             rest_on(self.plant.standbys[row : row + 1], self.design.machine(name).standby)
 
+    def aim_as_designed(self) -> None:
+        """Take the design's aims for all heliostats that were assigned none: they track them."""
+        aims = self.plant.default_aims(self.names)
+        for row, name in enumerate(self.names):
+            rest_on(self.plant.aims[row : row + 1], tuple(aims[name]))
+
     def _want(self) -> None:
         """Want every local controller to store the machine table and the last calibration."""
         for name, point in zip(self.names, self.plant.standbys, strict=True):

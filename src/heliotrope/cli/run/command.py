@@ -328,10 +328,11 @@ def run(
         begins = start_of("run", start, design)
         options = _options(field, heliostats, prototype=prototype)
         options += ["--speed", str(speed), "--start", begins.isoformat()]
-        options += ["--up"] if begin is not Begin.STOW and not prototype else []
+        up = begin is not Begin.STOW and not prototype
+        options += ["--up"] if up else []
         measured = 0 if begin is Begin.NEW or prototype else min(_MEASURED, len(design) * 3 // 20)
         with twin_process(options, seed, measured) as twin:
-            choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle))
+            choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle), aimed=up)
             run_plant(open_plant(twin.folder / PLANT), choice, shown, twin.begin)
         return
     if field is None:

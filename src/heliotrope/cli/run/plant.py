@@ -65,13 +65,17 @@ Prepare = Callable[[Keeper, Plant, datetime], Awaitable[None]]
 
 @dataclass(frozen=True)
 class PlantChoice:
-    """Options of a plant on the command line; see `cli.run.command`."""
+    """Options of a plant on the command line; see `cli.run.command`.
+
+    ``aimed``: the heliostats of a simulated field track the design's aims when the plant begins.
+    """
 
     folder: Path
     clusters: Path
     idle: bool
     configure: bool = False
     check: bool = False
+    aimed: bool = False
 
 
 def run_plant(
@@ -326,6 +330,8 @@ async def _run(
         kept = pictures(shown, folder, waits=outside.fast)
         ports = replace(ports, pictures=kept, marks=shown.marks)
         live = PlantAssembly(design, ports, _settings(design, choice, shown, outside))
+        if choice.aimed:
+            live.aim_as_designed()
         real = outside.reader is None
         if real and live.plant.sentinel.table.unwatched:
             print(f"no readings for: {', '.join(live.plant.sentinel.table.unwatched)}", flush=True)
