@@ -97,7 +97,7 @@ class ProgressObserver(Judge):
         self._since: dict[tuple[str, ...], float] = {}
         self._lowest, self._dark = lowest, frozenset(dark)
         self._up: bool | None = None
-        self._locked, self._unlocked = set[str](), set[str]()
+        self._locked: set[str] = set()
         self._calibrates, self._measured = True, 0.0
         self._took_at, self._begun = -inf, dict[str, tuple[str, ...]]()
         self._emergency = self._called = self._ended = False
@@ -116,9 +116,8 @@ class ProgressObserver(Judge):
         """Note a command of a person that the plant has accepted: a lock has its owner."""
         if what == "LOCK":
             self._locked.update(heliostats)
-            self._unlocked.difference_update(heliostats)
-        elif what == "UNLOCK":  # one that is on its way to stow refuses it
-            self._unlocked.update(heliostats)
+        elif what == "UNLOCK":
+            self._locked.difference_update(heliostats)
 
     def took(self, operations: Operations, now: float) -> None:
         """Note that a person has taken the command authority."""
@@ -192,9 +191,6 @@ class ProgressObserver(Judge):
         well = not (operations.plant.sentinel.on or operations.automatic.waits or lost)
         self._go_on(operations, self._assigned & quiet if well else set(), now)
         self._step_finely(running, quiet, sun, now)
-        obeyed = {n for n in self._unlocked if self._boards[n].state != states.LOCKED}
-        self._locked -= obeyed
-        self._unlocked -= obeyed
         stowed = {n for n, board in self._boards.items() if board.state == states.STOWED}
         blocked = {row.subject for row in rows if row.condition == BLOCKED and row.active}
         stowed -= blocked if self._across else set()
