@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
+from heliotrope.links.messages import Stage
 from heliotrope.plant.operations import Operations
 from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
@@ -27,6 +28,8 @@ Commanding = Callable[[Operations, Person, int], None]
 #: Time until the clusters have a new token, and in which a command is done that only changes a
 #: setting, s.
 _DONE = 4.0
+#: Time for which a person waits until mirrors have gone to stow and take UNLOCK, s.
+_UNLOCKED_WITHIN = 120.0
 #: Noise of a parameter that a person has measured, rad; and of points that persons choose, m.
 _MEASURED, _BESIDE = 3e-4, 0.5
 #: Least time on duty, s.
@@ -76,6 +79,8 @@ class Acts:
         self._others = random.Random(f"locks {seed}")
         self._withheld: set[str] = set()  # what a person keeps from automatic control
         self._locked: dict[str, str] = {}  # who has locked each heliostat
+        #: UNLOCK under way: the plant's program, its ticket, and who had locked each heliostat.
+        self._unlocking: list[tuple[Operations, Ticket, dict[str, str]]] = []
         operator.commands = False
 
     def now(self) -> float:
@@ -163,14 +168,23 @@ class Acts:
                 operations.plant.authority.keep(person, token)
                 self._observer.kept(self.now())
                 self._watch.day.took(self.now())
+                self._hear()
                 if self.chance.random() < 0.2:
                     commands(operations, person, token)
                 await asyncio.sleep(1.0)
         if leaves or self._work.operations is not operations or self._operator.waits:
             return
         with contextlib.suppress(RefusedError):
-            for name in [name for name, by in self._locked.items() if by == person.name]:
-                self.command(operations, person, token, "UNLOCK", (name,))
+            until = self.now() + _UNLOCKED_WITHIN
+            while self.present() is operations and self.now() < until:
+                for name in [name for name, by in self._locked.items() if by == person.name]:
+                    self.command(operations, person, token, "UNLOCK", (name,))
+                if not self._unlocking:
+                    break
+                operations.plant.authority.keep(person, token)
+                self._observer.kept(self.now())
+                await asyncio.sleep(_DONE)
+                self._hear()
             self._gives(operations, person, token)
 
     async def once(
@@ -226,8 +240,21 @@ class Acts:
         if what == "LOCK":
             self._locked.update(dict.fromkeys(ticket.heliostats, person.name))
         elif what == "UNLOCK":
-            for name in ticket.heliostats:
-                self._locked.pop(name, None)
+            mine = {n: self._locked.pop(n) for n in ticket.heliostats if n in self._locked}
+            if mine:
+                self._unlocking.append((operations, ticket, mine))
+
+    def _hear(self) -> None:
+        """Learn what became of UNLOCK: one on its way to stow refuses it, and stays locked."""
+        pending = self._unlocking
+        self._unlocking = []
+        for program, ticket, mine in pending:
+            if program is self._work.operations and not ticket.finished:
+                self._unlocking.append((program, ticket, mine))
+                continue
+            refused = {n: by for n, by in mine.items() if ticket.stage(n) is not Stage.DONE}
+            self._locked.update(refused)
+            self._watch.commanded("LOCK", list(refused))
 
     def aims(
         self, operations: Operations, person: Person, token: int, names: Sequence[str]
