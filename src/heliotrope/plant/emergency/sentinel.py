@@ -30,7 +30,7 @@ from heliotrope.plant.motion.watch import BeamWatch
 from heliotrope.plant.orders.joining import JoinQueue
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.tickets import Ticket
-from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act
+from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act, Alarm
 from heliotrope.store.records import StoreError
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
@@ -121,9 +121,8 @@ class Sentinel(Part):
 
     def on_beat(self, now: float) -> None:
         """Evaluate the table, do what it demands, and report its alarms."""
-        proof = self.order.proof if self.on and self.order is not None else None
         self._unproven = {n: at for n, at in self._unproven.items() if now - at < _PROVEN_SHOWS}
-        news = self.table.evaluate(proof, self._unproven, called=bool(self._calls), now=now)
+        news = self._evaluate(now)
         self._obey_field(now)
         self._obey_night()
         self._obey_clusters()
@@ -131,6 +130,10 @@ class Sentinel(Part):
         self._keep(now)
         for alarm in news:
             self.table.tell(alarm)
+
+    def _evaluate(self, now: float) -> list[Alarm]:
+        proof = self.order.proof if self.on and self.order is not None else None
+        return self.table.evaluate(proof, self._unproven, called=bool(self._calls), now=now)
 
     def _obey_field(self, now: float) -> None:
         wanted, caused = self.table.demanded(), self.table.caused()
@@ -263,6 +266,9 @@ class Sentinel(Part):
         else:
             order = self.order
             self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
+        if before is None:  # its row trips now, even if the order is withdrawn before a beat
+            for alarm in self._evaluate(self._clock.monotonic()):
+                self.table.tell(alarm)
         self._keep(order.at)
         return order
 

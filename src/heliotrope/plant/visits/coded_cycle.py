@@ -52,6 +52,8 @@ from heliotrope.plant.visits.verification import Confirming
 #: Moves beams to points on the surface, ENU, m, by heliostat.
 Move = Callable[[Mapping[str, FloatArray]], Awaitable[None]]
 
+#: Time in which each heliostat of a visit reports its step counts: they are asked for each second.
+_COUNTED = 1.2
 #: Photographs that may wait to be read while the next is taken.
 _UNREAD = 2
 #: Share of the way from the usual light to that of a new photograph.
@@ -315,6 +317,10 @@ class CodedCycle(ABC):
             while plant.now() < begin + settle:
                 await visit.look()
             picture = await noting(visit.look, self._next(visit, light, taken))
+            # They stand until each has reported its step counts, however fast the camera is.
+            while plant.now() < begin + 0.5 * settle + _COUNTED:
+                await visit.look()
+            stood = plant.now()
             visit.drop(visit.missing(states.TRACKING))
             taken.count += 1
             if not await light.shown(picture):
@@ -322,7 +328,7 @@ class CodedCycle(ABC):
                 continue
             if count == taken.needed // 2:
                 taken.standing = Standing.of(plant.field)
-            taken.still.append((begin + 0.5 * settle, picture.at, number))
+            taken.still.append((begin + 0.5 * settle, stood, number))
             taken.pictures.append((number, picture))
             if visit.astray:
                 taken.forget()
