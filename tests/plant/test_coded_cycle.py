@@ -92,6 +92,17 @@ def test_a_photograph_in_other_light_is_taken_again(monkeypatch: pytest.MonkeyPa
     assert aims == [0, 1, 2, 2, 3, 4, 5, 6, 7]
 
 
+def test_a_turn_begins_anew_in_light_that_has_changed_for_good(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A mirror of a small field has come: its light stays, and nothing else has changed."""
+    aims, left = photographed(
+        monkeypatch, ReceiverCycle, 2.0, brightness=lambda count: 1.0 if count < 4 else 1.17
+    )
+    assert aims[:5] == [0, 1, 2, 3, 3]
+    assert left == aims[5:] == [3, 4, 5, 6, 7, 0, 1, 2]
+
+
 def test_changing_light_ends_the_photographs_at_their_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -9,9 +9,10 @@
 from heliotrope.imaging.coded.beams import ExpectedBeam, SeparatedBeam, Verdict
 from heliotrope.imaging.coded.codes import coded_movements, photographs_for, shared_codes
 from heliotrope.imaging.coded.separation import Separation, separate
-from heliotrope.imaging.coded.stack import Stack
+from heliotrope.imaging.coded.stack import DARK, Stack
 
 __all__ = [
+    "DARK",
     "ExpectedBeam",
     "SeparatedBeam",
     "Separation",

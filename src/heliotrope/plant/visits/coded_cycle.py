@@ -24,7 +24,7 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.field.coded_visits import CodedSettings
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.coded import Verdict
+from heliotrope.imaging.coded import DARK, Verdict
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
@@ -72,22 +72,36 @@ class Light:
         The light without beams; None: the surface is never without.
     usual, steady
         Mean brightness of photographs, and its largest change as a share; None: it may be any.
+    other
+        Brightness of the last photograph if it was not as usual.
+    lasting
+        Whether the last two were alike in another light, but not in the dark of a cloud: beams
+        have come or left, and theirs is the usual light from then on.
     """
 
     view: FaceView | None = None
     empty: TargetLight | None = None
     usual: float | None = None
     steady: float = 0.0
+    other: float | None = None
+    lasting: bool = False
 
     async def shown(self, picture: Exposed) -> bool:
         """Return whether a photograph is as bright as usual; follow the sun."""
         if self.usual is None:
             return True
         level = (await picture.light).brightness
-        if not abs(level - self.usual) <= self.steady * self.usual:
-            return False
-        self.usual += _FOLLOW * (level - self.usual)
-        return True
+        as_usual, self.lasting = self._near(level, self.usual), False
+        if as_usual:
+            self.usual, self.other = self.usual + _FOLLOW * (level - self.usual), None
+        elif self.other is not None and level > DARK * self.usual and self._near(level, self.other):
+            self.usual, self.other, self.lasting = level, None, True
+        else:
+            self.other = level
+        return as_usual
+
+    def _near(self, level: float, before: float) -> bool:
+        return abs(level - before) <= self.steady * before
 
 
 @dataclass
@@ -293,8 +307,8 @@ class CodedCycle(ABC):
     ) -> None:
         """Take the photographs, until their number is at its limit for changes of the light.
 
-        When a beam leaves, a whole turn of the codes begins anew. A photograph in other light than
-        the usual is taken again.
+        When a beam leaves or the light has changed for good, a whole turn of the codes begins anew.
+        A photograph in other light than the usual is taken again.
         """
         plant, settle, spoiled = self._plant, self.settings.settle, False
         while len(taken.pictures) < taken.needed:
@@ -325,6 +339,8 @@ class CodedCycle(ABC):
             taken.count += 1
             if not await light.shown(picture):
                 spoiled = True
+                if light.lasting:
+                    taken.forget()
                 continue
             if count == taken.needed // 2:
                 taken.standing = Standing.of(plant.field)
