@@ -131,14 +131,18 @@ def test_ctl_looks(ctl: Callable[..., Any], console: LiveConsole) -> None:
 
 def test_ctl_commands(ctl: Callable[..., Any], console: LiveConsole) -> None:
     name = console.live.names[7]
+    stowed = ctl("operator", "stow", name, "--wait", "60")
+    assert stowed.exit_code == 0, stowed.output
+    assert console.until(lambda: console.live.operations.viewer.heliostat(name).state == "STOWED")
     given = ctl("operator", "command", "lock", name)
     assert given.exit_code == 0, given.output
     assert given.stdout == "LOCK: 1 done\n"
     assert console.call(lambda: console.live.operations.viewer.heliostat(name).state) == "LOCKED"
+    why = ctl("viewer", "why", name)
+    assert why.exit_code == 0, why.output
+    assert f"{name} is LOCKED" in why.stdout
+    assert "last order: LOCK by operator" in why.stdout
     assert ctl("operator", "command", "unlock", name).exit_code == 0
-    stowed = ctl("operator", "stow", name, "--wait", "60")
-    assert stowed.exit_code == 0, stowed.output
-    assert console.until(lambda: console.live.operations.viewer.heliostat(name).state == "STOWED")
 
 
 def test_ctl_says_what_a_proof_has_measured_and_what_it_believes(

@@ -282,6 +282,32 @@ def show(
 
 
 @app.command()
+def why(
+    context: typer.Context,
+    heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
+    as_json: Json = False,
+) -> None:
+    """Say why a heliostat tracks or does not, what is next, and what you can do."""
+    from urllib.parse import quote
+
+    with _client(context) as client:
+        answer = client.get(f"heliostats/{quote(heliostat, safe='')}/why")
+    if as_json:
+        print_json(answer)
+        return
+    print(answer["text"])
+    for title, line in (("next", answer["follows"]), ("you can", answer["remedy"])):
+        if line:
+            print(f"{title}: {line}")
+    if (order := answer["order"]) is not None:
+        print(
+            f"last order: {order['what']} by {order['who']} at {_utc(order['at'])}, {order['text']}"
+        )
+    for alarm in answer["alarms"]:
+        print(f"{alarm['severity']}: {alarm['text']}")
+
+
+@app.command()
 def stow(
     context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 0.0
 ) -> None:

@@ -71,7 +71,7 @@ from heliotrope.plant.field.witnesses import Witnesses
 from heliotrope.plant.motion.paths import Paths
 from heliotrope.plant.motion.proofs import BeamError, PathProofs
 from heliotrope.plant.motion.watch import BeamWatch
-from heliotrope.plant.orders.audit import Audit
+from heliotrope.plant.orders.audit import Audit, Record
 from heliotrope.plant.orders.authority import Authority, Grant, Person, Role
 from heliotrope.plant.orders.commands import Commands
 from heliotrope.plant.orders.dispatch import JoinDispatcher
@@ -558,6 +558,10 @@ class PlantController:
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
         held = self.guards.reasons(Asked("UNLOCK", (heliostat,)), NOT_NOW)
         return self.locks.reason(heliostat, visit, held.get(heliostat, ""))
+
+    def last_order(self, heliostat: str) -> tuple[Record, Ticket] | None:
+        """Return the last command to a heliostat since the start, with its progress."""
+        return self._orders.last.get(heliostat)
 
     def waits_to_stow(self, heliostat: str) -> bool:
         """Return whether a heliostat waits for its turn to go to stow."""

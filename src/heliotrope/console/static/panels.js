@@ -81,8 +81,8 @@ export function heliostat(box) {
       return;
     }
     const name = encodeURIComponent(store.field.names[store.focus]);
-    const [one, kept] = await Promise.all([api("GET", `heliostats/${name}`), api("GET", `photographs?heliostat=${name}&limit=40`)]);
-    body.replaceChildren(...heliostatView(one), ...keptView(kept, one.history));
+    const [one, why, kept] = await Promise.all([api("GET", `heliostats/${name}`), api("GET", `heliostats/${name}/why`), api("GET", `photographs?heliostat=${name}&limit=40`)]);
+    body.replaceChildren(...heliostatView(one, why), ...keptView(kept, one.history));
     const canvas = body.querySelector("canvas");
     if (canvas && one.history.length) chart(canvas, [
       { points: one.history.map((s) => [s.at, 1e3 * s.error]), colour: colourOf("APPROACHING"), dots: true },
@@ -93,10 +93,30 @@ export function heliostat(box) {
   return () => off.forEach((end) => end());
 }
 
-function heliostatView(one) {
+// What the button of an explanation does, and its title.
+const ACTS = {
+  automatic: ["Give to automatic control", (name) => api("POST", "automatic", { heliostats: [name] })],
+  unlock: ["Unlock", (name) => api("POST", "commands", { command: "UNLOCK", heliostats: [name] })],
+  clear_fault: ["Clear fault", (name) => api("POST", "commands", { command: "CLEAR_FAULT", heliostats: [name] })],
+  return_lock: ["Return your lock", (name) => api("POST", "holds/release", { heliostats: [name] })],
+  resume: ["Resume", () => api("POST", "automatic/resume")],
+  withdraw: ["Withdraw your emergency order", () => api("DELETE", "emergency")],
+};
+
+function whyView(why) {
+  const [title, does] = ACTS[why.button] ?? [];
+  return h("section", { className: `hx-why ${why.tracks ? "" : "off"}` }, h("p", {}, h("b", {}, why.text)),
+    why.follows ? h("p", {}, why.follows) : "",
+    why.remedy || title ? h("p", {}, `${why.remedy} `, title && canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => does(why.heliostat), title) }, title) : "") : "",
+    why.order ? h("p", { className: "hx-hint" }, `Last order: ${why.order.what} by ${why.order.who} at ${clock(why.order.at)} UTC, ${why.order.text}.`) : "",
+    ...why.alarms.map((a) => h("p", { className: severe[a.severity] ?? "" }, a.text)));
+}
+
+function heliostatView(one, why) {
   const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none" : p.map((v) => number(v, 1)).join(", "));
   return [
     h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
+    whyView(why),
     canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: "Automatic control calibrates it as soon as a target is free",
       onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name }), `calibrate ${one.name}`) }, "Calibrate now"),
     h("button", { className: "hx-button", title: "Automatic control searches its beam on a target until the camera sees it move with its aim; nothing is changed",

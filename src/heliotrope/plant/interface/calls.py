@@ -208,6 +208,15 @@ def heliostat(desk: Desk, order: orders.Named) -> views.HeliostatView:
     return desk.operations.viewer.heliostat(order.name)
 
 
+@_call("GET heliostats/{name}/why", "field")
+def why(desk: Desk, order: orders.Named) -> views.Explanation:
+    """Return why a heliostat tracks or does not, what happens next, and what a person can do.
+
+    `order`: the last command to it, by whom and when; `button`: the command that `remedy` means.
+    """
+    return desk.operations.why(order.name)
+
+
 @_call("GET clusters", "field", fresh=FRESH)
 def clusters(desk: Desk) -> tuple[views.ClusterRow, ...]:
     """Return the health of each cluster."""

@@ -37,7 +37,7 @@ from heliotrope.plant.operations.movement_checks import MovementChecks
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.timetable import Timetable
-from heliotrope.plant.operations.views import CalibrationView
+from heliotrope.plant.operations.views import CalibrationView, Running
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
@@ -386,10 +386,18 @@ class AutomaticControl:
         """Return how far calibrations are that persons asked for at a time, POSIX s."""
         return {name: self._calibration_step(name, since) for name in heliostats}
 
+    def wants(self, heliostat: str) -> bool:
+        """Return whether a heliostat is given to automatic control."""
+        return bool(self._raising.wanted[self._plant.field.place(heliostat)])
+
+    def visit_of(self, heliostat: str) -> Running | None:
+        """Return the visit of a heliostat that is under way, None if there is none."""
+        running = () if self._calibrating is None else self._calibrating.running.values()
+        return next((one for one in running if heliostat in one.heliostats), None)
+
     def _calibration_step(self, name: str, since: float) -> Step:
         assert self._calibrating is not None
-        running = self._calibrating.running.values()
-        run = next((one for one in running if name in one.heliostats), None)
+        run = self.visit_of(name)
         if name in self._calibrating.asked:
             return Step(f"it waits: {self._why_waiting(name, run is not None)}")
         if run is not None:

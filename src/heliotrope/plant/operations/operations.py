@@ -32,6 +32,7 @@ from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.field.lockouts import TOWER
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.errands import Errands
+from heliotrope.plant.operations.explaining import explain
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
@@ -40,6 +41,7 @@ from heliotrope.plant.operations.typed_parameters import TypedParameters
 from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
     CameraView,
+    Explanation,
     Summary,
     SunView,
 )
@@ -210,6 +212,17 @@ class Operations:
             float(extra.pop("pace", 1.0)),
             extra,
         )
+
+    def why(self, heliostat: str) -> Explanation:
+        """Explain why a heliostat tracks or does not; see `Explanation`.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such heliostat.
+        """
+        on = self.viewer.aim_names[int(self.viewer.frame().on[self.plant.field.place(heliostat)])]
+        return explain(self.plant, self.automatic, self.logbook, heliostat, on)
 
     # -- light -----------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -304,6 +305,58 @@ class BusFrame:
     size: int
     signed: bool
     text: str
+
+
+class Button(StrEnum):
+    """What a person can do at once about a heliostat that does not track."""
+
+    NONE = ""
+    AUTOMATIC = "automatic"
+    UNLOCK = "unlock"
+    CLEAR_FAULT = "clear_fault"
+    RETURN_LOCK = "return_lock"
+    RESUME = "resume"
+    WITHDRAW = "withdraw"
+
+
+@dataclass(frozen=True)
+class LastOrder:
+    """The last command to a heliostat: POSIX s, person or part of the plant, name, and result."""
+
+    at: float
+    who: str
+    what: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why one heliostat tracks, or does not.
+
+    Attributes
+    ----------
+    heliostat, tracks
+        Its name, and whether its beam is on a receiver.
+    text
+        What it does and why: one sentence.
+    follows, remedy
+        What happens next by itself, and what a person can do.
+    button
+        The command that does this.
+    order
+        The last command to it since the start; None: there was none.
+    alarms
+        What is reported about it now.
+    """
+
+    heliostat: str
+    tracks: bool
+    text: str
+    follows: str
+    remedy: str
+    button: Button
+    order: LastOrder | None
+    alarms: tuple[AlarmRow, ...]
 
 
 @dataclass(frozen=True)

@@ -119,6 +119,8 @@ class PlantOrders(Part):
         Why it cannot write, "" if it can.
     latest
         Ticket of the last command; None before the first.
+    last
+        Record and ticket of the last command to each heliostat, by name, since the start.
     """
 
     def __init__(
@@ -139,6 +141,7 @@ class PlantOrders(Part):
         self._number = self._messages = 0
         self._open: dict[str, Ticket] = {}
         self.latest: Ticket | None = None
+        self.last: dict[str, tuple[Record, Ticket]] = {}
         self._under: dict[str, _Under] = {}
         #: What clusters refused because their token was not the present one.
         self._again: list[tuple[_Under, tuple[str, ...]]] = []
@@ -209,6 +212,7 @@ class PlantOrders(Part):
         else:
             self._record(ticket, entry, store)
         self._open[identity] = self.latest = ticket
+        self.last.update(dict.fromkeys(heliostats, (entry, ticket)))
         return ticket
 
     def _record(self, ticket: Ticket, entry: Record, store: tuple[Work, Work] | None) -> None:

@@ -1,0 +1,152 @@
+"""Why one heliostat tracks or does not, what happens next, and what a person can do about it."""
+
+from datetime import UTC, datetime
+
+from heliotrope.errors import once
+from heliotrope.lcu import states
+from heliotrope.links.messages import Stage
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.field.state import HeliostatState
+from heliotrope.plant.operations.automatic import AutomaticControl
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.views import Button, Explanation, LastOrder
+from heliotrope.store.records import Kind
+
+#: Reason, what follows by itself, what a person can do, and the command that does it.
+_Case = tuple[str, str, str, Button]
+
+
+def explain(
+    plant: PlantController, automatic: AutomaticControl, logbook: Logbook, name: str, on: str
+) -> Explanation:
+    """Explain one heliostat.
+
+    Parameters
+    ----------
+    plant, automatic, logbook
+        The plant at work.
+    name
+        Heliostat.
+    on
+        Receiver or target that it aims at, "" for none.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such heliostat.
+    """
+    shown = plant.field.of(name, plant.now())
+    tracks = (
+        shown.live
+        and shown.state == "TRACKING"
+        and on in {receiver.name for receiver in plant.design.receivers}
+    )
+    why, follows, remedy, button = _case(plant, automatic, shown, tracks=tracks)
+    alarms = tuple(row for row in logbook.alarms() if row.subject == name and row.active)
+    if alarms and not remedy:
+        remedy = "See its alarm."
+    where = f" on {on}" if on and shown.live else ""
+    text = once(f"{name} is {shown.condition}{where}{why and f': {why}'}")
+    order = _last_order(plant, name)
+    return Explanation(name, tracks, text, follows, remedy, button, order, alarms)
+
+
+def _case(
+    plant: PlantController,
+    automatic: AutomaticControl,
+    shown: HeliostatState,
+    *,
+    tracks: bool,
+) -> _Case:
+    """Return the first reason that holds, of those that go before all others."""
+    name = shown.name
+    if held := plant.lockouts.text(Kind.HELIOSTAT, name):
+        return (
+            f"it is out of service: {held}",
+            "Nobody moves it until each owner has returned their lock.",
+            "When nobody is at it any more, return the lock, then give it to automatic control.",
+            Button.RETURN_LOCK,
+        )
+    if not shown.live:
+        return (
+            f"its cluster {shown.cluster} has not heard it, or is not heard itself",
+            "The cluster asks again and again; a board without messages turns away by itself.",
+            f"Check cluster {shown.cluster} (tab Clusters), the supply and the bus of the board.",
+            Button.NONE,
+        )
+    if plant.sentinel.on:
+        causes = "; ".join(f"{who}: {text}" for who, text in plant.sentinel.causes().items())
+        return (
+            f"an emergency holds ({causes})",
+            "It stays away from the receiver; after the emergency, nothing moves by itself.",
+            "When the cause has gone: withdraw the order, acknowledge its alarms, press Automatic.",
+            Button.WITHDRAW if plant.sentinel.calls else Button.NONE,
+        )
+    if shown.state == "LOCKED":
+        button = Button.NONE if name in plant.authority.visited() else Button.UNLOCK
+        return plant.locked_for(name), "It does not move while it is locked.", "", button
+    if shown.state == "FAULT":
+        return (
+            f"its board has found a fault: {shown.fault}",
+            "It does not move until the fault is cleared.",
+            "Find the cause at the mirror, then clear the fault.",
+            Button.CLEAR_FAULT,
+        )
+    if (run := automatic.visit_of(name)) is not None:
+        follows = "It comes back to the receiver when the visit has ended."
+        return f"it is calibrated at {run.target}: {run.stage}", follows, "", Button.NONE
+    return _automatic_case(plant, automatic, name, tracks=tracks)
+
+
+def _automatic_case(
+    plant: PlantController, automatic: AutomaticControl, name: str, *, tracks: bool
+) -> _Case:
+    """Return why automatic control does not bring a heliostat to the receiver, or what is next."""
+    planned = next((visit for visit in automatic.plan(50) if visit.heliostat == name), None)
+    follows = ""
+    if planned is not None:
+        at = datetime.fromtimestamp(planned.at, UTC)
+        follows = f"Its next measurement is planned for {at:%H:%M} UTC on {planned.target}."
+    if tracks:
+        return "", follows, "", Button.NONE
+    if not automatic.wants(name):
+        return (
+            "it is not given to automatic control",
+            "It stays as it is, and is stowed before the night only by a person.",
+            "Give it to automatic control, or command it yourself.",
+            Button.AUTOMATIC,
+        )
+    if automatic.waits:
+        return (
+            automatic.waits,
+            "Automatic control raises nothing until a person presses Resume.",
+            "Make sure that nobody is in the field, then resume.",
+            Button.RESUME,
+        )
+    step = automatic.following(-float("inf"), (name,))[name]
+    tried = next((retry for retry in automatic.retries() if retry.subject == name), None)
+    if tried is not None:
+        again = "at the next occasion" if tried.left == 0.0 else f"in {tried.left:.0f} s"
+        again = "not by itself" if tried.left == float("inf") else again
+        follows = (
+            f"{tried.work}: {tried.count} of {tried.most} tries have failed ({tried.reason}); the "
+            f"next is {again}; after the last, {tried.following}."
+        )
+    if not follows and step.stage is not Stage.FAILED:
+        follows = "It goes on by itself."
+    state = plant.field.rows["state"][plant.field.place(name)]
+    remedy = "Store its parameters." if state == states.UNCONFIGURED else ""
+    return step.text, follows, remedy, Button.NONE
+
+
+def _last_order(plant: PlantController, name: str) -> LastOrder | None:
+    found = plant.last_order(name)
+    if found is None:
+        return None
+    record, ticket = found
+    stage = ticket.stage(name)
+    text = ticket.refusals.get(name, "") or ticket.steps.get(name, "")
+    result = "waiting in the plant" if stage is None else stage.value
+    at = datetime.fromisoformat(record.at).timestamp()
+    note = f" ({record.note})" if record.note else ""
+    return LastOrder(at, record.who, f"{record.what}{note}", f"{result}{text and f': {text}'}")

@@ -1,0 +1,110 @@
+"""One heliostat explained: why it tracks or does not, what is next, and what a person can do."""
+
+import asyncio
+
+import pytest
+
+from heliotrope.errors import UnknownNameError
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.views import Button
+from heliotrope.plant.orders.authority import Person, Role
+from support.live import LivePlant, live
+
+ENGINEER, OPERATOR = Person("Egon", Role.ENGINEER), Person("Olga", Role.OPERATOR)
+
+
+def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() -> None:
+    async def work(plant: LivePlant) -> None:
+        shown, (name, other, *_) = plant.operations, plant.operations.names
+        shown.give_back(OPERATOR, (name,))
+        first = shown.why(other)
+        assert not first.tracks
+        assert first.text == f"{other} is STOWED: it is not given to automatic control"
+        assert (first.button, first.order) == (Button.AUTOMATIC, None)
+        await asyncio.sleep(20.0)
+        assert (
+            shown.why(name).text == f"{name} is APPROACHING: automatic control has it: APPROACHING"
+        )
+        await asyncio.sleep(180.0)
+        up = shown.why(name)
+        assert up.tracks
+        assert (up.text, up.button) == (f"{name} is TRACKING on receiver", Button.NONE)
+        assert up.order is not None
+        assert (up.order.who, up.order.what) == ("automatic control", "TRACK")
+        assert up.order.text == "done"
+
+        token = shown.take_authority(OPERATOR).token
+        shown.command(OPERATOR, token, "LOCK", (name,))
+        await asyncio.sleep(5.0)
+        locked = shown.why(name)
+        assert locked.text.startswith(f"{name} is LOCKED: "), locked.text
+        assert locked.button is Button.UNLOCK
+        assert locked.order is not None
+        assert (locked.order.who, locked.order.what) == ("Olga", "LOCK")
+        shown.command(OPERATOR, token, "UNLOCK", (name,))
+        await asyncio.sleep(5.0)
+        taken = shown.why(name)
+        assert taken.button is Button.AUTOMATIC, "a person who locks it has taken it"
+
+        shown.give_back(OPERATOR, (name,))
+        held = shown.why(name)
+        assert "moves nothing: Olga has the command authority" in held.text, held.text
+        shown.hold(OPERATOR, (name,), "washing")
+        out = shown.why(name)
+        assert "it is out of service: washing (Olga" in out.text
+        assert out.button is Button.RETURN_LOCK
+        shown.unhold(OPERATOR, (name,))
+
+        shown.emergency(OPERATOR, reason="smoke")
+        await asyncio.sleep(2.0)
+        emergency = shown.why(name)
+        assert "an emergency holds (Olga: smoke)" in emergency.text, emergency.text
+        assert emergency.button is Button.WITHDRAW
+        shown.withdraw(OPERATOR)
+        assert shown.why(name).button is Button.NONE, "somebody has to acknowledge"
+        await asyncio.sleep(3.0)
+        shown.acknowledge(OPERATOR, "operator_emergency")
+        await asyncio.sleep(3.0)
+
+        plant.links["C1"].plugged = False
+        await asyncio.sleep(15.0)
+        silent = shown.why(name)
+        assert silent.text.startswith(f"{name} is not heard for "), silent.text
+        assert "its cluster C1 has not heard it" in silent.text
+        with pytest.raises(UnknownNameError):
+            shown.why("nobody")
+
+    live(work, AutomaticSettings(calibrate=False))
+
+
+def test_a_field_that_waits_for_a_person_says_so() -> None:
+    async def work(plant: LivePlant) -> None:
+        shown, name = plant.operations, plant.operations.names[-1]
+        await asyncio.sleep(200.0)
+        plant.links["C2"].plugged = False
+        await asyncio.sleep(20.0)
+        plant.links["C2"].plugged = True
+        await asyncio.sleep(120.0)
+        why = shown.why(name)
+        assert "left the receiver without an order" in why.text
+        assert why.button is Button.RESUME
+        shown.resume(OPERATOR)
+        await asyncio.sleep(10.0)
+        assert shown.why(name).button is Button.NONE
+
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0), count=8)
+
+
+def test_work_that_is_tried_again_is_shown_with_its_end() -> None:
+    async def work(plant: LivePlant) -> None:
+        shown, name = plant.operations, plant.operations.names[-1]
+        await asyncio.sleep(200.0)
+        plant.links["C2"].plugged = False
+        await asyncio.sleep(20.0)
+        plant.links["C2"].plugged = True
+        await asyncio.sleep(10.0)
+        why = shown.why(name)
+        assert "1 of 5 tries have failed (left the receiver without an order)" in why.follows, why
+        assert why.button is Button.NONE
+
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
