@@ -12,6 +12,7 @@ from heliotrope.cli._common import (
     parse_duration,
     parse_numbers,
     parse_point,
+    parse_time,
     print_json,
     print_table,
 )
@@ -305,6 +306,39 @@ def why(
         )
     for alarm in answer["alarms"]:
         print(f"{alarm['severity']}: {alarm['text']}")
+
+
+@app.command()
+def journal(
+    context: typer.Context,
+    since: Annotated[str, typer.Option(help="From this time, ISO 8601.", show_default=False)] = "",
+    until: Annotated[str, typer.Option(help="Before this time.", show_default=False)] = "",
+    kind: Annotated[str, typer.Option(help="event, alarm or command.", show_default=False)] = "",
+    who: Annotated[str, typer.Option(help="Person.", show_default=False)] = "",
+    heliostat: Annotated[str, typer.Option(help="Heliostat.", show_default=False)] = "",
+    text: Annotated[str, typer.Option(help="Text in it, in any case.", show_default=False)] = "",
+    limit: Annotated[int, typer.Option(min=1, max=2000, help="Most entries.")] = 200,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+) -> None:
+    """Print events, alarms and commands of all days, the latest first."""
+    import csv
+    import sys
+    from urllib.parse import urlencode
+
+    query = {"kind": kind, "who": who, "heliostat": heliostat, "text": text, "limit": limit}
+    for name, moment in (("since", since), ("until", until)):
+        if moment:
+            query[name] = f"{parse_time(moment).timestamp():.3f}"
+    with _client(context) as client:
+        found = client.get(f"journal?{urlencode(query)}")
+    rows = [(_utc(one["at"]), one["kind"], one["what"], one["text"]) for one in found]
+    if as_csv:
+        csv.writer(sys.stdout).writerows((("time", "kind", "what", "text"), *rows))
+        return
+    for row in rows:
+        print("  ".join(row))
+    if not rows:
+        print("nothing is found")
 
 
 @app.command()

@@ -20,7 +20,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.safety import Alarm, Severity
 from heliotrope.store import _rows as rows
-from heliotrope.store import chain, tables
+from heliotrope.store import chain, journal, tables
 from heliotrope.store.database import Database, make_private
 from heliotrope.store.people import People
 from heliotrope.store.records import (
@@ -30,6 +30,8 @@ from heliotrope.store.records import (
     Event,
     Fact,
     FlightEntry,
+    JournalEntry,
+    JournalQuery,
     KeptSightings,
     LearningEntry,
     Lockout,
@@ -396,6 +398,11 @@ class Keeper:
         if standing:
             query = query.where(a.cleared.is_(None) | a.acknowledged.is_(None))
         return self._records(AlarmEntry, query)
+
+    def journal(self, query: JournalQuery) -> list[JournalEntry]:
+        """Return events, alarms and commands that a query asks for, the latest first."""
+        with self.database.reading() as connection:
+            return journal.search(connection, query)
 
     def forget_events(self, before: float) -> None:
         """Remove events and predictions up to a time, and alarms over and acknowledged by then."""

@@ -410,6 +410,56 @@ class AuditEntry:
     finished: str = ""
 
 
+@dataclass(frozen=True)
+class JournalQuery:
+    """What is looked for in the journal.
+
+    Attributes
+    ----------
+    since, until
+        Times, POSIX s; the later one is excluded.
+    kind
+        "event", "alarm" or "command"; "" for all.
+    who, heliostat, text
+        Person, heliostat, and a text in any case; "" for any.
+    limit
+        Most entries.
+    """
+
+    since: float = 0.0
+    until: float = 1e11
+    kind: str = ""
+    who: str = ""
+    heliostat: str = ""
+    text: str = ""
+    limit: int = 200
+
+
+@dataclass(frozen=True)
+class JournalEntry:
+    """One entry of the journal.
+
+    Attributes
+    ----------
+    at
+        POSIX s.
+    kind
+        "event", "alarm" or "command".
+    what
+        Source of an event, condition of an alarm, name of a command.
+    text
+        One line.
+    severity
+        "" for a command.
+    """
+
+    at: float
+    kind: str
+    what: str
+    text: str
+    severity: str = ""
+
+
 #: A record that is one row of its own table.
 Fact = VisitEntry | CampaignEntry | FlightEntry | LearningEntry | TimetableRecord | Outlook
 
@@ -582,6 +632,10 @@ class Records(Protocol):
 
     def alarms(self, limit: int = 100, *, standing: bool = False) -> list[AlarmEntry]:
         """Return alarms, the latest first; with standing, without those over and acknowledged."""
+        ...
+
+    def journal(self, query: JournalQuery) -> list[JournalEntry]:
+        """Return events, alarms and commands that a query asks for, the latest first."""
         ...
 
     def close(self) -> None:

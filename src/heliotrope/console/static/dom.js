@@ -19,6 +19,12 @@ export const mrad = (value, digits = 2) => (known(value) ? (1e3 * value).toFixed
 export const degrees = (value, digits = 2) => (known(value) ? ((value * 180) / Math.PI).toFixed(digits) : "–");
 export const count = (value) => (known(value) ? value.toLocaleString("en") : "–");
 export const clock = (at) => (known(at) && at > 0 ? new Date(1e3 * at).toISOString().slice(11, 19) : "–");
+// With its day, unless that is the plant's present day.
+export function moment(at) {
+  if (!known(at) || at <= 0) return "–";
+  const text = new Date(1e3 * at).toISOString(), today = store.head?.at.slice(0, 10);
+  return text.slice(0, 10) === today ? text.slice(11, 19) : `${text.slice(0, 10)} ${text.slice(11, 19)}`;
+}
 export function span(seconds) {
   if (!known(seconds)) return "never";
   if (seconds < 120) return `${Math.max(0, seconds).toFixed(0)} s`;
@@ -32,6 +38,15 @@ export function table(columns, rows, act) {
     onkeydown: (event) => { if (event.key === "Enter") act(row); } } : {},
     columns.map(([, show, kind]) => { const cell = show(row); return h("td", { className: kind ?? "" }, cell ?? ""); })));
   return h("div", { className: "hx-scroll" }, h("table", { className: "hx-table" }, h("thead", {}, head), h("tbody", {}, body)));
+}
+
+// Saves rows as a file of comma-separated values.
+export function saveCsv(name, titles, rows) {
+  const cell = (value) => (/[",\n]/.test(String(value ?? "")) ? `"${String(value).replaceAll('"', '""')}"` : String(value ?? ""));
+  const text = [titles, ...rows].map((row) => row.map(cell).join(",")).join("\n");
+  const link = h("a", { href: URL.createObjectURL(new Blob([`${text}\n`], { type: "text/csv" })), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
 export function facts(pairs) {

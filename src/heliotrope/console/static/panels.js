@@ -1,7 +1,7 @@
 // The tabs of the page.
 import { api, me, store } from "./live.js";
 import { cividis, colourOf, dark } from "./palette.js";
-import { ask, chart, clock, count, degrees, facts, h, mrad, number, refreshed, span, table } from "./dom.js";
+import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, span, table } from "./dom.js";
 import { act } from "./orders.js";
 import { markCorners } from "./marking.js";
 
@@ -333,15 +333,17 @@ export function alarms(box) {
 
 export function logs(box) {
   let which = "events", filter = "";
-  const body = h("div"), tabs = ["events", "packets", "commands"].map((name) => h("button", { className: "hx-button", onclick: () => { which = name; mark(); load(); } }, name));
+  const body = h("div"), past = journal(), tabs = ["events", "journal", "packets", "commands"].map((name) => h("button", { className: "hx-button", onclick: () => { which = name; mark(); load(); } }, name));
   const find = h("input", { type: "search", placeholder: "filter", oninput: () => { filter = find.value.toLowerCase(); load(); } });
   const mark = () => tabs.forEach((tab) => tab.classList.toggle("main", tab.textContent === which));
   const columns = {
-    events: [["Time", (r) => clock(r.at)], ["Kind", (r) => r.kind], ["Who", (r) => r.who], ["", (r) => r.text]],
+    events: [["Time", (r) => moment(r.at)], ["Kind", (r) => r.kind], ["Who", (r) => r.who], ["", (r) => r.text]],
     packets: [["Time", (r) => clock(r.at)], ["Cluster", (r) => `${r.way === "to" ? "→" : "←"} ${r.cluster}`], ["Kind", (r) => r.kind], ["Bytes", (r) => r.size, "num"], ["", (r) => h("code", {}, r.text)]],
     commands: [["Command", (r) => r.command], ["Heliostats", (r) => count(r.heliostats), "num"], ["", (r) => h("span", { className: r.finished ? (r.good ? "good" : "warn") : "" }, r.text)]],
   };
   const load = async () => {
+    find.hidden = which === "journal";
+    if (which === "journal") { if (!body.contains(past)) body.replaceChildren(past); return; }
     const rows = await api("GET", which === "commands" ? which : `${which}?limit=300`);
     const text = (r) => Object.values(r).join(" ").toLowerCase();
     body.replaceChildren(table(columns[which], filter ? rows.filter((r) => text(r).includes(filter)) : rows));
@@ -349,6 +351,29 @@ export function logs(box) {
   box.append(h("div", { className: "hx-row" }, tabs, find), body);
   mark();
   return refreshed(load, { key: () => store.head?.events, every: 3 });
+}
+
+// Events, alarms and commands of all days, from the store.
+function journal() {
+  const day = (back) => new Date(1e3 * (store.head.utc - 86400 * back)).toISOString().slice(0, 10);
+  const field = (label, given) => { const input = h("input", given); return [h("label", { className: "hx-field" }, label, input), input]; };
+  const [fromLabel, from] = field("From", { type: "date", value: day(1) }), [toLabel, to] = field("To", { type: "date", value: day(0) });
+  const [whoLabel, who] = field("Person", { type: "search", maxLength: 64 }), [nameLabel, name] = field("Heliostat", { type: "search", maxLength: 64 });
+  const [textLabel, text] = field("Text", { type: "search", maxLength: 100 });
+  const kind = h("select", { ariaLabel: "Kind" }, ["all kinds", "event", "alarm", "command"].map((one) => h("option", { value: one === "all kinds" ? "" : one }, one)));
+  const found = h("div"), said = h("p", { className: "hx-hint" }, "Events, alarms and commands of all days, over restarts."), most = 1000;
+  let rows = [];
+  const search = async () => {
+    const seconds = (date, more) => (date ? { [more ? "until" : "since"]: Date.parse(`${date}T00:00:00Z`) / 1e3 + (more ? 86400 : 0) } : {});
+    const query = new URLSearchParams({ ...seconds(from.value, false), ...seconds(to.value, true), kind: kind.value, who: who.value.trim(), heliostat: name.value.trim(), text: text.value.trim(), limit: most });
+    rows = await api("GET", `journal?${query}`);
+    said.textContent = rows.length === most ? `The latest ${count(most)}; choose fewer days or a text.` : `${count(rows.length)} entries.`;
+    found.replaceChildren(table([["Time (UTC)", (r) => moment(r.at)], ["Kind", (r) => h("span", { className: severe[r.severity] ?? "" }, r.kind)], ["What", (r) => r.what], ["", (r) => r.text]], rows));
+  };
+  const form = h("form", { className: "hx-row hx-search", onsubmit: (event) => { event.preventDefault(); act(search, "journal", false); } },
+    fromLabel, toLabel, kind, whoLabel, nameLabel, textLabel, h("button", { className: "hx-button main" }, "Search"),
+    h("button", { className: "hx-button", type: "button", onclick: () => saveCsv("journal.csv", ["time", "kind", "what", "text"], rows.map((r) => [new Date(1e3 * r.at).toISOString(), r.kind, r.what, r.text])) }, "Save as CSV"));
+  return h("div", {}, form, said, found);
 }
 
 const minute = (at) => (at ? new Date(1e3 * at).toISOString().slice(5, 16).replace("T", " ") : "–");

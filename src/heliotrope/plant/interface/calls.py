@@ -35,7 +35,7 @@ from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.zero import lock_position, zero
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.orders.tickets import Ticket
-from heliotrope.store.records import Lockout, PlannedVisit
+from heliotrope.store.records import JournalEntry, JournalQuery, Lockout, PlannedVisit
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
@@ -280,6 +280,15 @@ def acknowledge(desk: Desk, who: Person, order: orders.Acknowledged) -> None:
 def events(desk: Desk, order: orders.Some) -> tuple[views.EventRow, ...]:
     """Return the last events, newest first."""
     return desk.operations.logbook.events(order.limit)
+
+
+@_call("GET journal", "logs")
+async def journal(desk: Desk, order: orders.Journal) -> tuple[JournalEntry, ...]:
+    """Return events, alarms and commands of all days from the store, the latest first.
+
+    `since` and `until` are POSIX seconds; `kind` is `event`, `alarm` or `command`.
+    """
+    return tuple(await desk.operations.journal(JournalQuery(**order.model_dump())))
 
 
 @_call("GET packets", "logs", fresh=FRESH)

@@ -3,7 +3,7 @@
 Lists of points travel as names in the arguments and coordinates in the blob; see `points_of`.
 """
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -86,6 +86,20 @@ class Some(Strict):
     """The last ones, at most this many."""
 
     limit: Limit = 200
+
+
+Moment = Annotated[float, Field(ge=0, le=1e11, allow_inf_nan=False, description="POSIX s.")]
+
+
+class Journal(Some):
+    """Entries of the journal: of a time, kind, person and heliostat, with a text."""
+
+    since: Moment = 0.0
+    until: Moment = 1e11
+    kind: Literal["", "event", "alarm", "command"] = ""
+    who: Annotated[str, Field(max_length=64)] = ""
+    heliostat: Annotated[str, Field(max_length=64)] = ""
+    text: Annotated[str, Field(max_length=100)] = ""
 
 
 class SomePackets(Some):

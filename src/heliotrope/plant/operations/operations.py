@@ -49,7 +49,7 @@ from heliotrope.plant.orders.authority import Grant, Person, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import Act
-from heliotrope.store.records import Kind, Records
+from heliotrope.store.records import JournalEntry, JournalQuery, Kind, Records
 
 #: Commands that take heliostats from automatic control, and that give them to it.
 _TAKES_FROM_AUTOMATIC = messages.having("manual")
@@ -132,6 +132,7 @@ class Operations:
         self.security = SecurityLog(logbook, plant.clock)
         self.viewer = Viewer(plant, self.automatic)
         self.parameters = TypedParameters(plant, logbook, records)
+        self._records = records
         self._flux: dict[str, _Cached] = {}
         self._closing = asyncio.Event()
 
@@ -223,6 +224,19 @@ class Operations:
         """
         on = self.viewer.aim_names[int(self.viewer.frame().on[self.plant.field.place(heliostat)])]
         return explain(self.plant, self.automatic, self.logbook, heliostat, on)
+
+    async def journal(self, query: JournalQuery) -> list[JournalEntry]:
+        """Return events, alarms and commands of all days, the latest first.
+
+        Raises
+        ------
+        InputError
+            If the plant keeps no records.
+        """
+        if self._records is None:
+            raise InputError("journal: this plant keeps no records; run it with a data folder")
+        await self._records.confirm()
+        return await asyncio.to_thread(self._records.journal, query)
 
     # -- light -----------------------------------------------------------------------------
 

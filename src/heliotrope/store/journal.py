@@ -1,0 +1,109 @@
+"""The journal: events, alarms and commands of the store in one list, searched."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, String, cast, or_, select
+
+from heliotrope.store import _rows as rows
+from heliotrope.store import tables
+from heliotrope.store.records import AlarmEntry, AuditEntry, Event, JournalEntry, JournalQuery
+
+_EVENT, _ALARM, _AUDIT = tables.event.c, tables.alarm.c, tables.audit.c
+#: Heliostats of a command that are named; of more, their number is.
+_NAMED = 5
+
+
+def search(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
+    """Return the entries that a query asks for, the latest first."""
+    parts = {"event": _events, "alarm": _alarms, "command": _commands}
+    kinds = [query.kind] if query.kind else parts
+    found = [entry for kind in kinds for entry in parts[kind](connection, query)]
+    return sorted(found, key=lambda entry: -entry.at)[: query.limit]
+
+
+def _within(column: ColumnElement[Any], query: JournalQuery, *, text: bool = False) -> Any:
+    """Return the condition on a time, POSIX s or (``text``) as ISO 8601."""
+    since, until = (
+        datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds") if text else at
+        for at in (query.since, query.until)
+    )
+    return [column >= since, column < until]
+
+
+def _has(text: str, *columns: ColumnElement[Any]) -> list[Any]:
+    """Return the condition that one of some columns contains a text, in any case."""
+    return [or_(*(column.icontains(text, autoescape=True) for column in columns))] if text else []
+
+
+def _events(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
+    # An event of a person, or about a heliostat, begins with the name.
+    by = [_EVENT.text.istartswith(f"{query.who}: ", autoescape=True)] if query.who else []
+    about = _has(query.heliostat, _EVENT.heliostat, _EVENT.text)
+    wanted = select(tables.event).where(
+        *_within(_EVENT.at, query), *by, *about, *_has(query.text, _EVENT.text, _EVENT.source)
+    )
+    found = rows.records(
+        connection, Event, wanted.order_by(_EVENT.number.desc()).limit(query.limit)
+    )
+    return [
+        JournalEntry(one.at, "event", one.source, one.text, one.severity.value) for one in found
+    ]
+
+
+def _alarms(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
+    by = [_ALARM.acknowledged_by == query.who] if query.who else []
+    about = _has(query.heliostat, _ALARM.subject)
+    wanted = select(tables.alarm).where(
+        *_within(_ALARM.raised, query),
+        *by,
+        *about,
+        *_has(query.text, _ALARM.text, _ALARM.condition),
+    )
+    found = rows.records(
+        connection, AlarmEntry, wanted.order_by(_ALARM.number.desc()).limit(query.limit)
+    )
+    return [
+        JournalEntry(one.raised, "alarm", one.condition, _alarm_text(one), one.severity.value)
+        for one in found
+    ]
+
+
+def _alarm_text(alarm: AlarmEntry) -> str:
+    ends = "" if alarm.cleared is None else f"; over at {_clock(alarm.cleared)}"
+    if alarm.acknowledged is not None:
+        ends += f"; acknowledged by {alarm.acknowledged_by} at {_clock(alarm.acknowledged)}"
+    return f"{alarm.text}{ends}"
+
+
+def _clock(at: float) -> str:
+    return f"{datetime.fromtimestamp(at, UTC):%d %b %H:%M:%S} UTC"
+
+
+def _commands(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
+    names = cast(_AUDIT.heliostats, String)
+    by = [_AUDIT.who == query.who] if query.who else []
+    # No names: it was a command to the whole field.
+    about = [*_has(f'"{query.heliostat}"', names), names == "[]"] if query.heliostat else []
+    wanted = select(tables.audit).where(
+        *_within(_AUDIT.at, query, text=True),
+        *by,
+        *([or_(*about)] if about else []),
+        *_has(query.text, _AUDIT.what, _AUDIT.note, _AUDIT.result),
+    )
+    found = rows.records(
+        connection, AuditEntry, wanted.order_by(_AUDIT.number.desc()).limit(query.limit)
+    )
+    return [
+        JournalEntry(datetime.fromisoformat(one.at).timestamp(), "command", one.what, _said(one))
+        for one in found
+    ]
+
+
+def _said(entry: AuditEntry) -> str:
+    count, names = len(entry.heliostats), ", ".join(entry.heliostats[:_NAMED])
+    whom = names if count <= _NAMED else f"{count:,} heliostats ({names}, …)"
+    note = f" ({entry.note})" if entry.note else ""
+    return (
+        f"{entry.who} ({entry.role}): {whom or 'all'}{note}{entry.result and f': {entry.result}'}"
+    )
