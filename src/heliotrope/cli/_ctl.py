@@ -314,9 +314,12 @@ def journal(
     since: Annotated[str, typer.Option(help="From this time, ISO 8601.", show_default=False)] = "",
     until: Annotated[str, typer.Option(help="Before this time.", show_default=False)] = "",
     kind: Annotated[str, typer.Option(help="event, alarm or command.", show_default=False)] = "",
-    who: Annotated[str, typer.Option(help="Person.", show_default=False)] = "",
+    person: Annotated[str, typer.Option(help="Person.", show_default=False)] = "",
     heliostat: Annotated[str, typer.Option(help="Heliostat.", show_default=False)] = "",
     text: Annotated[str, typer.Option(help="Text in it, in any case.", show_default=False)] = "",
+    everybody: Annotated[
+        bool, typer.Option("--all", help="The commands of automatic control, too.")
+    ] = False,
     limit: Annotated[int, typer.Option(min=1, max=2000, help="Most entries.")] = 200,
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
 ) -> None:
@@ -325,7 +328,8 @@ def journal(
     import sys
     from urllib.parse import urlencode
 
-    query = {"kind": kind, "who": who, "heliostat": heliostat, "text": text, "limit": limit}
+    query = {"kind": kind, "person": person, "heliostat": heliostat, "text": text, "limit": limit}
+    query["but"] = "" if everybody else "automatic control"
     for name, moment in (("since", since), ("until", until)):
         if moment:
             query[name] = f"{parse_time(moment).timestamp():.3f}"

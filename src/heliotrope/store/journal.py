@@ -38,7 +38,7 @@ def _has(text: str, *columns: ColumnElement[Any]) -> list[Any]:
 
 def _events(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
     # An event of a person, or about a heliostat, begins with the name.
-    by = [_EVENT.text.istartswith(f"{query.who}: ", autoescape=True)] if query.who else []
+    by = [_EVENT.text.istartswith(f"{query.person}: ", autoescape=True)] if query.person else []
     about = _has(query.heliostat, _EVENT.heliostat, _EVENT.text)
     wanted = select(tables.event).where(
         *_within(_EVENT.at, query), *by, *about, *_has(query.text, _EVENT.text, _EVENT.source)
@@ -52,7 +52,7 @@ def _events(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
 
 
 def _alarms(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
-    by = [_ALARM.acknowledged_by == query.who] if query.who else []
+    by = [_ALARM.acknowledged_by == query.person] if query.person else []
     about = _has(query.heliostat, _ALARM.subject)
     wanted = select(tables.alarm).where(
         *_within(_ALARM.raised, query),
@@ -82,7 +82,7 @@ def _clock(at: float) -> str:
 
 def _commands(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
     names = cast(_AUDIT.heliostats, String)
-    by = [_AUDIT.who == query.who] if query.who else []
+    by = [_AUDIT.who == query.person] if query.person else [_AUDIT.who != query.but]
     # No names: it was a command to the whole field.
     about = [*_has(f'"{query.heliostat}"', names), names == "[]"] if query.heliostat else []
     wanted = select(tables.audit).where(

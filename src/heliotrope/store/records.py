@@ -420,8 +420,10 @@ class JournalQuery:
         Times, POSIX s; the later one is excluded.
     kind
         "event", "alarm" or "command"; "" for all.
-    who, heliostat, text
+    person, heliostat, text
         Person, heliostat, and a text in any case; "" for any.
+    but
+        Whose commands are left out.
     limit
         Most entries.
     """
@@ -429,9 +431,10 @@ class JournalQuery:
     since: float = 0.0
     until: float = 1e11
     kind: str = ""
-    who: str = ""
+    person: str = ""
     heliostat: str = ""
     text: str = ""
+    but: str = ""
     limit: int = 200
 
 

@@ -361,17 +361,18 @@ function journal() {
   const [whoLabel, who] = field("Person", { type: "search", maxLength: 64 }), [nameLabel, name] = field("Heliostat", { type: "search", maxLength: 64 });
   const [textLabel, text] = field("Text", { type: "search", maxLength: 100 });
   const kind = h("select", { ariaLabel: "Kind" }, ["all kinds", "event", "alarm", "command"].map((one) => h("option", { value: one === "all kinds" ? "" : one }, one)));
+  const all = h("input", { type: "checkbox" }), allLabel = h("label", { className: "hx-field" }, all, "commands of automatic control too");
   const found = h("div"), said = h("p", { className: "hx-hint" }, "Events, alarms and commands of all days, over restarts."), most = 1000;
   let rows = [];
   const search = async () => {
     const seconds = (date, more) => (date ? { [more ? "until" : "since"]: Date.parse(`${date}T00:00:00Z`) / 1e3 + (more ? 86400 : 0) } : {});
-    const query = new URLSearchParams({ ...seconds(from.value, false), ...seconds(to.value, true), kind: kind.value, who: who.value.trim(), heliostat: name.value.trim(), text: text.value.trim(), limit: most });
+    const query = new URLSearchParams({ ...seconds(from.value, false), ...seconds(to.value, true), kind: kind.value, person: who.value.trim(), heliostat: name.value.trim(), text: text.value.trim(), but: all.checked ? "" : "automatic control", limit: most });
     rows = await api("GET", `journal?${query}`);
     said.textContent = rows.length === most ? `The latest ${count(most)}; choose fewer days or a text.` : `${count(rows.length)} entries.`;
     found.replaceChildren(table([["Time (UTC)", (r) => moment(r.at)], ["Kind", (r) => h("span", { className: severe[r.severity] ?? "" }, r.kind)], ["What", (r) => r.what], ["", (r) => r.text]], rows));
   };
   const form = h("form", { className: "hx-row hx-search", onsubmit: (event) => { event.preventDefault(); act(search, "journal", false); } },
-    fromLabel, toLabel, kind, whoLabel, nameLabel, textLabel, h("button", { className: "hx-button main" }, "Search"),
+    fromLabel, toLabel, kind, whoLabel, nameLabel, textLabel, allLabel, h("button", { className: "hx-button main" }, "Search"),
     h("button", { className: "hx-button", type: "button", onclick: () => saveCsv("journal.csv", ["time", "kind", "what", "text"], rows.map((r) => [new Date(1e3 * r.at).toISOString(), r.kind, r.what, r.text])) }, "Save as CSV"));
   return h("div", {}, form, said, found);
 }

@@ -97,9 +97,10 @@ class Journal(Some):
     since: Moment = 0.0
     until: Moment = 1e11
     kind: Literal["", "event", "alarm", "command"] = ""
-    who: Annotated[str, Field(max_length=64)] = ""
+    person: Annotated[str, Field(max_length=64)] = ""
     heliostat: Annotated[str, Field(max_length=64)] = ""
     text: Annotated[str, Field(max_length=100)] = ""
+    but: Annotated[str, Field(max_length=64, description="Whose commands are left out.")] = ""
 
 
 class SomePackets(Some):
