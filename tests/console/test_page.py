@@ -88,7 +88,7 @@ def test_wrong_password(field: LiveConsole, browser: Any) -> None:
 def test_select_by_lasso_and_stow(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     field.until(lambda: field.live.operations.summary().states.get("STOWED", 0) < 320)
     page = enter("operator")
-    page.click(".hx-tools >> text=Lasso")
+    page.select_option("[aria-label='Select by']", "lasso")
     box = page.locator(".hx-map-field").bounding_box()
     left, top = box["x"] + 4, box["y"] + 0.1 * box["height"]
     right, bottom = box["x"] + 0.78 * box["width"], box["y"] + 0.97 * box["height"]
@@ -120,6 +120,130 @@ def test_select_by_lasso_and_stow(field: LiveConsole, enter: Callable[[str], Any
     )
     assert others - {"STOWED", "STOWING"}
     page.keyboard.press("Escape")
+
+
+def _drag(page: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
+    """Drag over the map between two places of the field, ENU, m, with Shift."""
+    box = page.locator(".hx-map-field").bounding_box()
+    at = [
+        page.evaluate("([x, y]) => heliotropeMap.toScreen(x, y)", place) for place in (start, end)
+    ]
+    (x, y), (u, v) = [(box["x"] + x, box["y"] + y) for x, y in at]
+    page.keyboard.down("Shift")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for k in range(1, 6):
+        page.mouse.move(x + 0.2 * k * (u - x), y + 0.2 * k * (v - y))
+    page.mouse.up()
+    page.keyboard.up("Shift")
+
+
+def test_shapes_rows_and_clusters_select(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    places = np.asarray(field.live.operations.viewer.positions)[:, :2]
+    tower = page.evaluate("heliotrope.store.field.tower.slice(0, 2)")
+    away = np.hypot(*(places - tower).T)
+    azimuth = np.arctan2(*(places - tower).T)
+    middle = int(np.argsort(away)[len(away) // 2])
+    (east, north), step = places[middle], 12.0
+
+    def selected() -> set[int]:
+        return set(page.evaluate("[...heliotrope.store.selection]"))
+
+    page.select_option("[aria-label='Select by']", "rectangle")
+    corners = (east - step, north - step), (east + step, north + step)
+    _drag(page, *corners)
+    inside = (np.abs(places - places[middle]) < step).all(axis=-1)
+    assert selected() == set(np.flatnonzero(inside).tolist())
+    # A straight line of the lasso is the diagonal of the same rectangle.
+    page.keyboard.press("Escape")
+    page.select_option("[aria-label='Select by']", "lasso")
+    _drag(page, *corners)
+    assert selected() == set(np.flatnonzero(inside).tolist())
+    said(page, f"{inside.sum()} heliostats in the lasso")
+    page.select_option("[aria-label='Select by']", "sector")
+    _drag(page, *corners)
+    (near, first), (far, last) = [
+        (np.hypot(x - tower[0], y - tower[1]), np.arctan2(x - tower[0], y - tower[1]))
+        for x, y in corners
+    ]
+    turn = (azimuth - first + np.pi) % (2 * np.pi) - np.pi
+    wide = (last - first + np.pi) % (2 * np.pi) - np.pi
+    ring = (away > min(near, far)) & (away < max(near, far))
+    expected = ring & (turn * np.sign(wide) > 0.0) & (np.abs(turn) < abs(wide))
+    # The arcs are drawn with corners, and pixels are not metres.
+    assert len(selected() ^ set(np.flatnonzero(expected).tolist())) <= 0.05 * expected.sum() + 1
+    page.select_option("[aria-label='Select by']", "cluster")
+    spot = page.evaluate(
+        f"heliotropeMap.toScreen(heliotropeMap.x[{middle}], heliotropeMap.y[{middle}])"
+    )
+    box = page.locator(".hx-map-field").bounding_box()
+    page.mouse.click(box["x"] + spot[0], box["y"] + spot[1])
+    cluster = field.live.operations.plant.field.cluster
+    assert selected() == set(np.flatnonzero(cluster == cluster[middle]).tolist())
+    page.select_option("[aria-label='Select by']", "row")
+    page.mouse.click(box["x"] + spot[0], box["y"] + spot[1])
+    assert middle in selected()
+    assert len(selected()) > 3
+    page.select_option("[aria-label='Select by']", "pan")
+    page.keyboard.press("Escape")
+
+
+def test_the_worst_heliostats_are_found_and_kept(
+    field: LiveConsole, enter: Callable[[str], Any]
+) -> None:
+    page = enter("viewer")
+    page.click("[data-tab=heliostats]")
+    page.wait_for_selector(".hx-grid-body .hx-grid-row")
+    # Of 640 rows only those in view are there.
+    assert page.locator(".hx-grid-body .hx-grid-row").count() < 100
+    page.click("[role=columnheader]:has-text('North')")
+    rows = page.locator(".hx-grid-body .hx-grid-row")
+    north = np.asarray(field.live.operations.viewer.positions)[:, 1]
+    names = np.asarray(field.live.names)
+    page.wait_for_selector(
+        f".hx-grid-body .hx-grid-row:first-child:has-text('{names[np.argmax(north)]}')"
+    )
+    rows.nth(0).click()
+    rows.nth(4).click(modifiers=["Shift"])
+    best = set(page.evaluate("heliotrope.store.selected()"))
+    assert best == set(names[np.argsort(-north, kind="stable")[:5]].tolist())
+    page.click("text=Save selection…")
+    page.fill(".hx-dialog input", "far five")
+    page.click(".hx-dialog button:has-text('Save')")
+    page.evaluate("heliotrope.store.select([], -1)")
+    page.select_option("[aria-label='Saved selections']", "far five")
+    assert set(page.evaluate("heliotrope.store.selected()")) == best
+    with page.expect_download() as saving:
+        page.click(".hx-heliostats >> text=Save as CSV")
+    lines = Path(saving.value.path()).read_text("utf-8").splitlines()
+    assert lines[0].startswith("Name,State,On,Predicted error (mrad)")
+    assert len(lines) == 641
+    page.fill(".hx-heliostats .hx-query", f"name = {names[3]}")
+    page.click(".hx-heliostats >> text=Show >> nth=0")
+    until(page, "document.querySelectorAll('.hx-grid-body .hx-grid-row').length === 1")
+    page.evaluate("localStorage.clear()")
+    page.keyboard.press("Escape")
+
+
+def test_the_journal_finds_what_a_person_did(
+    field: LiveConsole, enter: Callable[[str], Any]
+) -> None:
+    page = enter("operator")
+    name = field.live.names[7]
+    page.evaluate("heliotrope.store.select([7], 7)")
+    page.click(".hx-orders >> text=Stow")
+    said(page, "STOW: 1 done")
+    page.click("[data-tab=logs]")
+    page.click(".hx-logs >> text=journal")
+    page.fill("label:has-text('Heliostat') input", name)
+    page.fill("label:has-text('Text') input", "stow")
+    page.click(".hx-search >> text=Search")
+    page.wait_for_selector(f".hx-logs td:has-text('operator: STOW {name}')")
+    page.click("[data-tab=heliostat]")
+    page.wait_for_selector(f".hx-why:has-text('{name} is STOWED: it is not given to automatic')")
+    page.click(".hx-why >> text=Give to automatic control")
+    page.wait_for_selector(".hx-why:has-text('automatic control has it')")
 
 
 def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> None:

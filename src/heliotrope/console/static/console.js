@@ -1,6 +1,7 @@
 // Fills the page, console.html, with its parts.
 import { api, me, rowsWhere, store } from "./live.js";
-import { FieldMap } from "./map.js";
+import { CLICKS, FieldMap, SHAPES } from "./map.js";
+import { heliostats } from "./table.js";
 import { VIEWS } from "./palette.js";
 import * as panels from "./panels.js";
 import * as people from "./people.js";
@@ -10,7 +11,10 @@ import { ask, count, degrees, h, span } from "./dom.js";
 function map(box) {
   const view = h("select", { title: "Colour by (V)", onchange: () => store.emit("view", view.value) },
     Object.entries(VIEWS).map(([name, { title }]) => h("option", { value: name }, title)));
-  const lasso = h("button", { className: "hx-button", title: "Draw a lasso (L, or Shift and drag)", onclick: () => store.emit("mode", lasso.classList.contains("main") ? "pan" : "lasso") }, "Lasso");
+  const title = (name) => name[0].toUpperCase() + name.slice(1);
+  const mode = h("select", { title: "What a drag or a click on the map does; Shift and drag draws in every mode", ariaLabel: "Select by", onchange: () => store.emit("mode", mode.value) },
+    h("option", { value: "pan" }, "Move the map"), h("optgroup", { label: "Select by a drag" }, SHAPES.map((name) => h("option", { value: name }, title(name)))),
+    h("optgroup", { label: "Select by a click" }, CLICKS.map((name) => h("option", { value: name }, title(name)))));
   const all = h("button", { className: "hx-button", title: "Show the whole field (0)", onclick: () => store.emit("fit") }, "Whole");
   const none = h("button", { className: "hx-button", title: "Clear (Escape)", onclick: () => store.select([], -1) }, "Clear");
   const query = h("input", { type: "search", className: "hx-query", spellcheck: false, "aria-label": "Query",
@@ -18,8 +22,8 @@ function map(box) {
   const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(rows.length === 1 ? `${store.field.names[rows[0]]} is selected` : `${count(rows.length)} heliostats match`); } catch (error) { say(error.message, true); } };
   query.addEventListener("keydown", (event) => { if (event.key === "Enter") run(); event.stopPropagation(); });
   const field = h("div", { className: "hx-map-field" });
-  box.append(h("div", { className: "hx-tools" }, view, lasso, all, none, query, h("button", { className: "hx-button", onclick: run }, "Select")), field);
-  store.on("mode", (mode) => lasso.classList.toggle("main", mode === "lasso"));
+  box.append(h("div", { className: "hx-tools" }, view, mode, all, none, query, h("button", { className: "hx-button", onclick: run }, "Select")), field);
+  store.on("mode", (now) => { mode.value = now; });
   document.addEventListener("keydown", (event) => {
     if (event.key === "/" && !/INPUT|SELECT|TEXTAREA/.test(document.activeElement?.tagName)) { event.preventDefault(); query.focus(); }
   });
@@ -84,7 +88,7 @@ function tabs() {
     panel.replaceChildren(box);
     panel.scrollTop = 0;
     panel.ariaLabel = button.firstChild.textContent;
-    end = panels[button.dataset.tab](box);
+    end = { ...panels, heliostats }[button.dataset.tab](box);
   };
   buttons.forEach((button, i) => {
     button.onclick = () => open(button);

@@ -4,6 +4,10 @@ import { VIEWS, colourOf, dark } from "./palette.js";
 
 const FAULT = 9;
 const NEAR = 14; // px within which a click finds a heliostat
+const ARC = 24; // corners of each arc of a sector
+// What a drag (with Shift, or in that mode) draws, and what a click takes in its mode.
+export const SHAPES = ["lasso", "rectangle", "sector"], CLICKS = ["row", "cluster"];
+const KEYS = { l: "lasso", r: "rectangle", s: "sector" };
 
 const words = new Map();
 // A colour as the word of a pixel, little-endian: opaque, blue, green, red.
@@ -21,12 +25,13 @@ export class FieldMap {
     this.view = "state";
     this.lasso = null;
     this.mode = "pan";
+    this.shape = SHAPES[0];
     this.dirty = true;
     this.fitted = false;
     box.tabIndex = 0;
     box.setAttribute("role", "application");
     box.setAttribute("aria-label", "Map of the field. Arrows move, plus and minus zoom, 0 shows all, " +
-      "L draws a lasso, A selects all, Escape clears.");
+      "L draws a lasso, R a rectangle, S a sector, A selects all, Escape clears.");
     this.canvas = box.appendChild(document.createElement("canvas"));
     this.context = this.canvas.getContext("2d", { alpha: false });
     this.tip = box.appendChild(Object.assign(document.createElement("div"), { className: "hx-tip" }));
@@ -34,7 +39,7 @@ export class FieldMap {
     for (const name of ["frame", "live", "theme"]) store.on(name, () => this.news());
     store.on("selection", () => { this.dirty = true; });
     store.on("view", (view) => { this.view = view; this.news(); });
-    store.on("mode", (mode) => { this.mode = mode; box.classList.toggle("lasso", mode === "lasso"); });
+    store.on("mode", (mode) => { this.mode = mode; if (SHAPES.includes(mode)) this.shape = mode; box.classList.toggle("lasso", mode !== "pan"); });
     store.on("fit", () => this.fit());
     new ResizeObserver(() => this.resize()).observe(box);
     this.hear();
@@ -271,10 +276,38 @@ export class FieldMap {
     c.fillText(`${degrees(sun.azimuth)}  ↑${degrees(sun.elevation)}`, cx, cy + r + 14);
   }
 
+  // The outline of what is drawn, in pixels: a lasso that encloses nothing is the diagonal of a rectangle.
+  outline() {
+    const drawn = this.lasso, start = drawn[0], end = drawn.at(-1);
+    if (this.shape === "sector") return this.sector(this.toField(...start), this.toField(...end));
+    let area = 0;
+    drawn.forEach(([x, y], i) => { const [u, v] = drawn[(i + 1) % drawn.length]; area += x * v - u * y; });
+    const straight = Math.abs(area) < 0.1 * ((end[0] - start[0]) ** 2 + (end[1] - start[1]) ** 2);
+    return this.shape === "lasso" && !straight ? drawn : [start, [end[0], start[1]], end, [start[0], end[1]]];
+  }
+
+  // A sector about the tower between two corners: by the shorter way round.
+  sector(start, end) {
+    const [e, n] = store.field.tower, polar = ([x, y]) => [Math.hypot(x - e, y - n), Math.atan2(x - e, y - n)];
+    const [r, a] = polar(start), [far, b] = polar(end), turn = ((b - a + 3 * Math.PI) % (2 * Math.PI)) - Math.PI;
+    const arc = (radius, from, by) => Array.from({ length: ARC + 1 }, (_, i) => { const at = from + (by * i) / ARC; return this.toScreen(e + radius * Math.sin(at), n + radius * Math.cos(at)); });
+    return [...arc(r, a, turn), ...arc(far, a + turn, -turn)];
+  }
+
+  // The heliostats of one's cluster, or of its row: the ring about the tower or the straight line with most of them.
+  beside(row) {
+    if (row < 0) return [];
+    const { cluster, tower } = store.field, all = [...cluster.keys()];
+    if (this.mode === "cluster") return all.filter((other) => cluster[other] === cluster[row]);
+    const gap = 0.35 * all.reduce((least, other) => (other === row ? least : Math.min(least, Math.hypot(this.x[other] - this.x[row], this.y[other] - this.y[row]))), Infinity);
+    const by = [(i) => Math.hypot(this.x[i] - tower[0], this.y[i] - tower[1]), (i) => this.y[i], (i) => this.x[i]];
+    return by.map((at) => all.filter((other) => Math.abs(at(other) - at(row)) <= gap)).reduce((a, b) => (b.length > a.length ? b : a));
+  }
+
   drawLasso(c, night) {
     if (!this.lasso || this.lasso.length < 2) return;
     c.strokeStyle = night ? "#ffffff" : "#000000"; c.lineWidth = 1.5; c.setLineDash([5, 4]);
-    c.beginPath(); this.lasso.forEach(([x, y], i) => (i ? c.lineTo(x, y) : c.moveTo(x, y)));
+    c.beginPath(); this.outline().forEach(([x, y], i) => (i ? c.lineTo(x, y) : c.moveTo(x, y)));
     c.closePath(); c.stroke(); c.setLineDash([]);
     c.fillStyle = night ? "#ffffff18" : "#00000012"; c.fill();
   }
@@ -328,6 +361,12 @@ export class FieldMap {
     return found;
   }
 
+  // Selects what a shape encloses, and says how many that are.
+  tell(rows, event, shape) {
+    this.choose(rows, event);
+    store.emit("said", { text: rows.length ? `${rows.length.toLocaleString("en")} heliostats in the ${shape}` : `no heliostat in the ${shape}`, bad: !rows.length });
+  }
+
   choose(rows, event, focus) {
     const add = event.ctrlKey || event.metaKey, before = add ? new Set(store.selection) : new Set();
     for (const row of rows) add && before.has(row) && rows.length === 1 ? before.delete(row) : before.add(row);
@@ -342,7 +381,7 @@ export class FieldMap {
       box.setPointerCapture(event.pointerId);
       pointers.set(event.pointerId, at(event));
       start = at(event);
-      if (pointers.size === 1 && (event.shiftKey || this.mode === "lasso")) this.lasso = [start];
+      if (pointers.size === 1 && (event.shiftKey || SHAPES.includes(this.mode))) this.lasso = [start];
     });
     box.addEventListener("pointermove", (event) => {
       const place = at(event), before = pointers.get(event.pointerId);
@@ -358,10 +397,13 @@ export class FieldMap {
     const up = (event) => {
       const place = at(event);
       pointers.delete(event.pointerId); spread = 0;
-      if (this.lasso && this.lasso.length > 4) this.choose(this.inside(this.lasso), event);
-      else if (start && Math.hypot(place[0] - start[0], place[1] - start[1]) < 4) {
+      if (!start) return;
+      if (Math.hypot(place[0] - start[0], place[1] - start[1]) < 4 && (this.lasso?.length ?? 0) < 5) {
         const row = this.nearest(...place);
-        this.choose(row < 0 ? [] : [row], event, row);
+        if (CLICKS.includes(this.mode)) this.tell(this.beside(row), event, this.mode);
+        else this.choose(row < 0 ? [] : [row], event, row);
+      } else if (this.lasso) {
+        this.tell(this.inside(this.outline()), event, this.shape);
       }
       this.lasso = null; start = null; this.dirty = true;
     };
@@ -375,7 +417,7 @@ export class FieldMap {
       else if (event.key === "+" || event.key === "=") this.zoom(1.25);
       else if (event.key === "-") this.zoom(0.8);
       else if (event.key === "0") this.fit();
-      else if (event.key === "l") store.emit("mode", this.mode === "lasso" ? "pan" : "lasso");
+      else if (KEYS[event.key]) store.emit("mode", this.mode === KEYS[event.key] ? "pan" : KEYS[event.key]);
       else if (event.key === "a") store.select(rowsWhere("east >= -1e9"));
       else if (event.key === "Escape") { this.lasso = null; store.emit("mode", "pan"); store.select([], -1); }
       else return;

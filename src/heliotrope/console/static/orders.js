@@ -26,6 +26,12 @@ async function follow(ticket) {
   }
 }
 
+// The commands by their meaning, always at the same places.
+const GROUPS = [
+  ["Safe", ["Stow", "Defocus"]],
+  ["Move", ["Automatic", "Approach", "Track", "Standby", "Refocus", "Aim…"]],
+  ["Service", ["Lock", "Unlock", "Out of service…", "Search…", "Jog…", "Clear fault", "Zero…", "Lock position…"]],
+];
 let scope = "selection";
 
 function recipients() {
@@ -106,6 +112,8 @@ export function bar(box) {
       h("option", { value: "selection" }, "Selection"), h("option", { value: "cluster" }, "Clusters of the selection"), h("option", { value: "field" }, "Whole field"));
     const buttons = ORDERS.filter(([, , , kind]) => kind !== "engineer" || me.role === "engineer")
       .map(([title, key, go, kind]) => [h("button", { className: `hx-button ${kind === "safe" ? "safe" : ""}`, title: key ? `Alt+${key}` : "", onclick: go }, title), kind]);
+    const groups = GROUPS.map(([name, titles]) => h("span", { className: "hx-group", role: "group", ariaLabel: name }, h("em", {}, name),
+      buttons.filter(([button]) => titles.includes(button.textContent)).map(([button]) => button)));
     const mark = () => {
       const n = store.selection.size;
       to.options[0].textContent = `Selection (${count(n)})`;
@@ -114,7 +122,7 @@ export function bar(box) {
         button.disabled = !store.field || !may || (scope !== "field" && !n);
       }
     };
-    box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, "Scope ", to), buttons.map(([button]) => button)), said);
+    box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, "Scope ", to), groups), said);
     // The whole field, or whole clusters, must be chosen anew after each selection.
     store.on("selection", () => { if (store.selection.size) scope = to.value = "selection"; mark(); });
     store.on("authority", mark);
