@@ -61,10 +61,13 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         assert "an emergency holds (Olga: smoke)" in emergency.text, emergency.text
         assert emergency.button is Button.WITHDRAW
         shown.withdraw(OPERATOR)
-        assert shown.why(name).button is Button.NONE, "somebody has to acknowledge"
+        assert shown.why(name).button is Button.RESUME, "somebody has to acknowledge"
         await asyncio.sleep(3.0)
         shown.acknowledge(OPERATOR, "operator_emergency")
         await asyncio.sleep(3.0)
+        over = shown.why(name)
+        assert "an emergency has taken it out of automatic control" in over.text, over.text
+        assert over.button is Button.RESUME
 
         plant.links["C1"].plugged = False
         await asyncio.sleep(15.0)

@@ -24,6 +24,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import SendOutcome, Statistics
 from heliotrope.links.messages import Ask, ClusterStatus, Lease, encode
 from heliotrope.optics import FluxView, air_loss, intercept_rectangle, predict_flux
+from heliotrope.plant.interface.desk import Desk
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
@@ -433,6 +434,51 @@ def test_persons_come_before_the_automat() -> None:
         assert any("EMERGENCY STOW: a fire" in event.text for event in shown.logbook.events())
 
     live(work, AutomaticSettings(wanted=True, calibrate=False))
+
+
+def test_resume_ends_an_emergency_and_brings_back_what_automatic_control_had() -> None:
+    async def work(plant: LivePlant) -> None:
+        shown, (first, second, *_) = plant.operations, plant.operations.names
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["TRACKING"] * 4
+        shown.stow(OPERATOR, (first,))
+        shown.emergency(VIEWER, "STOW", "a fire")
+        await asyncio.sleep(3.0)
+        with pytest.raises(RefusedError, match="the emergency goes on: Vera: a fire"):
+            shown.resume(OPERATOR)
+        shown.withdraw(ENGINEER, "Vera")
+        with pytest.raises(RefusedError, match="Vera is viewer"):
+            shown.resume(VIEWER)
+        assert not shown.summary().resume, "the banner of the emergency says it"
+        desk = Desk(shown)
+        await desk.resume(OPERATOR)
+        await asyncio.sleep(2.0)
+        assert not shown.summary().emergency
+        said = [event.text for event in shown.logbook.events() if event.who == "Olga"]
+        assert said[0] == "automatic control resumed: 3 heliostats given back to it"
+        await asyncio.sleep(250.0)
+        # Which a person had stowed before stays stowed.
+        assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
+
+        # It may also be acknowledged; then the field waits, and a person may take single ones.
+        shown.emergency(OPERATOR, reason="a test")
+        await asyncio.sleep(3.0)
+        shown.withdraw(OPERATOR)
+        await asyncio.sleep(3.0)
+        shown.acknowledge(OPERATOR, "operator_emergency")
+        await asyncio.sleep(60.0)
+        assert set(_states(plant)[1:]) == {"DEFOCUSED"}
+        assert shown.summary().resume == (
+            "The emergency is over: 3 heliostats wait for a person's Resume."
+        )
+        shown.give_back(OPERATOR, (second,))
+        assert "2 heliostats wait" in shown.summary().resume
+        shown.resume(OPERATOR)
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
+        assert shown.summary().resume == ""
+
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
 
 
 def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:

@@ -156,6 +156,12 @@ NOT_CALLER = Refusal(
     "Each person withdraws their own order; an engineer withdraws another's by the owner's name. "
     "Once every order is withdrawn, acknowledge `operator_emergency`.",
 )
+EMERGENCY_GOES_ON = Refusal(
+    "emergency goes on",
+    "A person resumes while an order of an emergency stands, or a row demands it.",
+    "resume: the emergency goes on: {causes}",
+    "Withdraw the order; remove the cause of each row that the text names, and acknowledge it.",
+)
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",
     "The row is not tripped, its cause has not gone, or it needs another role.",

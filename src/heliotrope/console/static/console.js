@@ -58,22 +58,22 @@ function alert(box) {
     const { calls } = store.head.order, owners = calls.map((call) => call.who), own = !calls.length || owners.includes(me.name);
     const by = (call) => `${call.who}: ${call.reason}`;
     const whose = own ? "your emergency order" : `another person's emergency order (${calls.map(by).join("; ")})`;
-    const given = await ask(`Withdraw ${whose}? Nothing moves because of it; alarms that remain must be acknowledged.`, own ? [] : [{ name: "owner", label: "Whose", options: owners }], "Withdraw");
+    const given = await ask(`Withdraw ${whose}? Nothing moves because of it.`, own ? [] : [{ name: "owner", label: "Whose", options: owners }], "Withdraw");
     if (!given) return;
     try {
       const left = (await api("DELETE", "emergency", own ? undefined : { owner: given.owner })).calls;
-      say(left.length ? `withdrawn; still ordered by ${left.map(by).join("; ")}` : "emergency withdrawn; acknowledge the alarms that remain");
+      say(left.length ? `withdrawn; still ordered by ${left.map(by).join("; ")}` : "emergency withdrawn; Resume ends it");
     } catch (error) { say(error.message, true); }
   } }, "Withdraw");
   const resume = h("button", { className: "hx-button", onclick: async () => {
-    if (await ask("Resume automatic control? It raises the heliostats that it has lost.", [], "Resume")) await act(() => api("POST", "automatic/resume"), "Resume");
+    if (await ask("Resume automatic control? It raises the heliostats that it had.", [], "Resume")) await act(() => api("POST", "automatic/resume"), "Resume");
   } }, "Resume");
   box.append(text, viewer ? "" : back, viewer ? "" : resume);
   store.on("frame", (now) => {
     box.classList.toggle("on", now.emergency || Boolean(now.resume));
     box.classList.toggle("waits", !now.emergency);
-    back.hidden = !now.emergency || !now.order.calls.length; resume.hidden = !now.resume;
-    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)} · ${now.order.basis}${now.order.calls.length ? "" : " · acknowledge its alarms (tab Alarms) when their causes have gone"}` : now.resume;
+    back.hidden = !now.emergency || !now.order.calls.length; resume.hidden = now.emergency ? now.order.calls.length > 0 : !now.resume;
+    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)} · ${now.order.basis}${now.order.calls.length ? "" : " · when the causes have gone, Resume ends it and gives the field back to automatic control"}` : now.resume;
   });
 }
 

@@ -248,6 +248,10 @@ class Sentinel(Part):
             found[_TABLE[0]] = text
         return found
 
+    def ends_by(self, condition: str) -> bool:
+        """Return whether nothing but one row of the table, whose cause has gone, demands it."""
+        return self.on and not self._calls and not self.table.caused(but=condition)
+
     def call(self, who: str, act: Act, reason: str, at: float) -> EmergencyOrder:
         """Order an emergency for a person; it holds until it is withdrawn.
 

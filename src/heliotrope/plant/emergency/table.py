@@ -304,10 +304,14 @@ class TableWatch:
             if condition in ("", a.condition)
         }
 
-    def caused(self) -> bool:
-        """Whether a row other than the consequences of an emergency demands one for the field."""
+    def caused(self, but: str = "") -> bool:
+        """Return whether a row demands an emergency of the field.
+
+        Its own consequences do not, nor does the row whose name is ``but``.
+        """
         return any(
-            a.act >= Act.DEFOCUS and a.condition not in CONSEQUENCES for a in self._demands()
+            a.act >= Act.DEFOCUS and a.condition not in (*CONSEQUENCES, but)
+            for a in self._demands()
         )
 
     def reasons(self, least: Act, cluster: str = "", but: str = "") -> str:

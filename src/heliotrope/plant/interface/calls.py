@@ -427,9 +427,12 @@ def automatic(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketSt
 
 
 @_call("POST automatic/resume", "commands", OPERATOR)
-def resume(desk: Desk, who: Person) -> None:
-    """Let automatic control go on after a loss of many heliostats."""
-    desk.operations.resume(who)
+async def resume(desk: Desk, who: Person) -> None:
+    """Let automatic control go on with its heliostats, after a loss of many or an emergency.
+
+    It acknowledges an emergency whose orders are all withdrawn.
+    """
+    await desk.resume(who)
 
 
 @_call("GET holds", "calibration")

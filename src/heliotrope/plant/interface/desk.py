@@ -19,14 +19,16 @@ from heliotrope.field.volumes import outline
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
 from heliotrope.plant import refusals
+from heliotrope.plant.emergency import ORDERED
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.tickets import Tickets, TicketState
 from heliotrope.plant.operations.given_readings import GivenReadings
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CameraView, EmergencyView, PictureRow
-from heliotrope.plant.orders.authority import Person
+from heliotrope.plant.orders.authority import Person, RefusedError
 from heliotrope.plant.orders.queue import RECORDING
 from heliotrope.plant.orders.tickets import Ticket
 
@@ -34,6 +36,8 @@ from heliotrope.plant.orders.tickets import Ticket
 SAME, _MOST_CALLED = 30.0, 100
 #: A holder of the authority counts as present for this long after renewing it, s.
 PRESENT = 8.0
+#: Longest wait for an order that was just withdrawn to be released, s.
+_RELEASED = 5.0
 T = TypeVar("T")
 
 
@@ -225,6 +229,26 @@ class Desk:
         self.tickets.put(ticket)
         await ticket.written(RECORDING + 1.0)
         return TicketState.of(ticket)
+
+    async def resume(self, who: Person) -> None:
+        """Let automatic control go on; an order that was just withdrawn is waited for.
+
+        Raises
+        ------
+        RefusedError
+            See `Operations.resume`.
+        """
+        plant = self.operations.plant
+        until = plant.now() + _RELEASED
+        while True:
+            try:
+                self.operations.resume(who)
+            except RefusedError:
+                if plant.now() >= until or not plant.sentinel.ends_by(ORDERED):
+                    raise
+                await sleep_until(plant.clock, plant.now() + 0.25)
+            else:
+                return
 
     # -- photographs -----------------------------------------------------------------------
 

@@ -70,6 +70,8 @@ _AS_WANTED = (
 )
 #: Time in which a heliostat that automatic control has must follow, s; and until it is heard.
 _FOLLOWS, _HEARD = 120.0, 15.0
+#: Time in which an emergency must have ended that a person's Resume has acknowledged, s.
+_ENDED = 5.0
 #: Time between checks of the sun's elevation, s: a mirror that is locked for its parameters at one
 #: check in the evening is stowed at the next.
 _SUN_EVERY = 10.0
@@ -194,7 +196,7 @@ class AutomaticControl:
         settings = settings or AutomaticSettings()
         self._plant, self._log, self._settings = plant, logbook, settings
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
-        self._token, self._sun_at = 0, -math.inf
+        self._token, self._sun_at, self._resumed_at = 0, -math.inf, -math.inf
         self.truth = TrueErrors(plant, truth)
         cycle = CycleSettings() if visits is None else visits.cycle.settings
         self.book = CalibrationBook(plant, "malan8" if visits is None else cycle.first_model)
@@ -438,9 +440,30 @@ class AutomaticControl:
         """Why it waits for a person's Resume, "" if it does not."""
         return self._losses.reason
 
-    def resume(self) -> None:
-        """Go on after a loss of many heliostats."""
+    @property
+    def to_resume(self) -> str:
+        """What a person's Resume would do, "" if nothing waits for it."""
+        left = 0 if self._plant.sentinel.on else int(self._raising.left.sum())
+        after = f"The emergency is over: {left:,} heliostats wait for a person's Resume."
+        return self.waits or (after if left else "")
+
+    def left_by_emergency(self, heliostat: str) -> bool:
+        """Return whether an emergency has taken a heliostat out, and nobody has resumed since."""
+        return bool(self._raising.left[self._plant.field.place(heliostat)])
+
+    def resume(self) -> int:
+        """Go on after a loss of many heliostats or an emergency; return how many come back."""
         self._losses.resume()
+        if not self._plant.sentinel.on:
+            return self._raising.resume()
+        self._resumed_at = self._plant.now()  # an emergency that is acknowledged ends soon
+        return int((self._raising.left | self._raising.wanted).sum())
+
+    def give_up(self, why: str) -> None:
+        """Take all heliostats out of automatic control, until a person resumes."""
+        self._raising.give_up()
+        self._resumed_at = -math.inf
+        self._withdraw(self._plant.field.names, why)
 
     def stop(self) -> None:
         """Begin nothing more; to be called before `run` is cancelled."""
@@ -619,6 +642,8 @@ class AutomaticControl:
         self.service.park()
         if self._plant.sentinel.on:
             self._raising.give_up()
+        elif self._plant.now() - self._resumed_at < _ENDED:
+            self._raising.resume()
         self._raising.lose(self._losses.look(self._raising.wanted, self._checks.moved))
         if not self._why_idle():
             resting = self._left_alone() | self._checks.resting

@@ -79,8 +79,8 @@ def _case(
         return (
             f"an emergency holds ({causes})",
             "It stays away from the receiver; after the emergency, nothing moves by itself.",
-            "When the cause has gone: withdraw the order, acknowledge its alarms, press Automatic.",
-            Button.WITHDRAW if plant.sentinel.calls else Button.NONE,
+            "When the cause has gone: withdraw the order, then press Resume.",
+            Button.WITHDRAW if plant.sentinel.calls else Button.RESUME,
         )
     if shown.state == "LOCKED":
         button = Button.NONE if name in plant.authority.visited() else Button.UNLOCK
@@ -109,6 +109,13 @@ def _automatic_case(
         follows = f"Its next measurement is planned for {at:%H:%M} UTC on {planned.target}."
     if tracks:
         return "", follows, "", Button.NONE
+    if automatic.left_by_emergency(name):
+        return (
+            "an emergency has taken it out of automatic control",
+            "It stays where it is.",
+            "Resume brings back all that automatic control had; Automatic gives it this one alone.",
+            Button.RESUME,
+        )
     if not automatic.wants(name):
         return (
             "it is not given to automatic control",

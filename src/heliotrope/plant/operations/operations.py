@@ -28,7 +28,7 @@ from heliotrope.links.clock import sleep_until
 from heliotrope.optics import FluxView, predict_flux
 from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.emergency import EmergencyOrder
+from heliotrope.plant.emergency import ORDERED, EmergencyOrder
 from heliotrope.plant.field.lockouts import TOWER
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.errands import Errands
@@ -209,7 +209,7 @@ class Operations:
             self.plant.waiting,
             self.logbook.open_alarms,
             self.plant.sentinel.on,
-            self.automatic.waits,
+            self.automatic.to_resume,
             float(extra.pop("pace", 1.0)),
             extra,
         )
@@ -578,7 +578,7 @@ class Operations:
             Another act.
         """
         order = self.plant.raise_emergency(person.name, _act(act), reason)
-        self._meant(act, self.names)
+        self.automatic.give_up("an emergency has taken it away")
         self.logbook.event("command", person.name, f"EMERGENCY {act}: {reason or 'no reason'}")
         return order
 
@@ -628,16 +628,26 @@ class Operations:
         return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)
 
     def resume(self, person: Person) -> None:
-        """Let automatic control go on after a loss of many heliostats.
+        """Let automatic control go on with its heliostats, after a loss of many or an emergency.
+
+        An emergency whose orders are all withdrawn is acknowledged by it.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer.
+            If the person is a viewer, an order stands, or something else demands the emergency.
         """
         _operator(person, "resume")
-        self.automatic.resume()
-        self._tell(person, "automatic control resumed", "command")
+        sentinel = self.plant.sentinel
+        if sentinel.on:
+            if sentinel.ends_by(ORDERED):
+                self.acknowledge(person, ORDERED)
+            else:
+                causes = "; ".join(f"{who}: {text}" for who, text in sentinel.causes().items())
+                raise refusals.EMERGENCY_GOES_ON.error(causes=causes)
+        count = self.automatic.resume()
+        back = f": {count} heliostats given back to it" if count else ""
+        self._tell(person, f"automatic control resumed{back}", "command")
 
     # -- notes -----------------------------------------------------------------------------
 

@@ -68,6 +68,8 @@ class Raising:
     ----------
     wanted
         Which heliostats automatic control may move, (N,).
+    left
+        Those that an emergency has taken out of it, (N,): they wait for a person's Resume.
     attempts
         Heliostats that were raised in vain.
     """
@@ -87,6 +89,7 @@ class Raising:
         self._most, self._patience = most, patience
         self._names, count = plant.field.names, len(plant.field)
         self.wanted: Mask = np.full(count, wanted, dtype=np.bool_)
+        self.left: Mask = np.zeros(count, dtype=np.bool_)
         self._by_people: Mask = np.zeros(count, dtype=np.bool_)
         self._busy_until = np.full(count, -math.inf)
         self._told_in = np.full(count, -1, dtype=np.int16)
@@ -112,7 +115,7 @@ class Raising:
         """
         rows = [self._plant.field.place(name) for name in heliostats]
         self._by_people[rows] = by_person & (self._by_people[rows] | ~self.wanted[rows])
-        self.wanted[rows] = wanted
+        self.wanted[rows], self.left[rows] = wanted, False
         self._busy_until[rows] = -math.inf
         for name in heliostats:
             self.attempts.done(name)
@@ -182,8 +185,15 @@ class Raising:
         return np.array(free[: self._most], dtype=np.intp)
 
     def give_up(self) -> None:
-        """Take all heliostats out of automatic control."""
+        """Take all heliostats out of automatic control, until a person resumes."""
+        self.left |= self.wanted
         self.wanted[:] = False
+
+    def resume(self) -> int:
+        """Take back the heliostats that an emergency has taken out; return their number."""
+        names = [self._names[row] for row in np.flatnonzero(self.left)]
+        self.want(names, wanted=True)
+        return len(names)
 
     def release(self, heliostat: str) -> None:
         """Allow a new command to a heliostat at once: its visit to a target has ended."""
