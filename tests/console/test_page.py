@@ -464,14 +464,18 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
     )
     page.click(".hx-alert >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
+    # Resume acknowledges the order; a row of the table that still holds is named, and acknowledged.
     page.click(".hx-tabs >> text=Alarms")
-    # Each row can be acknowledged when its cause has gone: the order, then the light.
     end = time.monotonic() + 120.0
     while page.locator(".hx-alert.on").count():
         assert time.monotonic() < end, page.inner_text(".hx-alarms")
-        button = page.locator(".hx-alarms >> text=Acknowledge all")
-        if button.count():
-            button.click(force=True)
+        if page.locator(".hx-alert >> text='Resume'").is_visible():
+            page.click(".hx-alert >> text='Resume'")
+            page.click("dialog >> text='Resume'")
+            page.wait_for_timeout(3000)
+        others = page.locator(".hx-alarms >> text=Acknowledge all")
+        if "the emergency goes on" in page.inner_text(".hx-said >> nth=0") and others.count():
+            others.click(force=True)
         page.wait_for_timeout(1000)
     assert not field.call(lambda: field.live.operations.plant.sentinel.on)
 
