@@ -61,7 +61,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
         Settings of the console.
     """
     chosen = settings or ConsoleSettings()
-    people, stream = RemotePeople(plant), Stream(plant, chosen.period)
+    people, stream = RemotePeople(plant), Stream(plant, chosen.period, chosen.viewers)
     attempts = SignInFailures(time.monotonic, chosen.proxies)
     console = Console(plant, people, chosen, stream, attempts)
     if chosen.people_by_proxy is not None:
