@@ -21,6 +21,7 @@ from heliotrope.console import _words
 from heliotrope.console._attempts import SignInFailures
 from heliotrope.console.by_proxy import ByProxy, Introduced
 from heliotrope.console.connections import FOUND
+from heliotrope.console.hashing import Hashing
 from heliotrope.console.headers import address_of, host_known, parts_of, secret_of
 from heliotrope.console.live import Stream
 from heliotrope.console.people import ROLES, person_of
@@ -68,8 +69,8 @@ class Console:
     settings: ConsoleSettings
     stream: Stream
     attempts: SignInFailures
-    #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
-    hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    #: Turns for checks of passwords.
+    hashing: Hashing = field(default_factory=Hashing)
 
     #: How a trusted proxy names people; None: it does not.
     by_proxy: ByProxy | None = None

@@ -75,6 +75,11 @@ class Account:
     by_proxy: bool = False
     no_password: bool = False
 
+    @property
+    def has_password(self) -> bool:
+        """Whether a password can be checked."""
+        return not self.by_proxy and not self.no_password
+
 
 @dataclass(frozen=True)
 class Session:
