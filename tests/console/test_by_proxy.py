@@ -43,7 +43,7 @@ def behind(console: LiveConsole, tmp_path: Path) -> Iterator[httpx.Client]:
 
     def put(chosen: ConsoleSettings, by_proxy: ByProxy | None) -> None:
         here.settings, here.by_proxy = chosen, by_proxy
-        here.known.clear()
+        here.roster.forget()
 
     console.call(lambda: put(settings, ByProxy.read(file)))
     with httpx.Client(base_url=console.address, trust_env=False, headers=HEADERS) as client:
@@ -68,7 +68,7 @@ def test_the_person_enters_with_the_role_of_the_groups(
     # Nobody signs in to it with a password, and it changes no accounts.
     guess = behind.post("api/v1/session", json={"name": "ada", "password": account.password_hash})
     assert guess.status_code == 401
-    # A wrong guess takes as long as for any other name: a hash of a password is checked all the same.
+    # A guess takes as long as for any other name: a hash is checked all the same.
     checked: list[Any] = []
     monkeypatch.setattr(_secrets, "verify_password", lambda kept, _: checked.append(kept))
     guess = behind.post("api/v1/session", json={"name": "ada", "password": "another guess"})

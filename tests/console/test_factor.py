@@ -85,7 +85,7 @@ def required(console: LiveConsole) -> Iterator[None]:
 
     def put(settings: ConsoleSettings) -> None:
         here.settings = settings
-        here.known.clear()
+        here.roster.forget()
 
     console.call(lambda: put(ConsoleSettings(port=0, second_factor="operator")))
     yield

@@ -11,7 +11,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 from websockets.sync.client import ClientConnection, connect
 
-from heliotrope.console import api, auth
+from heliotrope.console import api, roster
 from heliotrope.console.live import OWN, RESERVED, Stream
 from heliotrope.plant.interface import BusyError
 from heliotrope.plant.orders.authority import Person, Role
@@ -124,7 +124,7 @@ def test_a_stream_ends_with_its_token(
     how: str,
 ) -> None:
     monkeypatch.setattr(api, "TRUSTED", 0.2)
-    monkeypatch.setattr(auth, "TRUSTED", 0.2)
+    monkeypatch.setattr(roster, "TRUSTED", 0.2)
     people, name = console.keeper.people, f"watcher {how}"
     people.add(name, "none", "viewer", time.time())
     made, secret = people.add_token(name, "tests", "viewer", time.time())

@@ -7,7 +7,7 @@ addresses is so slowed to some fourteen attempts an hour from all of them togeth
 signed in from an address is not delayed there by what others do.
 """
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Collection
 from typing import TypeVar
 
@@ -49,6 +49,7 @@ class SignInFailures:
         self._names: OrderedDict[str, deque[tuple[float, Pair]]] = OrderedDict()
         self._addresses: OrderedDict[str, deque[tuple[float, Pair]]] = OrderedDict()
         self._good: OrderedDict[Pair, None] = OrderedDict()
+        self._homes = Counter[str]()
 
     def wait(self, name: str, address: str) -> float:
         """Return the time to wait before the next attempt, s; 0 if it may be made now."""
@@ -65,6 +66,21 @@ class SignInFailures:
     def known(self, name: str, address: str) -> bool:
         """Whether a name has signed in from an address."""
         return (name, address) in self._good
+
+    def is_home(self, address: str) -> bool:
+        """Whether anybody has signed in from an address."""
+        return address in self._homes
+
+    def meet(self, name: str, address: str) -> None:
+        """Note that a name has signed in from an address."""
+        pair = (name, address)
+        if pair not in self._good:
+            self._homes[address] += 1
+        self._good[pair] = None
+        self._good.move_to_end(pair)
+        if len(self._good) > self._largest:
+            (_, oldest), _ = self._good.popitem(last=False)
+            self._homes -= Counter([oldest])
 
     def begin(self, name: str, address: str) -> None:
         """Count an attempt as failed until `good` says otherwise.
@@ -97,10 +113,7 @@ class SignInFailures:
                 others = [failure for failure in failures if failure[1] != pair]
                 failures.clear()
                 failures.extend(others)
-        self._good[pair] = None
-        self._good.move_to_end(pair)
-        if len(self._good) > self._largest:
-            self._good.popitem(last=False)
+        self.meet(name, address)
 
 
 def _kept(kept: "OrderedDict[K, deque[V]]", key: K, most: int, largest: int) -> "deque[V]":

@@ -73,7 +73,7 @@ async def sign_out(console: AppConsole, who: Anyone, request: Request, response:
     """Sign out."""
     if who.by == "session":
         await console.ask(lambda: console.people.close_session(who.secret))
-        console.known.clear()
+        console.roster.forget()
         response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
         await console.note(SecurityEvent.SIGNED_OUT, request, who.person.name)
 
@@ -161,7 +161,7 @@ async def change_account(
             due=True,
         )
     )
-    console.known.clear()
+    console.roster.forget()
     detail = _changes(name, body)
     await console.note(SecurityEvent.ACCOUNT_CHANGED, request, who.person.name, detail)
     return _account(made)
@@ -205,7 +205,7 @@ async def revoke(
     if token is None:
         raise HTTPException(404, f"there is no token {key}")
     await console.ask(lambda: console.people.revoke_token(key))
-    console.known.clear()
+    console.roster.forget()
     what = f"{token.label} of {token.name}"
     await console.note(SecurityEvent.TOKEN_REVOKED, request, who.person.name, what)
 
@@ -242,7 +242,7 @@ async def _set_password(
     await console.ask(
         lambda: console.people.change(name, console.now(), password_hash=kept, due=due)
     )
-    console.known.clear()
+    console.roster.forget()
 
 
 def _changes(name: str, change: models.AccountChange) -> str:

@@ -21,7 +21,6 @@ from heliotrope.console import models
 from heliotrope.console._files import SMALL, takes_gzip
 from heliotrope.console.auth import (
     DUES,
-    TRUSTED,
     Anyone,
     AppConsole,
     Caller,
@@ -35,6 +34,7 @@ from heliotrope.console.auth import (
     settle,
 )
 from heliotrope.console.models import json_type
+from heliotrope.console.roster import TRUSTED
 from heliotrope.errors import HeliotropeError
 from heliotrope.local.frames import REQUEST_BLOB
 from heliotrope.plant.interface import CALLS, BusyError, Call, WithBlob, orders

@@ -92,6 +92,7 @@ async def _begin(
     now, lifetime = console.now(), console.settings.session_s
     address = address_of(console.settings, connection)
     secret = await console.ask(lambda: console.people.open_session(name, now, lifetime, address))
+    console.roster.forget()
     await console.note(SecurityEvent.SIGNED_IN, connection, name, detail)
     return secret, now + lifetime
 
