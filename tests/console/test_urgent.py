@@ -48,7 +48,11 @@ def test_a_viewer_orders_it_once_by_both_ways(
     assert answer.json()["on"]
     assert ask("viewer", "POST", "emergency", order).json()["on"]
     assert ordered(console) == before + 1
+    # An equal one with another word merges with it; one with another reason is new.
     assert ask("viewer", "POST", "emergency", {**order, "call": "other"}).status_code == 200
+    assert ordered(console) == before + 1
+    more = {**order, "call": "third", "reason": "a fire"}
+    assert ask("viewer", "POST", "emergency", more).status_code == 200
     assert ordered(console) == before + 2
 
 

@@ -428,11 +428,13 @@ class Operator:
         pause = self._chance.choice([2.0, 33.0, 33.0, 310.0])
         self._rest_until = self._clock.monotonic() + pause
         who = self._chance.choice([VIEWER, self._duty])
-        self.raises(plant, who, act)
+        with contextlib.suppress(RefusedError):  # it was withdrawn again and again
+            self.raises(plant, who, act)
         if self._others.random() < _SECOND:  # another person has a reason of their own
             others = [person for person in (OPERATOR, ENGINEER, VIEWER) if person is not who]
             act = self._others.choice([Act.DEFOCUS, Act.STOW])
-            self.raises(plant, self._others.choice(others), act)
+            with contextlib.suppress(RefusedError):
+                self.raises(plant, self._others.choice(others), act)
 
     def raises(self, plant: PlantController, who: Person, act: Act) -> EmergencyOrder:
         """Raise an emergency, which anybody may do."""
