@@ -56,6 +56,13 @@ class Callers:
         """The orders that stand, one for each person."""
         return tuple(self._calls.values())
 
+    def pause(self, who: str, now: float) -> float:
+        """Return the time until an order of a person is taken, s; 0 if it is taken now."""
+        history = self._histories.get(who)
+        if history is None or who in self._calls:
+            return 0.0
+        return max(0.0, history.until - now)
+
     def take(self, who: str, act: Act, reason: str, at: float, now: float) -> bool:
         """Take an order of a person.
 
@@ -75,10 +82,9 @@ class Callers:
         RefusedError
             If the person pauses.
         """
+        if (wait := self.pause(who, now)) > 0.0:
+            raise refusals.EMERGENCY_PAUSED.error(who=who, wait=math.ceil(wait))
         history, before = self._histories.setdefault(who, _History()), self._calls.get(who)
-        if before is None and now < history.until:
-            wait = math.ceil(history.until - now)
-            raise refusals.EMERGENCY_PAUSED.error(who=who, wait=wait)
         history.given.append(now)
         if before is None:
             history.merged = 0

@@ -274,6 +274,10 @@ class Sentinel(Part):
         self._keep(order.at)
         return order
 
+    def pause(self, who: str) -> float:
+        """Return the time until an order of a person is taken, s; 0 if it is taken now."""
+        return self._callers.pause(who, self._clock.monotonic())
+
     def withdraw(self, who: str, by: str) -> str:
         """Withdraw one person's order; rows that it tripped still wait to be acknowledged.
 
