@@ -354,17 +354,17 @@ def test_the_store_is_asked_beside_the_loop(
     console: LiveConsole, ask: Ask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     people, threads = console.keeper.people, []
-    look = people.token
-    monkeypatch.setattr("heliotrope.console.auth.TRUSTED", -1.0)
+    look = people.valid
+    console.console_call(console.server.app.state.console.roster.forget)
 
-    def noted(secret: str, now: float) -> object:
+    def noted(now: float, used: list[str]) -> object:
         threads.append(threading.current_thread())
-        return look(secret, now)
+        return look(now, used)
 
-    monkeypatch.setattr(people, "token", noted)
+    monkeypatch.setattr(people, "valid", noted)
     assert ask("viewer", "GET", "sun").status_code == 200
     loops = {console.call(threading.current_thread), console.console_call(threading.current_thread)}
-    assert len(threads) == 1
+    assert threads
     assert not loops & set(threads)
     # Nor in the thread of the sockets, where all requests of the console wait.
     assert threads[0].name.startswith("plant people")
@@ -612,8 +612,8 @@ def test_emergency_does_not_wait_for_the_store(
         raise StoreError("store: cannot be read (gone)")
 
     assert ask("viewer", "GET", "summary").status_code == 200
-    monkeypatch.setattr("heliotrope.console.auth.TRUSTED", -1.0)
-    monkeypatch.setattr(console.keeper.people, "token", gone)
+    monkeypatch.setattr(console.keeper.people, "valid", gone)
+    console.console_call(console.server.app.state.console.roster.forget)
     assert ask("viewer", "GET", "summary").status_code == 503
     try:
         assert ask("viewer", "POST", "emergency").json()["on"]

@@ -15,7 +15,7 @@ from heliotrope.console import bodies, routes
 from heliotrope.console.headers import network_of
 from heliotrope.errors import InputError
 from heliotrope.local import Buckets
-from support.live_console import LiveConsole
+from support.live_console import PASSWORD, LiveConsole
 
 Ask = Callable[..., httpx.Response]
 #: Nested JSON of 16 MB, as deep as its parser follows.
@@ -180,6 +180,40 @@ def test_strangers_are_counted_and_known_callers_are_not(
         guess = {"Authorization": "Bearer guessed"}
         seen = [client.get(f"{console.address}api/v1/summary", headers=guess) for _ in range(30)]
         assert {answer.status_code for answer in seen} >= {429}
+
+
+def test_known_people_share_no_bucket_with_strangers(
+    console: LiveConsole, signed_in: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Strangers at many addresses have taken all that there is for strangers."""
+    here = console.server.app.state
+    monkeypatch.setattr(here.edge, "_strangers", Buckets(1.0, 0.0, lambda: 0.0))
+    assert signed_in.get("session").status_code == 200
+    person = {"name": "operator", "password": PASSWORD}
+    unmet = console.keeper.people.add_token("viewer", "unmet", "viewer", time.time())[1]
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        bearer = {"Authorization": f"Bearer {unmet}"}
+        assert client.get("summary", headers=bearer).status_code == 200
+        # Nor do those share it who sign in where somebody is signed in.
+        assert client.post("session", json=person).status_code == 200
+        client.cookies.clear()
+        monkeypatch.setattr(here.console.attempts, "is_home", lambda _: False)
+        assert client.post("session", json=person).status_code == 429
+
+
+def test_all_tokens_of_a_person_count_together(
+    console: LiveConsole, tokens: dict[str, str], ask: Ask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edge = console.server.app.state.edge
+    monkeypatch.setattr(edge, "_known", Buckets(1.0, 2.0, lambda: 0.0))
+    other = console.keeper.people.add_token("viewer", "other", "viewer", time.time())[1]
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        seen = [
+            client.get("summary", headers={"Authorization": f"Bearer {token}"}).status_code
+            for token in (tokens["viewer"], other, tokens["viewer"], other)
+        ]
+    assert seen == [200, 200, 429, 429]
+    assert ask("operator", "GET", "summary").status_code == 200
 
 
 def test_a_bucket() -> None:

@@ -1,6 +1,7 @@
 """The second factor: set up, asked for, used once, recovered, reset; and what it never asks."""
 
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from heliotrope.cli import app
+from heliotrope.console._attempts import AN_HOUR
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import UnknownNameError
 from heliotrope.store.factors import CODES, KEY_FILE, STEP
@@ -83,7 +85,7 @@ def required(console: LiveConsole) -> Iterator[None]:
 
     def put(settings: ConsoleSettings) -> None:
         here.settings = settings
-        here.known.clear()
+        here.roster.forget()
 
     console.call(lambda: put(ConsoleSettings(port=0, second_factor="operator")))
     yield
@@ -102,6 +104,16 @@ def test_it_is_asked_for_after_the_password(holder: Holder) -> None:
     good = holder.sign_in(holder.code())
     assert good.status_code == 200
     assert good.json()["factor"]
+
+
+def test_the_question_for_a_code_is_no_failure(holder: Holder) -> None:
+    """Every sign-in with a second factor asks for the code first."""
+    holder.enrol()
+    attempts = holder.console.server.app.state.console.attempts
+    holder.console.call(lambda: setattr(attempts, "_good", OrderedDict()))
+    for _ in range(2 * AN_HOUR):
+        assert holder.sign_in().status_code == 428
+    assert holder.sign_in(holder.code()).status_code == 200
 
 
 def test_a_code_is_good_once(holder: Holder) -> None:

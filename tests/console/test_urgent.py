@@ -1,15 +1,17 @@
 """EMERGENCY by a way of its own: the second listener."""
 
 import asyncio
+import hashlib
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack
 from typing import Any
 
 import httpx
 import pytest
 
+from heliotrope.console import roster
 from heliotrope.console.listeners import Listeners
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.urgent import EmergencyWay
@@ -46,7 +48,11 @@ def test_a_viewer_orders_it_once_by_both_ways(
     assert answer.json()["on"]
     assert ask("viewer", "POST", "emergency", order).json()["on"]
     assert ordered(console) == before + 1
+    # An equal one with another word merges with it; one with another reason is new.
     assert ask("viewer", "POST", "emergency", {**order, "call": "other"}).status_code == 200
+    assert ordered(console) == before + 1
+    more = {**order, "call": "third", "reason": "a fire"}
+    assert ask("viewer", "POST", "emergency", more).status_code == 200
     assert ordered(console) == before + 2
 
 
@@ -159,53 +165,90 @@ class Plant:
 
     def __init__(self) -> None:
         self.away: HeliotropeError | None = None
-        self.orders = 0
+        self.valid = ["good"]
+        self.orders = self.asked = 0
 
     async def ask(self, call: str, given: dict[str, Any], **_: Any) -> tuple[Any, bytes]:
         if call == "order_emergency":
             self.orders += 1
             return {"on": True}, b""
+        self.asked += 1
         if self.away is not None:
             raise self.away
-        known = given["secret"] == "good" * 16
-        return {"name": "ada", "role": "viewer", "expires": None} if known else None, b""
+        assert call == "people.valid"
+        made = {"name": "ada", "role": "viewer", "expires": None}
+        keys = [hashlib.sha256(word.encode() * 16).hexdigest() for word in self.valid]
+        found = [{"key": key, **made} for key in keys]
+        return {"sessions": found, "tokens": found}, b""
 
 
-def by_token(way: EmergencyWay, word: str, times: int = 1) -> list[int]:
-    """Return the statuses of some orders by token."""
+class Caller:
+    """Orders emergencies by tokens."""
 
-    async def main() -> list[int]:
-        transport = httpx.ASGITransport(app=way)
+    def __init__(self, way: EmergencyWay) -> None:
+        self.way = way
+
+    async def by_token(self, word: str, times: int = 1) -> list[int]:
+        """Return the statuses of some orders."""
+        transport = httpx.ASGITransport(app=self.way)
         headers = {"Authorization": f"Bearer {word * 16}"}
         async with httpx.AsyncClient(
             transport=transport, base_url="http://127.0.0.1", headers=headers
         ) as client:
             url = "/api/v1/emergency"
-            return [(await client.post(url, json={})).status_code for _ in range(times)]
+            sent = [client.post(url, json={}) for _ in range(times)]
+            return [answer.status_code for answer in await asyncio.gather(*sent)]
 
-    return asyncio.run(main())
+
+def at_work(plant: Plant, work: Callable[[Caller], Coroutine[Any, Any, None]]) -> None:
+    """Do something at a way whose roster is read."""
+
+    async def main() -> None:
+        way = EmergencyWay(plant.ask, ConsoleSettings())
+        async with asyncio.timeout(30.0), asyncio.TaskGroup() as group:
+            reading = group.create_task(way.roster.run())
+            await work(Caller(way))
+            reading.cancel()
+
+    asyncio.run(main())
 
 
 @pytest.mark.parametrize("away", [AwayError("no answer"), CallError("store", "it is full")])
-def test_it_knows_a_caller_whom_the_store_knew_lately(away: HeliotropeError) -> None:
+def test_it_knows_everybody_whom_the_store_knew_lately(
+    away: HeliotropeError, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plant = Plant()
-    way = EmergencyWay(plant.ask, ConsoleSettings())
-    assert by_token(way, "good") == [200]
-    plant.away = away
-    assert by_token(way, "good") == [200]
-    assert by_token(way, "evil") == [503]
-    plant.away = None
-    assert by_token(way, "evil") == [401]
-    assert plant.orders == 2
+    plant.valid = ["good", "unmet"]
+
+    async def work(caller: Caller) -> None:
+        assert await caller.by_token("good") == [200]
+        plant.away = away
+        monkeypatch.setattr(roster, "TRUSTED", -1.0)
+        assert await caller.by_token("good") == [200]
+        assert await caller.by_token("unmet") == [200]
+        assert await caller.by_token("evil") == [503]
+        plant.away, plant.valid = None, ["good"]
+        assert await caller.by_token("evil") == [401]
+        assert await caller.by_token("unmet") == [401]  # revoked
+        assert plant.orders == 3
+
+    at_work(plant, work)
 
 
 def test_strangers_are_counted_and_people_are_not() -> None:
+    """An unmet token neither counts with strangers nor waits behind them for the store."""
     plant = Plant()
-    way = EmergencyWay(plant.ask, ConsoleSettings())
-    way._stranger = Buckets(1.0, 10.0, lambda: 0.0)
-    assert by_token(way, "good") == [200]
-    assert by_token(way, "evil", 12) == [401] * 9 + [429] * 3
-    assert by_token(way, "good", 30) == [200] * 30
+
+    async def work(caller: Caller) -> None:
+        caller.way._stranger = Buckets(1.0, 10.0, lambda: 0.0)
+        before = plant.asked
+        assert sorted(await caller.by_token("evil", 200)) == [401] * 10 + [429] * 190
+        assert plant.asked <= before + 4
+        plant.valid.append("unmet")
+        assert await caller.by_token("unmet", 30) == [200] * 30
+        assert await caller.by_token("good", 30) == [200] * 30
+
+    at_work(plant, work)
 
 
 @pytest.mark.parametrize(
@@ -222,10 +265,11 @@ def test_text_that_cannot_be_read_is_refused_like_any_other(
     """An address without its bracket, and half a surrogate pair, were mistakes of the program."""
     plant = Plant()
 
-    async def main() -> int:
-        transport = httpx.ASGITransport(app=EmergencyWay(plant.ask, ConsoleSettings()))
+    async def work(caller: Caller) -> None:
+        transport = httpx.ASGITransport(app=caller.way)
         url = "http://127.0.0.1/api/v1/emergency"
         async with httpx.AsyncClient(transport=transport, headers=headers) as client:
-            return (await client.post(url, content=body)).status_code
+            assert (await client.post(url, content=body)).status_code == status
 
-    assert (asyncio.run(main()), plant.orders) == (status, 0)
+    at_work(plant, work)
+    assert plant.orders == 0

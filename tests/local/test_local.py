@@ -1,13 +1,14 @@
 """The local interface by itself: frames, and a listener under clients of every kind."""
 
 import asyncio
+import contextlib
 import os
 import socket
 import struct
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +45,15 @@ class _Echo:
 
     def __init__(self) -> None:
         self.most = self.now = self.held = 0
+        self.asked = self.answered = 0
+        self.valid = "good"
 
     async def caller(self, hello: dict[str, Any], user: int) -> _Caller | None:
         assert user == os.getuid()
+        self.asked += 1
         if hello.get("key") == "console":
             return _Caller(reserved=True)
-        return _Caller(reserved=False) if hello.get("token") == "good" else None
+        return _Caller(reserved=False) if hello.get("token") == self.valid else None
 
     async def answer(self, _: _Caller, frame: Frame) -> tuple[Any, bytes]:
         given = frame.head["arguments"]
@@ -60,6 +64,7 @@ class _Echo:
             await asyncio.sleep(given.get("wait", 0.0))
         finally:
             self.now -= 1
+            self.answered += 1
             self.held -= len(frame.blob)
         if frame.head["call"] == "refuse":
             raise InputError("no")
@@ -416,6 +421,49 @@ def test_the_oldest_caller_gives_way_and_a_console_never(tmp_path: Path) -> None
                 raw.close()
 
     _run(tmp_path, work)
+
+
+@pytest.mark.parametrize("idle", [False, True])
+def test_a_connection_ends_with_its_token(tmp_path: Path, idle: bool) -> None:
+    """A request on a standing connection has no more rights than a new connection would have."""
+
+    async def work(path: Path, echo: _Echo) -> None:
+        raw = await asyncio.to_thread(connect, path, 2.0)
+        with raw:
+            await asyncio.to_thread(raw.sendall, pack(HELLO) + pack(_request(1)))
+            while echo.answered < 1:
+                await asyncio.sleep(0.01)
+            echo.valid = "another"
+            if idle:
+                assert await asyncio.to_thread(_ended, raw)
+                return
+            await asyncio.sleep(2.0 * limits.trusted_s)
+            with contextlib.suppress(OSError):
+                await asyncio.to_thread(raw.sendall, pack(_request(2)) * 3)
+            assert await asyncio.to_thread(_ended, raw)
+        assert echo.answered == 1
+
+    limits = replace(SHORT, trusted_s=0.1 if idle else 0.3)
+    _run(tmp_path / "local", work, limits)
+
+
+def test_a_caller_is_asked_for_no_more_often_than_needed(tmp_path: Path) -> None:
+    async def work(path: Path, echo: _Echo) -> None:
+        line = LocalConnection(path, HELLO)
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(line.run())
+            while not line.up:
+                await asyncio.sleep(0.01)
+            for _ in range(50):
+                await line.ask("echo", {})
+            running.cancel()
+        assert echo.asked == 1
+
+    _run(tmp_path / "local", work, replace(SHORT, trusted_s=60.0))
+
+
+def _request(number: int) -> dict[str, Any]:
+    return {"id": number, "call": "echo", "arguments": {}}
 
 
 def test_a_connection_comes_back(tmp_path: Path) -> None:

@@ -291,6 +291,50 @@ def test_what_a_token_may_see_and_order(plant: LiveConsole, tokens: dict[str, st
         ask_once(folder / EMERGENCY, operator, "summary", {})
 
 
+def test_a_standing_connection_loses_what_its_account_loses(plant: LiveConsole) -> None:
+    """A token that is revoked, of a disabled account or of a lower role commands no more."""
+    people, now = plant.keeper.people, time.time
+    lines: dict[str, LocalConnection] = {}
+    for name in ("revoked", "disabled", "lowered"):
+        people.add(name, "none", "operator", now())
+        made, secret = people.add_token(name, "tests", "operator", now())
+        hello = {"token": secret}
+        lines[name] = LocalConnection(plant.interface.folder / ORDINARY, hello)
+        if name == "revoked":
+            revoked = made.key
+
+    async def take() -> dict[str, str]:
+        found = {}
+        for name, line in lines.items():
+            try:
+                await line.ask("take_authority", {})
+                await line.ask("release_authority", {})
+                found[name] = "taken"
+            except HeliotropeError as error:
+                found[name] = str(error)
+        return found
+
+    async def work() -> None:
+        async with asyncio.TaskGroup() as group:
+            running = [group.create_task(line.run()) for line in lines.values()]
+            while not all(line.up for line in lines.values()):
+                await asyncio.sleep(0.02)
+            assert set((await take()).values()) == {"taken"}
+            people.revoke_token(revoked)
+            people.change("disabled", now(), disabled=True)
+            people.change("lowered", now(), role="viewer")
+            await asyncio.sleep(5.5)
+            found = await take()
+            assert "lowered is viewer" in found["lowered"], found
+            assert not lines["revoked"].up, found
+            assert not lines["disabled"].up, found
+            assert "taken" not in found.values()
+            for one in running:
+                one.cancel()
+
+    asyncio.run(work())
+
+
 def test_a_blob_of_a_viewer_is_passed_over_and_the_role_is_named(
     plant: LiveConsole, tokens: dict[str, str]
 ) -> None:

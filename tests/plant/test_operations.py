@@ -408,6 +408,10 @@ def test_persons_come_before_the_automat() -> None:
         view = shown.viewer.emergency()
         assert (view.on, view.act, view.done) == (True, "STOW", 4)
         assert shown.summary().emergency
+        seen = len(shown.logbook.events(1000))
+        for _ in range(100):
+            shown.emergency(VIEWER, "STOW", "a fire")
+        assert len(shown.logbook.events(1000)) == seen
         # Two persons have their reasons; each withdraws their own, an engineer another's by name.
         shown.emergency(OPERATOR, reason="somebody on the tower")
         calls = [(call.who, call.act, call.reason) for call in shown.viewer.emergency().calls]

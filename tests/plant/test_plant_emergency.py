@@ -287,6 +287,26 @@ def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_pa
     assert not any(r.what == "STOW" for r in records)
 
 
+def test_a_flood_of_orders_leaves_one_record(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        order = plant.raise_emergency("Vera", reason="smoke")
+        for _ in range(500):
+            assert plant.raise_emergency("Vera", reason="smoke") is order
+        await bench.wait(2.0)
+        told = plant.withdraw_emergency(ENGINEER, "Vera")
+        assert told == "it was repeated 500 times; Vera's next one is taken in 30 s"
+        with pytest.raises(RefusedError, match="EMERGENCY: that of Vera"):
+            plant.raise_emergency("Vera", reason="smoke")
+        assert plant.raise_emergency(OPERATOR.name, Act.STOW).act is Act.STOW
+        await bench.wait(2.0)
+
+    bench = play(tmp_path, scene)
+    records, _ = read(bench.audit.path)
+    mine = [(record.who, record.what) for record in records if record.who != "safety table"]
+    assert mine == [("Vera", "DEFOCUS"), (ENGINEER.name, "WITHDRAW"), (OPERATOR.name, "STOW")]
+
+
 def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
     tmp_path: Path,
 ) -> None:

@@ -77,8 +77,7 @@ def test_people_read_back(old: Keeper) -> None:
     (account,) = old.people.accounts()
     assert (account.name, account.role, account.disabled) == ("anna", "engineer", False)
     secret = bytes(32).hex()
-    session, token = old.people.session(secret, 2.0), old.people.token(secret, 2.0)
-    assert session is not None
+    (session,), token = old.people.valid(2.0).sessions, old.people.token(secret, 2.0)
     assert token is not None
     assert (session.role, session.note) == ("engineer", "tablet")
     assert (token.role, token.label, token.expires) == ("viewer", "report", None)

@@ -1,5 +1,6 @@
 """Accounts, sessions and tokens, on SQLite and on PostgreSQL."""
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from sqlalchemy import select
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store import tables
 from heliotrope.store.keeper import Keeper
-from heliotrope.store.people import Account, People
+from heliotrope.store.people import LONGEST, MOST_SESSIONS, MOST_TOKENS, Account, People, Session
 
 HASH = "$argon2id$v=19$m=65536,t=3,p=4$c2FsdA$aGFzaA"
 
@@ -21,6 +22,12 @@ def people(keeper: Keeper) -> People:
     made.add("anna", HASH, "engineer", 100.0)
     made.add("ben", HASH, "operator", 101.0)
     return made
+
+
+def session_of(people: People, secret: str, now: float) -> Session | None:
+    """Return the valid session of a secret, None if there is none."""
+    key = hashlib.sha256(secret.encode()).hexdigest()
+    return next((one for one in people.valid(now).sessions if one.key == key), None)
 
 
 class TestAccounts:
@@ -90,7 +97,7 @@ class TestAccounts:
 class TestSessions:
     def test_last_until_they_expire(self, people: People) -> None:
         secret = people.open_session("ben", 200.0, 60.0, "control room")
-        found = people.session(secret, 259.9)
+        found = session_of(people, secret, 259.9)
         assert found is not None
         assert (found.name, found.role, found.since, found.expires, found.note) == (
             "ben",
@@ -99,9 +106,9 @@ class TestSessions:
             260.0,
             "control room",
         )
-        assert people.session(secret, 260.0) is None
-        assert people.sessions(259.9) == (found,)
-        assert people.sessions(260.0) == ()
+        assert session_of(people, secret, 260.0) is None
+        assert people.valid(259.9).sessions == (found,)
+        assert people.valid(260.0).sessions == ()
 
     def test_end(self, people: People) -> None:
         secrets = [people.open_session("ben", 200.0, 60.0) for _ in range(3)]
@@ -109,10 +116,17 @@ class TestSessions:
         assert len(set(secrets)) == 3
         people.close_session(secrets[0])
         people.close_session("none")
-        assert [people.session(s, 201.0) is None for s in secrets] == [True, False, False]
+        assert [session_of(people, s, 201.0) is None for s in secrets] == [True, False, False]
         people.close_sessions("ben")
-        assert [people.session(s, 201.0) is None for s in secrets] == [True, True, True]
-        assert people.session(other, 201.0) is not None
+        assert [session_of(people, s, 201.0) is None for s in secrets] == [True, True, True]
+        assert session_of(people, other, 201.0) is not None
+
+    def test_of_one_person_are_few(self, people: People) -> None:
+        other = people.open_session("anna", 100.0, 600.0)
+        secrets = [people.open_session("ben", 200.0 + k, 600.0) for k in range(MOST_SESSIONS + 3)]
+        valid = [session_of(people, secret, 300.0) is not None for secret in secrets]
+        assert valid == [False] * 3 + [True] * MOST_SESSIONS
+        assert session_of(people, other, 300.0) is not None
 
     @pytest.mark.parametrize("change", [{"password_hash": "new"}, {"disabled": True}])
     def test_end_with_a_new_password_and_when_disabled(
@@ -123,14 +137,15 @@ class TestSessions:
         _, other = people.add_token("anna", "report", "viewer", 200.0)
         people.change("ben", 201.0, **change)  # type: ignore[arg-type]
         people.change("ben", 201.5, disabled=False)
-        assert people.session(secret, 202.0) is None
+        assert session_of(people, secret, 202.0) is None
         assert people.token(word, 202.0) is None
         assert people.token(other, 202.0) is not None
+        assert [token.name for token in people.valid(202.0).tokens] == ["anna"]
 
     def test_have_the_role_that_the_account_has_now(self, people: People) -> None:
         secret = people.open_session("ben", 200.0, 60.0)
         people.change("ben", 201.0, role="viewer")
-        assert people.session(secret, 202.0).role == "viewer"  # type: ignore[union-attr]
+        assert session_of(people, secret, 202.0).role == "viewer"  # type: ignore[union-attr]
 
     def test_are_not_for_the_disabled(self, people: People) -> None:
         people.change("ben", 150.0, disabled=True)
@@ -143,11 +158,34 @@ class TestSessions:
         people.add_token("ben", "for ever", "viewer", 200.0)
         people.forget_expired(300.0)
         keeper.writer.confirmed().result(10.0)
-        assert people.sessions(0.0) == ()
+        assert people.valid(0.0).sessions == ()
         assert [t.label for t in people.tokens()] == ["for ever"]
 
 
 class TestTokens:
+    def test_of_one_person_are_few(self, people: People) -> None:
+        made = [people.add_token("ben", f"t {k}", "viewer", 200.0)[0] for k in range(MOST_TOKENS)]
+        with pytest.raises(InputError, match=f"ben has {MOST_TOKENS} tokens already; revoke one"):
+            people.add_token("ben", "one more", "viewer", 200.0)
+        people.add_token("anna", "report", "viewer", 200.0)
+        people.revoke_token(made[0].key)
+        people.add_token("ben", "one more", "viewer", 200.0)
+
+    def test_are_all_valid_as_each_is(self, people: People) -> None:
+        """One picture of all says what a question about each one says, also of its use."""
+        tokens = [people.add_token("ben", "t", "operator", 200.0, life) for life in (5.0, None)]
+        people.change("ben", 201.0, role="viewer")
+        for now, left in ((204.0, 2), (206.0, 1), (200.0 + LONGEST["operator"], 0)):
+            found = people.valid(now).tokens
+            assert {one.key for one in found} == {
+                made.key for made, secret in tokens if people.token(secret, now) is not None
+            }
+            assert len(found) == left
+            assert {one.role for one in found} <= {"viewer"}
+        people.valid(9000.0, [tokens[1][0].key])
+        people.revoke_token(tokens[0][0].key)  # waits for what was written before
+        assert [one.last_used for one in people.tokens("ben")] == [9000.0]
+
     def test_last_no_longer_than_their_role_allows(self, people: People) -> None:
         for role, days in (("viewer", 365), ("operator", 90)):
             with pytest.raises(InputError, match=f"role {role} lasts at most {days}"):

@@ -21,7 +21,7 @@ from heliotrope.console.process import ProcessInput
 from heliotrope.console.remote import RemotePlant
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.console.urgent_process import server_of
+from heliotrope.console.urgent_process import server_of, way_of
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.volumes import Box
 from heliotrope.links.clock import VirtualClock
@@ -54,9 +54,11 @@ async def serving(
     plant = RemotePlant(interface.folder, interface.key)
     server = ConsoleServer(plant, lines.settings, page)
     urgent = LocalConnection(interface.folder / EMERGENCY, {"key": interface.key}, 10.0)
-    beside = server_of(urgent, ProcessInput(interface.folder, interface.key, lines.settings, way))
+    inputs = ProcessInput(interface.folder, interface.key, lines.settings, way)
+    second = way_of(urgent, inputs)
+    beside = server_of(second, inputs)
     async with asyncio.TaskGroup() as group:
-        connecting = [group.create_task(one.run()) for one in (plant, urgent)]
+        connecting = [group.create_task(one.run()) for one in (plant, urgent, second.roster)]
         async with running(server), running(beside):
             await plant.up()
             while not urgent.up:

@@ -113,9 +113,10 @@ def all_withdrawn(patch: pytest.MonkeyPatch) -> None:
     """One person's withdrawal ends the orders of all."""
     withdraw = sentinel.Sentinel.withdraw
 
-    def careless(self: Any, who: str) -> None:
-        self._calls.clear()
-        withdraw(self, who)
+    def careless(self: sentinel.Sentinel, who: str, by: str) -> str:
+        for call in self.calls:
+            self._callers.withdraw(call.who, call.who, 0.0)
+        return withdraw(self, who, by)
 
     patch.setattr(sentinel.Sentinel, "withdraw", careless)
 

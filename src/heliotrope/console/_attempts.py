@@ -2,11 +2,12 @@
 
 Each of the three delays the next attempt, the longer the more failures there were. Only the first
 ends guessing (`AN_HOUR` attempts): the other two merely slow it, since whoever guesses could
-otherwise keep a person, or everybody at one address, out. A name that has signed in from an address
-is not delayed there by what others do.
+otherwise keep a person, or everybody at one address, out. A name that is guessed from ever new
+addresses is so slowed to some fourteen attempts an hour from all of them together. A name that has
+signed in from an address is not delayed there by what others do.
 """
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Collection
 from typing import TypeVar
 
@@ -14,9 +15,9 @@ from typing import TypeVar
 SPAN, AN_HOUR = 3600.0, 12
 #: Delay after each failure of a name at an address, s; the first ones cost nothing.
 _OWN = (0.0, 0.0, 0.0, 0.0, 15.0, 30.0, 60.0, 120.0, 240.0, 300.0, 300.0)
-#: Failures of a name, or from an address, that cost nothing; then the delay doubles from 1 s up to
+#: Failures of a name, and from an address, that cost nothing; then the delay doubles from 1 s up to
 #: the longest, s.
-_FREE, _LONGEST_NAME, _LONGEST_ADDRESS = 20, 30.0, 10.0
+_NAME, _ADDRESS = (5, 300.0), (20, 10.0)
 _KEPT = 64
 Pair = tuple[str, str]
 K = TypeVar("K")
@@ -48,18 +49,38 @@ class SignInFailures:
         self._names: OrderedDict[str, deque[tuple[float, Pair]]] = OrderedDict()
         self._addresses: OrderedDict[str, deque[tuple[float, Pair]]] = OrderedDict()
         self._good: OrderedDict[Pair, None] = OrderedDict()
+        self._homes = Counter[str]()
 
     def wait(self, name: str, address: str) -> float:
         """Return the time to wait before the next attempt, s; 0 if it may be made now."""
         now, pair = self._now(), (name, address)
         until = _own_until(self._pairs.get(pair, ()), now)
-        if pair not in self._good:
+        if not self.known(name, address):
             until = max(
                 until,
-                _shared_until(self._names.get(name, ()), now, _LONGEST_NAME),
-                _shared_until(self._addresses.get(address, ()), now, _LONGEST_ADDRESS),
+                _shared_until(self._names.get(name, ()), now, *_NAME),
+                _shared_until(self._addresses.get(address, ()), now, *_ADDRESS),
             )
         return max(0.0, until - now)
+
+    def known(self, name: str, address: str) -> bool:
+        """Whether a name has signed in from an address."""
+        return (name, address) in self._good
+
+    def is_home(self, address: str) -> bool:
+        """Whether anybody has signed in from an address."""
+        return address in self._homes
+
+    def meet(self, name: str, address: str) -> None:
+        """Note that a name has signed in from an address."""
+        pair = (name, address)
+        if pair not in self._good:
+            self._homes[address] += 1
+        self._good[pair] = None
+        self._good.move_to_end(pair)
+        if len(self._good) > self._largest:
+            (_, oldest), _ = self._good.popitem(last=False)
+            self._homes -= Counter([oldest])
 
     def begin(self, name: str, address: str) -> None:
         """Count an attempt as failed until `good` says otherwise.
@@ -72,6 +93,17 @@ class SignInFailures:
         if address not in self._shared:
             _kept(self._addresses, address, _KEPT, self._largest).append((now, pair))
 
+    def undo(self, name: str, address: str) -> None:
+        """Count the last attempt of a name at an address no more: it was no guess."""
+        pair = (name, address)
+        if times := self._pairs.get(pair):
+            times.pop()
+        for failures in (self._names.get(name), self._addresses.get(address)):
+            last = [failure for failure in failures or () if failure[1] == pair][-1:]
+            for failure in last:
+                assert failures is not None
+                failures.remove(failure)
+
     def good(self, name: str, address: str) -> None:
         """Forget the failures of a name at an address where it has signed in, and no others."""
         pair = (name, address)
@@ -81,10 +113,7 @@ class SignInFailures:
                 others = [failure for failure in failures if failure[1] != pair]
                 failures.clear()
                 failures.extend(others)
-        self._good[pair] = None
-        self._good.move_to_end(pair)
-        if len(self._good) > self._largest:
-            self._good.popitem(last=False)
+        self.meet(name, address)
 
 
 def _kept(kept: "OrderedDict[K, deque[V]]", key: K, most: int, largest: int) -> "deque[V]":
@@ -106,8 +135,10 @@ def _own_until(times: Collection[float], now: float) -> float:
     return recent[-1] + _OWN[len(recent) - 1]
 
 
-def _shared_until(failures: Collection[tuple[float, Pair]], now: float, longest: float) -> float:
+def _shared_until(
+    failures: Collection[tuple[float, Pair]], now: float, free: int, longest: float
+) -> float:
     """Return when anybody may try again for a name, or from an address, s."""
     recent = [at for at, _ in failures if now - at < SPAN]
-    more = len(recent) - _FREE
+    more = len(recent) - free
     return recent[-1] + min(longest, 2.0**more) if more >= 0 else now

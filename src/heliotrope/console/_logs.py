@@ -22,11 +22,11 @@ class Repeated(logging.Filter):
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._now = monotonic
-        self._counts: dict[tuple[str, int, str], tuple[float, int]] = {}
+        self._counts: dict[tuple[str, int], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether a line is written."""
-        kind = (record.name, record.lineno, str(record.msg)[:60].partition("\n")[0])
+        kind = (record.name, record.lineno)  # never its text, which a stranger may choose
         now = self._now()
         begun, count = self._counts.get(kind, (now, 0))
         if now - begun >= SPAN:

@@ -17,7 +17,8 @@ from heliotrope.console.auth import (
     same_origin,
     signed_in,
 )
-from heliotrope.console.headers import COOKIE
+from heliotrope.console.hashing import CrowdError, GoneError
+from heliotrope.console.headers import COOKIE, address_of
 from heliotrope.console.people import ROLES
 from heliotrope.console.sign_in import confirm, log_in, set_cookie
 from heliotrope.plant.operations.security import SecurityEvent
@@ -72,7 +73,7 @@ async def sign_out(console: AppConsole, who: Anyone, request: Request, response:
     """Sign out."""
     if who.by == "session":
         await console.ask(lambda: console.people.close_session(who.secret))
-        console.known.clear()
+        console.roster.forget()
         response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
         await console.note(SecurityEvent.SIGNED_OUT, request, who.person.name)
 
@@ -91,7 +92,7 @@ async def own_password(
         await confirm(console, who, request, body.old)
     if body.new == body.old:
         raise HTTPException(422, "this is your password already; give another one")
-    await _set_password(console, who.person.name, body.new)
+    await _set_password(console, who, request, who.person.name, body.new)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
     await console.note(SecurityEvent.PASSWORD_CHANGED, request, who.person.name)
 
@@ -109,7 +110,7 @@ async def reset_password(
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     await _find(console, name, password=True)
     password = _secrets.new_password()
-    await _set_password(console, name, password, due=True)
+    await _set_password(console, who, request, name, password, due=True)
     await console.note(SecurityEvent.PASSWORD_RESET, request, who.person.name, name)
     return models.GivenPassword(name=name, password=password)
 
@@ -127,7 +128,7 @@ async def new_account(
 ) -> models.AccountState:
     """Create an account; its password must be changed at first use."""
     await confirm(console, who, request, body.own_password)
-    kept = await _hashed(console, body.password)
+    kept = await _hashed(console, who, request, body.password)
     made = await console.ask(
         lambda: console.people.add(body.name, kept, body.role, console.now(), due=True)
     )
@@ -147,7 +148,9 @@ async def change_account(
     if name == who.person.name and (body.disabled or body.role not in (None, "engineer")):
         raise HTTPException(409, f"{name}: you cannot change your own role; ask another engineer")
     await _find(console, name, password=body.password is not None)
-    kept = await _hashed(console, body.password) if body.password is not None else None
+    kept = None
+    if body.password is not None:
+        kept = await _hashed(console, who, request, body.password)
     made = await console.ask(
         lambda: console.people.change(
             name,
@@ -158,7 +161,7 @@ async def change_account(
             due=True,
         )
     )
-    console.known.clear()
+    console.roster.forget()
     detail = _changes(name, body)
     await console.note(SecurityEvent.ACCOUNT_CHANGED, request, who.person.name, detail)
     return _account(made)
@@ -202,7 +205,7 @@ async def revoke(
     if token is None:
         raise HTTPException(404, f"there is no token {key}")
     await console.ask(lambda: console.people.revoke_token(key))
-    console.known.clear()
+    console.roster.forget()
     what = f"{token.label} of {token.name}"
     await console.note(SecurityEvent.TOKEN_REVOKED, request, who.person.name, what)
 
@@ -222,17 +225,24 @@ async def _without_password(console: Console, who: Caller) -> bool:
     return who.by == "session" and found is not None and found.no_password
 
 
-async def _hashed(console: Console, password: str) -> str:
-    async with console.hashing:
-        return await asyncio.to_thread(_secrets.hash_password, password)
+async def _hashed(console: Console, who: Caller, request: Request, password: str) -> str:
+    """Return the hash of a new password, which somebody who has signed in gives."""
+    pair = (who.person.name, address_of(console.settings, request))
+    try:
+        async with console.hashing.turn(pair, request.is_disconnected, known=True):
+            return await asyncio.to_thread(_secrets.hash_password, password)
+    except (CrowdError, GoneError) as error:
+        raise HTTPException(429, f"{error}; try again in 1 s", {"Retry-After": "1"}) from None
 
 
-async def _set_password(console: Console, name: str, password: str, *, due: bool = False) -> None:
-    kept = await _hashed(console, password)
+async def _set_password(
+    console: Console, who: Caller, request: Request, name: str, password: str, *, due: bool = False
+) -> None:
+    kept = await _hashed(console, who, request, password)
     await console.ask(
         lambda: console.people.change(name, console.now(), password_hash=kept, due=due)
     )
-    console.known.clear()
+    console.roster.forget()
 
 
 def _changes(name: str, change: models.AccountChange) -> str:

@@ -34,8 +34,10 @@ from heliotrope.console.auth import (
     settle,
 )
 from heliotrope.console.models import json_type
+from heliotrope.console.roster import TRUSTED
+from heliotrope.errors import HeliotropeError
 from heliotrope.local.frames import REQUEST_BLOB
-from heliotrope.plant.interface import CALLS, Call, WithBlob, orders
+from heliotrope.plant.interface import CALLS, BusyError, Call, WithBlob, orders
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.orders.authority import OPERATOR_COMMANDS, Role
 
@@ -211,27 +213,39 @@ async def live(socket: WebSocket) -> None:
     if who.owes:
         await socket.close(4403, DUES[who.owes][0])
         return
-    if console.stream.viewers >= console.settings.viewers:
-        await socket.close(4429, f"{console.settings.viewers} viewers are connected already")
-        return
-    checked = console.now()
+    try:
+        with console.stream.place(who.person):
+            await _show(console, socket)
+    except BusyError as error:
+        await socket.close(4429, str(error))
 
-    async def allowed() -> bool:
-        nonlocal checked
-        if console.now() - checked < 10.0:
-            return True
-        checked = console.now()
-        return await find_caller(console, socket) is not None
+
+async def _show(console: Console, socket: WebSocket) -> None:
+    """Send the live stream until its viewer leaves, may see it no more, or the console ends."""
 
     async def follow() -> None:
         # A viewer that has left is noticed below: a closed socket cannot be written to.
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, OSError):
-            await console.stream.follow(socket.send_bytes, allowed)
+            await console.stream.follow(socket.send_bytes)
+
+    async def end() -> None:
+        """Close the socket once its session or token has ended, also where nothing is sent."""
+        while await _still_known(console, socket):
+            await asyncio.sleep(TRUSTED)
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError, OSError):
             await socket.close(4401, "the session has ended")
 
     async with asyncio.TaskGroup() as group:
-        following = group.create_task(follow())
-        # The viewer leaves, the console ends, or `follow` has closed the socket.
+        works = [group.create_task(work()) for work in (follow, end)]
         while (await socket.receive())["type"] != "websocket.disconnect":
             pass
-        following.cancel()
+        for work in works:
+            work.cancel()
+
+
+async def _still_known(console: Console, socket: WebSocket) -> bool:
+    """Whether a viewer may watch on; whoever was admitted may while the store cannot say."""
+    try:
+        return await find_caller(console, socket) is not None
+    except HeliotropeError:
+        return True

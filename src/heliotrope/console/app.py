@@ -23,8 +23,10 @@ from heliotrope.console.by_proxy import ByProxy
 from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
 from heliotrope.console.guard import Guard
+from heliotrope.console.headers import network_of
 from heliotrope.console.live import Stream
 from heliotrope.console.remote import RemotePeople, RemotePlant
+from heliotrope.console.roster import Key, Roster
 from heliotrope.console.routes import Routes
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.sign_in import enter, enter_once, set_cookie
@@ -33,6 +35,7 @@ from heliotrope.local import AwayError
 from heliotrope.plant.interface import BusyError
 from heliotrope.plant.orders.audit import AuditError
 from heliotrope.plant.orders.authority import RefusedError, Role
+from heliotrope.store.people import ApiToken, Session
 from heliotrope.store.records import StoreError
 
 ABOUT = (
@@ -61,9 +64,18 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
         Settings of the console.
     """
     chosen = settings or ConsoleSettings()
-    people, stream = RemotePeople(plant), Stream(plant, chosen.period)
+    people, stream = RemotePeople(plant), Stream(plant, chosen.period, chosen.viewers)
     attempts = SignInFailures(time.monotonic, chosen.proxies)
-    console = Console(plant, people, chosen, stream, attempts)
+
+    async def read(used: list[str]) -> dict[Key, Session | ApiToken]:
+        found = await plant.valid(used)
+        # Whoever is signed in has a place there, also after a new start of this process.
+        for one in found.values():
+            if isinstance(one, Session):
+                attempts.meet(one.name, network_of(one.note))
+        return found
+
+    console = Console(plant, people, chosen, stream, attempts, Roster(read))
     if chosen.people_by_proxy is not None:
         console.by_proxy = ByProxy.read(chosen.people_by_proxy)
 
@@ -72,7 +84,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
         del app
         people.begin()
         async with asyncio.TaskGroup() as group:
-            parts = (stream.run(), console.forget_expired())
+            parts = (stream.run(), console.roster.run(), console.forget_expired())
             works = [group.create_task(part) for part in parts]
             yield
             for work in works:

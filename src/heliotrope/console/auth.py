@@ -21,10 +21,12 @@ from heliotrope.console import _words
 from heliotrope.console._attempts import SignInFailures
 from heliotrope.console.by_proxy import ByProxy, Introduced
 from heliotrope.console.connections import FOUND
+from heliotrope.console.hashing import Hashing
 from heliotrope.console.headers import address_of, host_known, parts_of, secret_of
 from heliotrope.console.live import Stream
 from heliotrope.console.people import ROLES, person_of
 from heliotrope.console.remote import RemotePeople, RemotePlant
+from heliotrope.console.roster import Roster
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
 from heliotrope.plant.operations.security import SPAN, SecurityEvent, plain
@@ -32,11 +34,6 @@ from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.people import Account, ApiToken, Session
 
 T = TypeVar("T")
-#: A session that was found valid is trusted for this long without asking the store, s.
-TRUSTED = 5.0
-#: The same for EMERGENCY alone, s.
-LONG_TRUSTED = 3600.0
-MOST_KNOWN = 2000
 #: Security events of one kind that are sent to the plant within a minute.
 MOST_NOTED = 100
 #: The shared answer that never changes.
@@ -68,8 +65,9 @@ class Console:
     settings: ConsoleSettings
     stream: Stream
     attempts: SignInFailures
-    #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
-    hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    roster: Roster[Session | ApiToken]
+    #: Turns for checks of passwords.
+    hashing: Hashing = field(default_factory=Hashing)
 
     #: How a trusted proxy names people; None: it does not.
     by_proxy: ByProxy | None = None
@@ -81,9 +79,6 @@ class Console:
     threads: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(4, "console store")
     )
-
-    #: Recently authenticated callers, with the time, by kind and secret.
-    known: dict[tuple[str, str], tuple[float, "Caller"]] = field(default_factory=dict)
 
     #: When the last security events of each kind were sent to the plant, s.
     noted: dict[SecurityEvent, deque[float]] = field(default_factory=dict)
@@ -205,21 +200,25 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
 
     EMERGENCY accepts a caller known recently: it must not wait for a store that is slow or
     gone.
+
+    Raises
+    ------
+    HeliotropeError
+        If the store cannot say.
     """
     presented = secret_of(connection)
     if presented is None:
         return None
-    by, secret = presented
-    trusted = LONG_TRUSTED if _is_emergency(connection) else TRUSTED
-    known, now = console.known.get((by, secret)), time.monotonic()
-    if known is None or now - known[0] > trusted:
-        known = await _look_up(console, by, secret)
-        if known is None:
-            return None
-    who = known[1]
-    if not _is_emergency(connection) and not _as_introduced(console, connection, who):
+    emergency = _is_emergency(connection)
+    find = console.roster.find_for_emergency if emergency else console.roster.find
+    record = await find(*presented)
+    if record is None or (record.expires is not None and record.expires <= console.now()):
         return None
-    return who if who.expires is None or who.expires > console.now() else None
+    if isinstance(record, Session):
+        who = signed_in(console, record, presented[1], record.expires)
+    else:
+        who = Caller(person_of(record.name, record.role), *presented, record.expires)
+    return who if emergency or _as_introduced(console, connection, who) else None
 
 
 def introduced(console: Console, connection: HTTPConnection) -> Introduced | None:
@@ -238,27 +237,6 @@ def _as_introduced(console: Console, connection: HTTPConnection, who: Caller) ->
     if person is None:
         return not who.by_proxy
     return who.by_proxy and (person.name, person.role) == (who.person.name, who.person.role.title)
-
-
-async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Caller] | None:
-    """Ask the store for the owner of a secret."""
-    now = console.now()
-    record: ApiToken | Session | None
-    if by == "token":
-        record = await console.ask(lambda: console.people.token(secret, now))
-    else:
-        record = await console.ask(lambda: console.people.session(secret, now))
-    if record is None:
-        console.known.pop((by, secret), None)
-        return None
-    if isinstance(record, Session):
-        who = signed_in(console, record, secret, record.expires)
-    else:
-        who = Caller(person_of(record.name, record.role), by, secret, record.expires)
-    if len(console.known) > MOST_KNOWN:
-        console.known.clear()
-    known = console.known[by, secret] = (time.monotonic(), who)
-    return known
 
 
 def signed_in(console: Console, account: Account | Session, secret: str, expires: float) -> Caller:

@@ -1,8 +1,7 @@
-"""How often callers may send requests: strangers by address, known callers by session or token."""
+"""How often callers may send requests: strangers by address, known callers by person."""
 
 import math
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -10,15 +9,13 @@ from fastapi import HTTPException
 from starlette.requests import HTTPConnection
 
 from heliotrope.console.auth import Caller, Console, find_caller
-from heliotrope.console.headers import STRANGER, STRANGERS, address_of, network_of, secret_of
+from heliotrope.console.headers import STRANGER, STRANGERS, address_of, network_of
 from heliotrope.local import Buckets
 
-#: Requests of one session or token; 1/s, and at once.
+#: Requests of one person; 1/s, and at once.
 KNOWN = (200.0, 1000.0)
-#: Large bodies at the same time: from all, and of one session or token.
+#: Large bodies at the same time: from all, and of one person.
 MOST_LARGE, OWN_LARGE = 4, 1
-#: Sessions and tokens that are remembered as having been valid.
-_MOST_SEEN = 4096
 
 
 class Edge:
@@ -34,36 +31,26 @@ class Edge:
         self._stranger = Buckets(*STRANGER, monotonic)
         self._strangers = Buckets(*STRANGERS, monotonic)
         self._known = Buckets(*KNOWN, monotonic)
-        self._admitted: OrderedDict[tuple[str, str], None] = OrderedDict()
-        self._large: list[tuple[str, str]] = []
+        self._large: list[str] = []
 
     async def find(self, console: Console, connection: HTTPConnection) -> Caller | None:
         """Return the caller, None for a stranger.
 
-        A secret that was valid before is looked up at once. Any other one counts as a stranger's
-        request first: a look at the store costs the plant something.
+        A known caller's request never counts with those of strangers, and what strangers send
+        from an address where somebody has signed in never with those from elsewhere.
 
         Raises
         ------
         HTTPException
             429 if requests come too often.
         """
-        secret = secret_of(connection)
-        if secret is None or secret not in self._admitted:
-            self._count_stranger(console, connection)
-        who = None if secret is None else await find_caller(console, connection)
-        if secret is None or who is None:
-            self._admitted.pop(secret or ("", ""), None)
-            return None
-        self._admitted[secret] = None
-        self._admitted.move_to_end(secret)
-        if len(self._admitted) > _MOST_SEEN:
-            self._admitted.popitem(last=False)
+        who = await find_caller(console, connection)
+        if who is None:
+            address = network_of(address_of(console.settings, connection))
+            _refuse(self._stranger.take(address))
+            if not console.attempts.is_home(address):
+                _refuse(self._strangers.take(""))
         return who
-
-    def _count_stranger(self, console: Console, connection: HTTPConnection) -> None:
-        address = network_of(address_of(console.settings, connection))
-        _refuse(self._stranger.take(address) or self._strangers.take(""))
 
     def count(self, who: Caller) -> None:
         """Count a request of a known caller.
@@ -73,7 +60,7 @@ class Edge:
         HTTPException
             429 if requests come too often.
         """
-        _refuse(self._known.take(f"{who.by} {who.secret}"))
+        _refuse(self._known.take(who.person.name))
 
     @contextmanager
     def large(self, who: Caller) -> Iterator[None]:
@@ -84,7 +71,7 @@ class Edge:
         HTTPException
             429 if all are taken.
         """
-        key = (who.by, who.secret)
+        key = who.person.name
         if len(self._large) >= MOST_LARGE or self._large.count(key) >= OWN_LARGE:
             raise HTTPException(
                 429, "another large request is at work; try again", {"Retry-After": "1"}

@@ -35,7 +35,7 @@ async def confirm_factor(
         raise HTTPException(403, "a token cannot change a second factor; sign in to do so")
     name = who.person.name
     codes = await console.ask(lambda: console.people.confirm_factor(name, body.code, console.now()))
-    console.known.clear()
+    console.roster.forget()
     await console.note(SecurityEvent.FACTOR_CHANGED, request, name, "set up")
     return models.RecoveryCodes(codes=list(codes))
 
@@ -49,7 +49,7 @@ async def remove_own_factor(
     name = who.person.name
     if not await console.ask(lambda: console.people.remove_factor(name)):
         raise HTTPException(404, f"{name} has no second factor")
-    console.known.clear()
+    console.roster.forget()
     await console.note(SecurityEvent.FACTOR_CHANGED, request, name, "removed")
 
 
@@ -68,5 +68,5 @@ async def remove_factor(
     if not await console.ask(lambda: console.people.remove_factor(name)):
         raise HTTPException(404, f"{name} has no second factor")
     await console.ask(lambda: console.people.close_sessions(name))
-    console.known.clear()
+    console.roster.forget()
     await console.note(SecurityEvent.FACTOR_CHANGED, request, who.person.name, f"removed: {name}")

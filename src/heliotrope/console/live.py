@@ -2,12 +2,15 @@
 
 A new viewer gets the whole field, then only rows that changed; `stream` holds the messages' form.
 
-A slow viewer misses messages, and then gets the whole field again: nothing is queued.
+A slow viewer misses messages, and then gets the whole field again: nothing is queued. A person has
+a few places, and the last ones are for those who may command.
 """
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Awaitable, Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -17,13 +20,18 @@ from heliotrope.console.remote import RemotePlant
 from heliotrope.console.stream import ROW, changed, message
 from heliotrope.errors import HeliotropeError
 from heliotrope.lcu import names as meanings
-from heliotrope.plant.interface import frame_of
+from heliotrope.plant.interface import BusyError, frame_of
 from heliotrope.plant.operations.views import FieldFrame
+from heliotrope.plant.orders.authority import Person, Role
 
 #: Flags that come and go with every step or sun vector, which would change every row.
 _RESTLESS = sum(1 << meanings.FLAGS.index(name) for name in ("MOVING", "SUN_FRESH"))
 #: Flag of drives that are switched off at the mirror: it confirms *out of service*.
 _SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
+
+
+#: Streams of one person, and share of all places that is kept for operators and engineers.
+OWN, RESERVED = 20, 0.2
 
 
 def rows_of(frame: FieldFrame) -> npt.NDArray[Any]:
@@ -48,16 +56,19 @@ class Stream:
         The plant at work.
     period
         Time between messages, s.
+    most
+        Viewers at once.
     """
 
-    def __init__(self, plant: RemotePlant, period: float = 1.0) -> None:
-        self._plant, self._period = plant, period
+    def __init__(self, plant: RemotePlant, period: float = 1.0, most: int = 200) -> None:
+        self._plant, self._period, self._most = plant, period, most
         self._rows: npt.NDArray[Any] | None = None
         self._header: dict[str, Any] = {}
         self._whole = b""
         self.news = b""
         self.tick = 0
-        self.viewers = 0
+        #: Streams of each person.
+        self._places = Counter[str]()
         self._turned, self._making = asyncio.Event(), asyncio.Lock()
         self._problem: str = ""
 
@@ -69,7 +80,7 @@ class Stream:
             if time.monotonic() < due:
                 continue
             due = max(due + self._period, time.monotonic())
-            if self.viewers:
+            if self._places:
                 await self.make()
 
     async def make(self) -> None:
@@ -103,24 +114,36 @@ class Stream:
             self._whole = message({**self._header, "whole": True}, self._rows)
         return self._whole
 
-    async def follow(
-        self, send: Callable[[bytes], Any], allowed: Callable[[], Awaitable[bool]]
-    ) -> None:
-        """Send to one viewer for as long as they are allowed to watch."""
-        self.viewers += 1
+    @contextlib.contextmanager
+    def place(self, who: Person) -> Iterator[None]:
+        """Hold a place for one stream of a person.
+
+        Raises
+        ------
+        BusyError
+            If the person has as many as one may have, or all that they may take are taken.
+        """
+        most = self._most if who.role >= Role.OPERATOR else round(self._most * (1.0 - RESERVED))
+        if self._places[who.name] >= OWN:
+            raise BusyError(f"{OWN} streams of {who.name} are open already; close one")
+        if self._places.total() >= most:
+            raise BusyError(f"{most} streams are open already; close one")
+        self._places[who.name] += 1
         try:
-            if self.viewers == 1:
-                await self.make()
-            data = await self.whole()
-            sent = self.tick if data else -1
-            if data:
-                await send(data)
-            while True:
-                await self._turned.wait()
-                if not await allowed():
-                    return
-                data = self.news if self.tick == sent + 1 else await self.whole()
-                sent = self.tick
-                await send(data)
+            yield
         finally:
-            self.viewers -= 1
+            self._places -= Counter([who.name])
+
+    async def follow(self, send: Callable[[bytes], Any]) -> None:
+        """Send to one viewer until cancelled."""
+        if self._places.total() == 1:
+            await self.make()
+        data = await self.whole()
+        sent = self.tick if data else -1
+        if data:
+            await send(data)
+        while True:
+            await self._turned.wait()
+            data = self.news if self.tick == sent + 1 else await self.whole()
+            sent = self.tick
+            await send(data)

@@ -20,6 +20,7 @@ from typing import Any, Protocol
 
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
+from heliotrope.local import log_lines
 
 #: Time between two signs of life, s.
 BEAT = 1.0
@@ -55,6 +56,7 @@ def main(work: Callable[[ProcessInput], Coroutine[Any, Any, None]]) -> int:
     """Do the work of a process until standard input ends; return the exit code."""
     # The plant stows its field after Ctrl-C, and people watch that here.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    log_lines.install()
     read = json.loads(sys.stdin.buffer.readline())
     line = socket.socket(fileno=read["line"])
     settings = ConsoleSettings.of(read["settings"])

@@ -5,9 +5,11 @@ connection of their own.
 """
 
 import asyncio
+import time
 from pathlib import Path
 from typing import Any
 
+from heliotrope.console.roster import Key
 from heliotrope.local import EMERGENCY, INTERNAL, ORDINARY, CallError, LocalConnection
 from heliotrope.plant.interface import CALLS, remade
 from heliotrope.plant.operations.security import SecurityEvent
@@ -70,6 +72,12 @@ class RemotePlant:
             if error.kind == INTERNAL:
                 raise RuntimeError(f"{call}: {error}") from None
             raise remade(error) from None
+
+    async def valid(self, used: list[str]) -> dict[Key, Session | ApiToken]:
+        """Return all valid sessions and tokens; see `People.valid`."""
+        found = await self.ask("people.valid", now=time.time(), used=used)
+        sessions = {("session", one["key"]): Session(**one) for one in found["sessions"]}
+        return sessions | {("token", one["key"]): ApiToken(**one) for one in found["tokens"]}
 
     async def note(self, kind: SecurityEvent, who: str, address: str, detail: str) -> None:
         """Record a security event in the plant; see `SecurityLog.note`."""
@@ -148,11 +156,6 @@ class RemotePeople:
         """Return the secret of a new session; see `People.open_session`."""
         return str(self._ask("open_session", name=name, now=now, lifetime=lifetime, note=note))
 
-    def session(self, secret: str, now: float) -> Session | None:
-        """Return the session of a secret; see `People.session`."""
-        values = self._ask("session", secret=secret, now=now)
-        return None if values is None else Session(**values)
-
     def close_session(self, secret: str) -> None:
         """End a session, if it exists."""
         self._ask("close_session", secret=secret)
@@ -186,11 +189,6 @@ class RemotePeople:
             "add_token", name=name, label=label, role=role, now=now, lifetime=lifetime
         )
         return ApiToken(**made), str(secret)
-
-    def token(self, secret: str, now: float) -> ApiToken | None:
-        """Return the token of a secret; see `People.token`."""
-        values = self._ask("token", secret=secret, now=now)
-        return None if values is None else ApiToken(**values)
 
     def tokens(self, name: str = "") -> tuple[ApiToken, ...]:
         """Return the tokens of an account, or all, the oldest first."""

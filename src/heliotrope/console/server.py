@@ -11,6 +11,7 @@ from starlette.types import ASGIApp
 
 from heliotrope.console._logs import limit
 from heliotrope.console.connections import RESERVE, Doors, Limits, Listener, raise_descriptors
+from heliotrope.console.one_way import OneWaySocket
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
 from heliotrope.links.clock import SystemClock
@@ -66,9 +67,8 @@ class Server(uvicorn.Server):
             # It bounds the length of headers; the listener keeps the deadlines.
             http="h11",
             timeout_keep_alive=3600,
-            ws="websockets-sansio" if page else "none",
+            ws=OneWaySocket if page else "none",
             ws_per_message_deflate=False,
-            ws_max_size=1 << 16,
             timeout_graceful_shutdown=1,
             ssl_certfile=settings.certificate,
             ssl_keyfile=settings.key,

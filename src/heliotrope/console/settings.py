@@ -29,7 +29,7 @@ class ConsoleSettings:
     period
         Time between messages of the live stream, s.
     viewers
-        Largest number of concurrent live streams.
+        Largest number of concurrent live streams; see `live` for those of one person.
     plain
         Whether other machines may connect without TLS, behind a proxy that has it.
     proxies

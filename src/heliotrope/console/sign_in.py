@@ -4,12 +4,13 @@ import asyncio
 import math
 
 from fastapi import HTTPException
-from starlette.requests import HTTPConnection
+from starlette.requests import HTTPConnection, Request
 from starlette.responses import Response
 
 from heliotrope.console import _secrets
 from heliotrope.console.auth import Caller, Console
 from heliotrope.console.by_proxy import Introduced, check_account
+from heliotrope.console.hashing import CrowdError, GoneError
 from heliotrope.console.headers import COOKIE, address_of, network_of
 from heliotrope.console.settings import is_loopback
 from heliotrope.plant.operations.security import SecurityEvent
@@ -20,7 +21,7 @@ _WRONG_CODE = "the code is wrong or was used already; wait for the next one"
 
 
 async def log_in(
-    console: Console, name: str, password: str, code: str, connection: HTTPConnection
+    console: Console, name: str, password: str, code: str, request: Request
 ) -> tuple[Account, str, float]:
     """Check a password, and the code of a second factor; begin a session.
 
@@ -32,11 +33,11 @@ async def log_in(
     ------
     HTTPException
         401 if name, password or code is wrong; 428 if a code is needed; 429 after too many
-        failures.
+        failures, or while too many others sign in.
     """
     failure = SecurityEvent.SIGN_IN_FAILED
-    account = await checked(console, name, password, connection, failure, code)
-    return account, *await _begin(console, account.name, connection)
+    account = await checked(console, name, password, request, failure, code)
+    return account, *await _begin(console, account.name, request)
 
 
 async def enter(console: Console, person: Introduced, connection: HTTPConnection) -> str:
@@ -91,6 +92,7 @@ async def _begin(
     now, lifetime = console.now(), console.settings.session_s
     address = address_of(console.settings, connection)
     secret = await console.ask(lambda: console.people.open_session(name, now, lifetime, address))
+    console.roster.forget()
     await console.note(SecurityEvent.SIGNED_IN, connection, name, detail)
     return secret, now + lifetime
 
@@ -118,7 +120,7 @@ async def checked(
     console: Console,
     name: str,
     password: str,
-    connection: HTTPConnection,
+    request: Request,
     failure: SecurityEvent,
     code: str | None = None,
 ) -> Account:
@@ -130,37 +132,47 @@ async def checked(
     ------
     HTTPException
         401 if name, password or code is wrong; 428 if a code is needed; 429 after too many
-        failures.
+        failures, or while too many others sign in.
     """
-    keys = (name, network_of(address_of(console.settings, connection)))
-    if (wait := console.attempts.wait(*keys)) > 0.0:
-        seconds = math.ceil(wait)
-        await console.note(SecurityEvent.LOCKED_OUT, connection, await _known(console, name))
-        raise HTTPException(
-            429,
-            f"too many failed sign-ins; try again in {seconds} s",
-            {"Retry-After": str(seconds)},
-        )
-    console.attempts.begin(*keys)
-    account = await console.ask(lambda: console.people.account(name))
-    kept = account.password_hash if account is not None and not account.disabled else None
-    async with console.hashing:
-        good = await asyncio.to_thread(_secrets.verify_password, kept, password)
+    attempts = console.attempts
+    keys = (name, network_of(address_of(console.settings, request)))
+    if (wait := attempts.wait(*keys)) > 0.0:
+        await console.note(SecurityEvent.LOCKED_OUT, request, await _known(console, name))
+        raise _too_often("too many failed sign-ins", wait)
+    # Counting only after the slow check would let many attempts through at once.
+    attempts.begin(*keys)
+    try:
+        known = attempts.known(*keys)
+        async with console.hashing.turn(keys, request.is_disconnected, known=known):
+            account = await console.ask(lambda: console.people.account(name))
+            usable = account is not None and not account.disabled and account.has_password
+            kept = account.password_hash if account is not None and usable else None
+            good = await asyncio.to_thread(_secrets.verify_password, kept, password)
+    except (CrowdError, GoneError) as error:
+        attempts.undo(*keys)
+        raise _too_often(str(error), 1.0) from None
     if not good or account is None:
-        await console.note(failure, connection, name if account is not None else "")
+        await console.note(failure, request, name if account is not None else "")
         raise HTTPException(401, "name or password is wrong")
     if code is not None and account.factor:
-        await _use_code(console, name, code, connection, failure)
-    console.attempts.good(*keys)
+        if not code:
+            attempts.undo(*keys)  # the password was right, and no code was guessed
+            raise HTTPException(428, "give the code of your second factor too")
+        await _use_code(console, name, code, request, failure)
+    attempts.good(*keys)
     return account
+
+
+def _too_often(why: str, wait: float) -> HTTPException:
+    seconds = math.ceil(wait)
+    text = f"{why}; try again in {seconds} s"
+    return HTTPException(429, text, {"Retry-After": str(seconds)})
 
 
 async def _use_code(
     console: Console, name: str, code: str, connection: HTTPConnection, failure: SecurityEvent
 ) -> None:
     """Use a code of a second factor; raises `HTTPException` if it is not right."""
-    if not code:
-        raise HTTPException(428, "give the code of your second factor too")
     used = await console.ask(lambda: console.people.check_factor(name, code, console.now()))
     if used is None:
         await console.note(failure, connection, name, "wrong code of the second factor")
@@ -171,7 +183,7 @@ async def _use_code(
 
 
 async def confirm(
-    console: Console, who: Caller, request: HTTPConnection, password: str, code: str | None = None
+    console: Console, who: Caller, request: Request, password: str, code: str | None = None
 ) -> None:
     """Check that a person is there: a session, and its owner's password (and code) once more.
 

@@ -2,11 +2,10 @@
 
 The page sends its order by the ordinary way and by this one at the same time. Both carry the same
 word, so the plant gives the order once. This process needs little of the house, holds nothing but
-the callers that it has met, and asks the plant by the socket for emergencies alone: whatever holds
-the console up, or ends it, does not reach it.
+the roster of those who may call, and asks the plant by the socket for emergencies alone: whatever
+holds the console up, or ends it, does not reach it.
 """
 
-import hashlib
 import json
 import math
 import time
@@ -23,16 +22,16 @@ from heliotrope.console import _words, bodies
 from heliotrope.console.connections import FOUND, Limits
 from heliotrope.console.headers import (
     STRANGER,
-    STRANGERS,
     address_of,
     host_known,
     network_of,
     parts_of,
     secret_of,
 )
+from heliotrope.console.roster import Key, Roster
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
-from heliotrope.local import AwayError, Buckets, CallError
+from heliotrope.local import Buckets, CallError
 
 PATH = "/api/v1/emergency"
 #: Few connections with short deadlines: nothing but an order comes here.
@@ -40,10 +39,8 @@ LIMITS = Limits(
     most=64, strangers=48, address=32, handshake=2.0, header=2.0, body=2.0, idle=2.0, answer=12.0,
     idle_known=30.0, answer_known=12.0,
 )  # fmt: skip
-#: Time for the store to find a caller, and how long one that it found is good if it cannot, s.
-_STORE, _TRUSTED = 1.0, 3600.0
-#: Callers that are remembered.
-_MOST_KNOWN = 2000
+#: Time for the store to say who is valid, s.
+_STORE = 1.0
 #: Largest body, bytes.
 _LARGEST = 2048
 #: A refused request may announce so much and still hear why it was refused, bytes.
@@ -65,14 +62,17 @@ class EmergencyWay:
         Makes a call by the plant's socket for emergencies, as `LocalConnection.ask`.
     settings
         Settings of the console; only from the page at its port may a browser send an order.
+
+    Attributes
+    ----------
+    roster
+        Whose sessions and tokens are valid; somebody runs it.
     """
 
     def __init__(self, ask: Ask, settings: ConsoleSettings) -> None:
         self._ask, self._settings = ask, settings
-        self._stranger, self._strangers = (
-            Buckets(*limits, time.monotonic) for limits in (STRANGER, STRANGERS)
-        )
-        self._known: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._stranger = Buckets(*STRANGER, time.monotonic)
+        self.roster = Roster(self._valid)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -93,6 +93,12 @@ class EmergencyWay:
         except HeliotropeError as error:
             status, text = 503, {"detail": str(error)}
         await JSONResponse(text, status, headers)(scope, incoming, send)
+
+    async def _valid(self, used: list[str]) -> dict[Key, dict[str, Any]]:
+        """Return all valid sessions and tokens."""
+        given = {"now": time.time(), "used": used}
+        found, _ = await self._ask("people.valid", given, within=_STORE)
+        return {(by, one["key"]): one for by in ("session", "token") for one in found[f"{by}s"]}
 
     async def _take(self, scope: Scope, receive: Receive, answer: dict[str, str]) -> Any:
         """Give the order; return its view, and what the answer needs for the page's origin."""
@@ -128,35 +134,19 @@ class EmergencyWay:
         Raises
         ------
         HTTPException
-            429 if strangers ask too often; 503 if the store cannot say who an unknown caller is.
+            429 if a stranger asks too often.
+        HeliotropeError
+            If the store cannot say who an unknown caller is.
         """
-        key = hashlib.sha256(f"{by} {secret}".encode()).hexdigest()
-        at, known = self._known.get(key, (-math.inf, None))
-        if known is None:
-            self._count(connection)
-        if not secret:
+        found = await self.roster.find_for_emergency(by, secret) if secret else None
+        if found is None:
+            address = network_of(address_of(self._settings, connection))
+            wait = self._stranger.take(address)
+            if wait > 0.0:
+                raise HTTPException(429, "too many requests", {"Retry-After": str(math.ceil(wait))})
+        elif found["expires"] is not None and found["expires"] <= time.time():
             return None
-        now = time.time()
-        arguments = {"secret": secret, "now": now}
-        try:
-            account, _ = await self._ask(f"people.{by}", arguments, within=_STORE)
-        except (AwayError, CallError):
-            if known is None or time.monotonic() - at > _TRUSTED:
-                raise HTTPException(503, "the store cannot say who this is; try again") from None
-            expires = known["expires"]
-            return known if expires is None or expires > now else None
-        self._known.pop(key, None)
-        if account is not None:
-            if len(self._known) >= _MOST_KNOWN:
-                self._known.pop(next(iter(self._known)))
-            self._known[key] = time.monotonic(), account
-        return dict(account) if account is not None else None
-
-    def _count(self, connection: HTTPConnection) -> None:
-        address = network_of(address_of(self._settings, connection))
-        wait = self._stranger.take(address) or self._strangers.take("")
-        if wait > 0.0:
-            raise HTTPException(429, "too many requests", {"Retry-After": str(math.ceil(wait))})
+        return found
 
     def _from_page(self, origin: str, host: str) -> bool:
         """Whether an origin is the page of this console, at the name that the request names."""

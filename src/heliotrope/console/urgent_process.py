@@ -19,8 +19,8 @@ _ANSWER = 10.0
 _CONNECT = 5.0
 
 
-def server_of(plant: LocalConnection, inputs: ProcessInput) -> Server:
-    """Return the server of the way; an order that comes before the plant is connected waits."""
+def way_of(plant: LocalConnection, inputs: ProcessInput) -> EmergencyWay:
+    """Return the way; an order that comes before the plant is connected waits."""
 
     async def ask(call: str, arguments: dict[str, Any], **named: Any) -> tuple[Any, bytes]:
         until = time.monotonic() + _CONNECT
@@ -28,15 +28,26 @@ def server_of(plant: LocalConnection, inputs: ProcessInput) -> Server:
             await asyncio.sleep(0.02)
         return await plant.ask(call, arguments, **named)
 
-    app = EmergencyWay(ask, inputs.settings)
-    return Server(app, inputs.line, LIMITS, inputs.settings, page=False)
+    return EmergencyWay(ask, inputs.settings)
+
+
+def server_of(way: EmergencyWay, inputs: ProcessInput) -> Server:
+    """Return the server of the way."""
+    return Server(way, inputs.line, LIMITS, inputs.settings, page=False)
 
 
 async def _run(inputs: ProcessInput) -> None:
     plant = LocalConnection(inputs.folder / EMERGENCY, {"key": inputs.key}, _ANSWER)
+    way = way_of(plant, inputs)
+
+    async def connect() -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(plant.run())
+            group.create_task(way.roster.run())
+
     await serve(
-        server_of(plant, inputs),
-        plant.run,
+        server_of(way, inputs),
+        connect,
         lambda address: plant.ask("heartbeat", {"part": "emergency", "address": address}),
     )
 

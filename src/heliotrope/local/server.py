@@ -4,7 +4,8 @@ Connections are taken at a limited rate. One that does not say who it is in time
 all places are taken, the oldest connection gives way. A connection has a limited number of requests
 under way: while they are, nothing more is read from it. A request counts until its answer is
 written, and a client that does not read its answers is cut off. A blob is kept only where the call
-takes one from this caller.
+takes one from this caller. Who the caller is, is asked again every few seconds: a connection ends
+when its key or token does, and its requests never have more than the role of now.
 """
 
 import asyncio
@@ -12,6 +13,7 @@ import contextlib
 import functools
 import logging
 import socket
+import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +66,8 @@ class LocalLimits:
         Time to identify the caller, and to take an answer, s.
     pace_s
         Time between two new connections, s.
+    trusted_s
+        Time after which the caller of a connection is asked for again, s.
     """
 
     strangers: int = 32
@@ -74,6 +78,7 @@ class LocalLimits:
     hello_s: float = 2.0
     answer_s: float = 5.0
     pace_s: float = 0.005
+    trusted_s: float = 5.0
 
 
 class _Peer:
@@ -98,6 +103,24 @@ class _Peer:
             self.cut()
 
 
+class _Identity(Generic[C]):
+    """The caller of a connection, asked for again once the last answer is old."""
+
+    def __init__(self, ask: Callable[[], Awaitable[C | None]], trusted: float) -> None:
+        self._ask, self._trusted, self._turn = ask, trusted, asyncio.Lock()
+        self._caller: C | None = None
+        self._until = 0.0
+
+    async def caller(self) -> C | None:
+        """Return the caller, None if they are not valid any more."""
+        async with self._turn:
+            if time.monotonic() >= self._until:
+                asked = time.monotonic()
+                self._caller = await self._ask()
+                self._until = asked + self._trusted
+            return self._caller
+
+
 class LocalServer(Generic[C]):
     """One listener.
 
@@ -107,7 +130,8 @@ class LocalServer(Generic[C]):
         Socket, in a folder made by `sockets.make_folder`.
     caller
         Returns who sends the first frame of a connection, given that frame and the user of the
-        process, which is the plant's or root; None refuses it.
+        process, which is the plant's or root; None refuses it. Asked again while the connection
+        stands, see `LocalLimits.trusted_s`.
     answer
         Returns value and blob of the answer to a request.
     kinds
@@ -181,9 +205,9 @@ class LocalServer(Generic[C]):
         peer = _Peer(writer)
         _place(self._strangers, peer, self._limits.strangers)
         try:
-            caller = await self._known(reader, peer, user)
-            if caller is not None:
-                await self._talk(reader, peer, caller)
+            identity = await self._identified(reader, peer, user)
+            if identity is not None:
+                await self._talk(reader, peer, *identity)
         except (HeliotropeError, EOFError, OSError, TimeoutError):
             return  # the connection has ended, or has to
         except Exception:  # noqa: BLE001 - it is logged
@@ -195,14 +219,17 @@ class LocalServer(Generic[C]):
                     pool.remove(peer)
             peer.cut()
 
-    async def _known(self, reader: asyncio.StreamReader, peer: _Peer, user: int) -> C | None:
-        """Return the caller, None if the connection is refused."""
+    async def _identified(
+        self, reader: asyncio.StreamReader, peer: _Peer, user: int
+    ) -> tuple[_Identity[C], C] | None:
+        """Return how to ask for the caller again, and the caller; None if they are refused."""
         async with asyncio.timeout(self._limits.hello_s):
             hello = await read_frame(reader, HELLO_HEAD, 0)
-            caller = await self._caller(hello.head, user)
+            ask = functools.partial(self._caller, hello.head, user)
+            identity = _Identity(ask, self._limits.trusted_s)
+            caller = await identity.caller()
         if caller is None:
-            refusal = {"id": 0, "error": "refused", "text": "the key or token is not valid"}
-            await peer.write(pack(refusal), self._limits.answer_s)
+            await self._refuse(peer)
             return None
         if peer in self._strangers:
             self._strangers.remove(peer)
@@ -211,32 +238,49 @@ class LocalServer(Generic[C]):
         else:
             _place(self._callers, peer, self._limits.callers)
         await peer.write(pack({"id": 0, "value": None}), self._limits.answer_s)
-        return caller
+        return identity, caller
 
-    async def _talk(self, reader: asyncio.StreamReader, peer: _Peer, caller: C) -> None:
+    async def _refuse(self, peer: _Peer, number: int = 0) -> None:
+        refusal = {"id": number, "error": "refused", "text": "the key or token is not valid"}
+        await peer.write(pack(refusal), self._limits.answer_s)
+
+    async def _talk(
+        self, reader: asyncio.StreamReader, peer: _Peer, identity: _Identity[C], caller: C
+    ) -> None:
         limits = self._limits
         most = limits.console_under_way if caller.reserved else limits.under_way
         room, accepts = asyncio.Semaphore(most), functools.partial(self._blob, caller)
         works = set[asyncio.Task[None]]()
         async with asyncio.TaskGroup() as group:
+            works.add(group.create_task(self._end_with(identity, peer)))
             try:
                 while True:
                     await room.acquire()
                     frame = await read_frame(reader, REQUEST_HEAD, REQUEST_BLOB, accepts)
                     if type(frame.head.get("id")) is not int:
                         raise FrameError("local interface: a request without a number")
-                    work = group.create_task(self._answer_one(frame, peer, caller, room))
+                    work = group.create_task(self._answer_one(frame, peer, identity, room))
                     works.add(work)
                     work.add_done_callback(works.discard)
             except (FrameError, EOFError, OSError):
                 for work in works:
                     work.cancel()
 
+    async def _end_with(self, identity: _Identity[C], peer: _Peer) -> None:
+        """Cut a connection off once its caller is not valid any more, also an idle one."""
+        while await identity.caller() is not None:
+            await asyncio.sleep(self._limits.trusted_s)
+        peer.cut()
+
     async def _answer_one(
-        self, frame: Frame, peer: _Peer, caller: C, room: asyncio.Semaphore
+        self, frame: Frame, peer: _Peer, identity: _Identity[C], room: asyncio.Semaphore
     ) -> None:
-        """Answer one request."""
+        """Answer one request, of a caller who is valid now."""
         number, blob = frame.head["id"], b""
+        if (caller := await identity.caller()) is None:
+            await self._refuse(peer, number)
+            peer.cut()
+            return
         try:
             value, blob = await self._answer(caller, frame)
             data = pack({"id": number, "value": value}, blob)

@@ -592,6 +592,8 @@ class PlantController:
         ------
         InputError
             Another act.
+        RefusedError
+            If the person's order was withdrawn again and again; see `Callers`.
         """
         if act not in (Act.DEFOCUS, Act.STOW):
             raise InputError(f"emergency: {act.name} cannot be ordered; give DEFOCUS or STOW")
@@ -639,11 +641,15 @@ class PlantController:
         self.authority.release(person, token)
         self.note(person, "AUTHORITY", "released")
 
-    def withdraw_emergency(self, person: Person, owner: str = "") -> None:
+    def withdraw_emergency(self, person: Person, owner: str = "") -> str:
         """Withdraw a person's own emergency order, or, as an engineer, that of an ``owner``.
 
         The emergency goes on while another person's order stands; the rows that it tripped wait for
         `acknowledge`.
+
+        Returns
+        -------
+        What people should know: how often it was repeated, and when the next one is taken.
 
         Raises
         ------
@@ -659,8 +665,10 @@ class PlantController:
             rows = "; ".join(self.sentinel.causes().values()) or "no emergency holds"
             stands = f"it was ordered by {texts}" if calls else rows
             raise refusals.NOT_CALLER.error(who=who, calls=stands)
-        self.sentinel.withdraw(who)
-        self.note(person, "WITHDRAW", f"emergency order of {who}")
+        told = self.sentinel.withdraw(who, person.name)
+        about = f"; {told}" if told else ""
+        self.note(person, "WITHDRAW", f"emergency order of {who}{about}")
+        return told
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
         """Acknowledge a row of the safety table that waits for it.

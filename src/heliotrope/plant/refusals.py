@@ -162,6 +162,14 @@ EMERGENCY_GOES_ON = Refusal(
     "resume: the emergency goes on: {causes}",
     "Withdraw the order; remove the cause of each row that the text names, and acknowledge it.",
 )
+EMERGENCY_PAUSED = Refusal(
+    "emergency paused",
+    "A person's emergency order was withdrawn while it was being repeated, or twice by others "
+    "within ten minutes. That person alone pauses: 30 s, then twice as long each time.",
+    "EMERGENCY: that of {who} was withdrawn again and again; the next one is taken in {wait} s",
+    "Let another person order it: nobody else pauses. If a program repeats it, disable the account "
+    "or revoke its token.",
+)
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",
     "The row is not tripped, its cause has not gone, or it needs another role.",

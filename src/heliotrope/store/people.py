@@ -7,13 +7,23 @@ use them. Times are POSIX seconds and always arguments.
 
 import hashlib
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, FromClause, Select, Table, literal, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    FromClause,
+    RowMapping,
+    Select,
+    Table,
+    func,
+    literal,
+    select,
+)
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store import _rows as rows
@@ -75,6 +85,11 @@ class Account:
     by_proxy: bool = False
     no_password: bool = False
 
+    @property
+    def has_password(self) -> bool:
+        """Whether a password can be checked."""
+        return not self.by_proxy and not self.no_password
+
 
 @dataclass(frozen=True)
 class Session:
@@ -123,6 +138,14 @@ class ApiToken:
 
 
 @dataclass(frozen=True)
+class Valid:
+    """All sessions and tokens that are valid now."""
+
+    sessions: tuple[Session, ...]
+    tokens: tuple[ApiToken, ...]
+
+
+@dataclass(frozen=True)
 class Expired:
     """A session, or a token with its label, of a person that has expired."""
 
@@ -135,10 +158,16 @@ _DAY = 86_400.0
 #: Longest validity of a token by its role, s. What a viewer's token can do harms nobody, so the
 #: programs that only read need a new one once a year; those that command, every quarter.
 LONGEST = {"viewer": 365.0 * _DAY, "operator": 90.0 * _DAY, "engineer": 90.0 * _DAY}
+#: Sessions, and tokens, of one account: those of a person, their programs and their pages.
+MOST_SESSIONS, MOST_TOKENS = 20, 50
 #: A secret of which only the SHA-256 is kept: random bytes.
 _SECRET = 32
 #: The last use of a token is recorded at most this often, s.
 _NOTED = 60.0
+
+
+#: Tokens with what `_valid_token` needs of their accounts.
+_TOKENS = select(_TOKEN, _ACCOUNT.c.role.label("owner_role"), _ACCOUNT.c.disabled).join(_ACCOUNT)
 
 
 class People:
@@ -286,6 +315,8 @@ class People:
     def open_session(self, name: str, now: float, lifetime: float, note: str = "") -> str:
         """Return the secret of a new session, which expires ``lifetime`` s from now.
 
+        It ends the oldest ones of an account that has `MOST_SESSIONS`.
+
         Raises
         ------
         InputError
@@ -301,28 +332,26 @@ class People:
         def work(connection: Connection) -> None:
             if _need(connection, name).disabled:
                 raise InputError(f"account {name}: it is disabled; ask an engineer")
+            own = select(_SESSION.c.key).where(_SESSION.c.name == name)
+            newest = own.order_by(_SESSION.c.since.desc(), _SESSION.c.key).offset(MOST_SESSIONS - 1)
+            for key in connection.scalars(newest).all():
+                _delete(connection, _SESSION, _SESSION.c.key == key)
             connection.execute(_SESSION.insert().values({**row, "note": note}))
 
         self._writer.do(work)
         return secret
 
-    def session(self, secret: str, now: float) -> Session | None:
-        """Return the session of a secret; None if there is none, or it is no longer valid."""
-        columns = (_SESSION, _ACCOUNT.c.role, _ACCOUNT.c.disabled, *_STATE)
+    def valid(self, now: float, used: Collection[str] = ()) -> Valid:
+        """Return all valid sessions and tokens; record the use of the tokens of some keys."""
+        for key in used:
+            self._note_use(key, now)
+        columns = (_SESSION, _ACCOUNT.c.role, *_STATE)
         joined = select(*columns).select_from(_with_state(_SESSION.join(_ACCOUNT)))
-        query = joined.where(_SESSION.c.key == _key(secret), _SESSION.c.expires > now)
+        query = joined.where(_SESSION.c.expires > now, ~_ACCOUNT.c.disabled)
         with self._database.reading() as connection:
-            row = connection.execute(query).mappings().first()
-        if row is None or row["disabled"]:
-            return None
-        return rows.record_of(Session, row)
-
-    def sessions(self, now: float) -> tuple[Session, ...]:
-        """Return all unexpired sessions, the oldest first."""
-        joined = select(_SESSION, _ACCOUNT.c.role).join(_ACCOUNT)
-        query = joined.where(_SESSION.c.expires > now).order_by(_SESSION.c.since, _SESSION.c.key)
-        with self._database.reading() as connection:
-            return tuple(rows.records(connection, Session, query))
+            sessions = rows.records(connection, Session, query)
+            tokens = [_valid_token(row, now) for row in connection.execute(_TOKENS).mappings()]
+        return Valid(tuple(sessions), tuple(token for token in tokens if token is not None))
 
     def close_session(self, secret: str) -> None:
         """End a session, if it exists."""
@@ -344,7 +373,8 @@ class People:
         Raises
         ------
         InputError
-            If its role is above that of the account, or the lifetime above the longest.
+            If its role is above that of the account, the lifetime above the longest, or the
+            account has `MOST_TOKENS`.
         UnknownNameError
             An unknown account or role.
         StoreError
@@ -367,6 +397,11 @@ class People:
                 raise InputError(
                     f"token {label!r}: its role {role} is above that of {name}, {owner.role}"
                 )
+            own = select(func.count()).where(_TOKEN.c.name == name)
+            if (connection.scalar(own) or 0) >= MOST_TOKENS:
+                raise InputError(
+                    f"token {label!r}: {name} has {MOST_TOKENS} tokens already; revoke one first"
+                )
             connection.execute(_TOKEN.insert().values(asdict(made)))
 
         self._writer.do(work)
@@ -374,20 +409,13 @@ class People:
 
     def token(self, secret: str, now: float) -> ApiToken | None:
         """Return the token of a secret and record its use; None if there is no valid one."""
-        role = _ACCOUNT.c.role.label("owner_role")
-        query = select(_TOKEN, role, _ACCOUNT.c.disabled).join(_ACCOUNT)
         with self._database.reading() as connection:
-            result = connection.execute(query.where(_TOKEN.c.key == _key(secret)))
+            result = connection.execute(_TOKENS.where(_TOKEN.c.key == _key(secret)))
             row = result.mappings().first()
-        if row is None or row["disabled"]:
-            return None
-        # Earlier programs made tokens that last for years, or for ever.
-        ends = row["created"] + LONGEST[row["role"]]
-        if now >= min(ends, row["expires"] if row["expires"] is not None else ends):
-            return None
-        self._note_use(row["key"], now)
-        least = min(row["role"], row["owner_role"], key=ROLES.index)
-        return rows.record_of(ApiToken, row, role=least)
+        found = None if row is None else _valid_token(row, now)
+        if found is not None:
+            self._note_use(found.key, now)
+        return found
 
     def _note_use(self, key: str, now: float) -> None:
         last = self._noted.get(key)
@@ -438,6 +466,16 @@ class People:
 
     def _secret(self) -> str:
         return self._entropy(_SECRET).hex()
+
+
+def _valid_token(row: RowMapping, now: float) -> ApiToken | None:
+    """Return the token of a row of `_TOKENS`; None if it is not valid."""
+    # Earlier programs made tokens that last for years, or for ever.
+    ends = row["created"] + LONGEST[row["role"]]
+    if row["disabled"] or now >= min(ends, row["expires"] if row["expires"] is not None else ends):
+        return None
+    least = min(row["role"], row["owner_role"], key=ROLES.index)
+    return rows.record_of(ApiToken, row, role=least)
 
 
 def _key(secret: str) -> str:

@@ -32,6 +32,7 @@ from heliotrope.files.disk import DiskThread
 from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import Clock, SystemClock
 from heliotrope.links.link import running
+from heliotrope.local import log_lines
 from heliotrope.plant.assembly import CYCLE, AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.field.learner import LearnerProcess
 from heliotrope.plant.io.cameras import RealCameras
@@ -93,6 +94,7 @@ def run_plant(
     FetchError
         If the simulated field does not answer.
     """
+    log_lines.install()
     file = _links_file(choice)
     if not file.document.twin:
         _begin(_outside(design, file, SystemClock()), design, choice, shown)

@@ -17,6 +17,7 @@ from heliotrope.lcu import names as meanings
 from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism.drives import Drive
+from heliotrope.plant.emergency.callers import Callers
 from heliotrope.plant.emergency.order import (
     EmergencyOrder,
     switched_off,
@@ -99,7 +100,7 @@ class Sentinel(Part):
         self.night: str = ""
         self._record, self._kept_at = record, -math.inf
         self._kept = self._recalled = Standing() if record is None else _recall(record)
-        self._calls = {call.who: call for call in self._recalled.calls}
+        self._callers = Callers(self._recalled.calls)
         #: Heliostats that an emergency left unproven, and when each was proven, monotonic s.
         left = set() if self._recalled.act else set(self._recalled.unproven) & set(field.names)
         self._unproven = dict.fromkeys(sorted(left), math.inf)
@@ -133,7 +134,7 @@ class Sentinel(Part):
 
     def _evaluate(self, now: float) -> list[Alarm]:
         proof = self.order.proof if self.on and self.order is not None else None
-        return self.table.evaluate(proof, self._unproven, called=bool(self._calls), now=now)
+        return self.table.evaluate(proof, self._unproven, called=bool(self.calls), now=now)
 
     def _obey_field(self, now: float) -> None:
         wanted, caused = self.table.demanded(), self.table.caused()
@@ -234,7 +235,7 @@ class Sentinel(Part):
     @property
     def calls(self) -> tuple[Call, ...]:
         """The orders of persons that have not been withdrawn, one for each person."""
-        return tuple(self._calls.values())
+        return self._callers.calls
 
     def causes(self) -> dict[str, str]:
         """Return why the emergency holds, by the persons whose orders stand and the safety table.
@@ -255,31 +256,43 @@ class Sentinel(Part):
     def call(self, who: str, act: Act, reason: str, at: float) -> EmergencyOrder:
         """Order an emergency for a person; it holds until it is withdrawn.
 
-        A person has one order: another one keeps the stronger act, and adds a new reason.
+        A person has one order: another one keeps the stronger act, and adds a new reason; an equal
+        one merges with it.
+
+        Raises
+        ------
+        RefusedError
+            See `Callers.take`.
         """
-        before = self._calls.get(who)
-        if before is None:
-            self._calls[who] = Call(who, reason, act.name, at)
-        else:
-            known = before.reason.split("; ")
-            reasons = before.reason if reason in known else f"{before.reason}; {reason}"
-            stronger = max(act, Act[before.act])
-            self._calls[who] = Call(who, reasons, stronger.name, before.at)
+        first = who not in {call.who for call in self.calls}
+        new = self._callers.take(who, act, reason, at, self._clock.monotonic())
         if not self.on or self.order is None or act > self.order.act:
             order = self._begin(act, (who, "anybody"), reason)
         else:
             order = self.order
-            self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
-        if before is None:  # its row trips now, even if the order is withdrawn before a beat
+            if new:
+                self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
+        if first:  # its row trips now, even if the order is withdrawn before a beat
             for alarm in self._evaluate(self._clock.monotonic()):
                 self.table.tell(alarm)
         self._keep(order.at)
         return order
 
-    def withdraw(self, who: str) -> None:
-        """Withdraw one person's order; rows that it tripped still wait to be acknowledged."""
-        self._calls.pop(who, None)
-        self._keep(self._clock.monotonic())
+    def pause(self, who: str) -> float:
+        """Return the time until an order of a person is taken, s; 0 if it is taken now."""
+        return self._callers.pause(who, self._clock.monotonic())
+
+    def withdraw(self, who: str, by: str) -> str:
+        """Withdraw one person's order; rows that it tripped still wait to be acknowledged.
+
+        Returns
+        -------
+        What people should know of it, see `Callers.withdraw`.
+        """
+        now = self._clock.monotonic()
+        told = self._callers.withdraw(who, by, now)
+        self._keep(now)
+        return told
 
     def _keep(self, now: float) -> None:
         """Keep what stands, for the next program; a proof that goes on, once in a while."""

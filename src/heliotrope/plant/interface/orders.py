@@ -50,12 +50,14 @@ class Strict(BaseModel):
         return given
 
 
-Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
+#: No control characters, line breaks of any kind, or marks that reverse the order of letters.
+_LETTER = r"[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]"
+Name = Annotated[str, Field(min_length=1, max_length=64, pattern=f"^{_LETTER}+$")]
 #: The first wrong one is named: an error for each of 200,000 would take a second and 200 MB.
 Names = Annotated[
     list[Name], Field(max_length=200_000, fail_fast=True, description="Names; [] for all.")
 ]
-Words = Annotated[str, Field(max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Words = Annotated[str, Field(max_length=500, pattern=f"^{_LETTER}*$")]
 Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR, allow_inf_nan=False)]
 Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 #: Points by heliostat, ENU, m.

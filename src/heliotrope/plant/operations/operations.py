@@ -576,10 +576,14 @@ class Operations:
         ------
         InputError
             Another act.
+        RefusedError
+            See `PlantController.raise_emergency`.
         """
+        before = self.plant.sentinel.calls
         order = self.plant.raise_emergency(person.name, _act(act), reason)
-        self.automatic.give_up("an emergency has taken it away")
-        self.logbook.event("command", person.name, f"EMERGENCY {act}: {reason or 'no reason'}")
+        if self.plant.sentinel.calls != before:
+            self.automatic.give_up("an emergency has taken it away")
+            self.logbook.event("command", person.name, f"EMERGENCY {act}: {reason or 'no reason'}")
         return order
 
     def withdraw(self, person: Person, owner: str = "") -> None:
@@ -590,11 +594,11 @@ class Operations:
         RefusedError
             See `PlantController.withdraw_emergency`.
         """
-        self.plant.withdraw_emergency(person, owner)
+        told = self.plant.withdraw_emergency(person, owner)
         left = "; ".join(call.text for call in self.plant.sentinel.calls)
         whose = f"{owner}'s emergency" if owner not in ("", person.name) else "emergency"
-        still = f"; still ordered by {left}" if left else ""
-        self._tell(person, f"{whose} withdrawn{still}", "command")
+        about = [f"{whose} withdrawn", told, left and f"still ordered by {left}"]
+        self._tell(person, "; ".join(filter(None, about)), "command")
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
         """Acknowledge an alarm, and its row of the safety table.

@@ -428,17 +428,18 @@ class Operator:
         pause = self._chance.choice([2.0, 33.0, 33.0, 310.0])
         self._rest_until = self._clock.monotonic() + pause
         who = self._chance.choice([VIEWER, self._duty])
-        self.raises(plant, who, act)
+        if not plant.sentinel.pause(who.name):
+            self.raises(plant, who, act)
         if self._others.random() < _SECOND:  # another person has a reason of their own
             others = [person for person in (OPERATOR, ENGINEER, VIEWER) if person is not who]
             act = self._others.choice([Act.DEFOCUS, Act.STOW])
-            self.raises(plant, self._others.choice(others), act)
+            if not plant.sentinel.pause((other := self._others.choice(others)).name):
+                self.raises(plant, other, act)
 
     def raises(self, plant: PlantController, who: Person, act: Act) -> EmergencyOrder:
         """Raise an emergency, which anybody may do."""
-        order = plant.raise_emergency(who.name, act)
-        self.raised(who, act)
-        return order
+        self.raised(who, act)  # the plant raises its alarm before it answers
+        return plant.raise_emergency(who.name, act)
 
     def raised(self, who: Person, act: Act) -> None:
         """Note an emergency that a person has raised."""

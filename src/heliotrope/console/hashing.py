@@ -1,0 +1,128 @@
+"""Turns for the work that passwords cost: a few at a time, and few that wait.
+
+People who sign in where they have signed in before come first, and have places that strangers
+cannot take: guesses from ever new addresses and names keep none of them out. Whoever has left loses
+their place without a check.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass, field
+
+from heliotrope.console._attempts import Pair
+from heliotrope.errors import HeliotropeError
+
+#: Checks at a time: each takes 50 ms of a core and 64 MiB.
+AT_WORK = 2
+#: Checks that wait: of strangers, and of people who are known at their address.
+STRANGERS, KNOWN = 8, 32
+#: Of these, strangers from one address, and a known name.
+OF_ADDRESS, OF_NAME = 4, 4
+
+
+class CrowdError(HeliotropeError):
+    """Too many wait for a check of their password."""
+
+
+class GoneError(HeliotropeError):
+    """Whoever waited for a check has left."""
+
+
+@dataclass(eq=False)
+class _Place:
+    pair: Pair
+    known: bool
+    gone: Callable[[], Awaitable[bool]]
+    turn: "asyncio.Future[None]" = field(
+        default_factory=lambda: asyncio.get_running_loop().create_future()
+    )
+
+
+class Hashing:
+    """The queue of one console.
+
+    Parameters
+    ----------
+    at_work
+        Checks at a time.
+    """
+
+    def __init__(self, at_work: int = AT_WORK) -> None:
+        self._free = at_work
+        self._waiting: list[_Place] = []
+
+    @contextlib.asynccontextmanager
+    async def turn(
+        self, pair: Pair, gone: Callable[[], Awaitable[bool]], *, known: bool
+    ) -> AsyncIterator[None]:
+        """Wait for a turn, and hold it during a block.
+
+        Parameters
+        ----------
+        pair
+            Name and address of whoever asks.
+        gone
+            Returns whether they have left.
+        known
+            Whether they have signed in there before.
+
+        Raises
+        ------
+        CrowdError
+            If too many wait.
+        GoneError
+            If they have left before their turn.
+        """
+        if not self._free:
+            await self._wait(_Place(pair, known, gone))
+        else:
+            self._free -= 1
+        try:
+            yield
+        finally:
+            self._pass_on()
+
+    async def _wait(self, place: _Place) -> None:
+        """Wait until a turn is passed on."""
+        if self._full(place):
+            gone = [other for other in self._waiting if await other.gone()]
+            self._waiting = [other for other in self._waiting if other not in gone]
+            for other in gone:
+                if not other.turn.done():
+                    other.turn.set_exception(_left(other))
+            if self._full(place):
+                raise CrowdError("too many people sign in at once")
+        self._waiting.append(place)
+        try:
+            await place.turn
+        except asyncio.CancelledError:
+            if place in self._waiting:
+                self._waiting.remove(place)
+            elif place.turn.done() and not place.turn.cancelled() and not place.turn.exception():
+                self._pass_on()
+            raise
+        if await place.gone():
+            self._pass_on()
+            raise _left(place)
+
+    def _full(self, place: _Place) -> bool:
+        """Whether nobody like this one may wait too."""
+        alike = [other.pair for other in self._waiting if other.known == place.known]
+        name, address = place.pair
+        if place.known:
+            return len(alike) >= KNOWN or sum(one[0] == name for one in alike) >= OF_NAME
+        return len(alike) >= STRANGERS or sum(one[1] == address for one in alike) >= OF_ADDRESS
+
+    def _pass_on(self) -> None:
+        """Give a turn to the first known one that waits, else to the first stranger."""
+        place = min(self._waiting, key=lambda one: not one.known, default=None)
+        if place is None:
+            self._free += 1
+            return
+        self._waiting.remove(place)
+        place.turn.set_result(None)
+
+
+def _left(place: _Place) -> GoneError:
+    return GoneError(f"{place.pair[1]} has left before its turn")

@@ -1,0 +1,33 @@
+"""Sockets whose other end only listens: what it may send is counted in bytes.
+
+A viewer of the live stream answers the server's pings and closes the socket; both take a few bytes.
+Whatever else it sends (messages, parts of one that never ends, pings whose answers it does not
+read) would be kept in memory, so a connection that sends more is closed.
+"""
+
+import time
+from typing import Any
+
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+#: Bytes that a viewer may send at once, and in each second of its connection.
+AT_ONCE, A_SECOND = 4096, 100.0
+
+
+class OneWaySocket(WebSocketsSansIOProtocol):
+    """The server's end of a socket to a viewer."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self._opened, self._received = time.monotonic(), -1
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes from the viewer; the first are the request, which the server has read."""
+        if self._received < 0:
+            self._received = 0
+        else:
+            self._received += len(data)
+        if self._received > AT_ONCE + A_SECOND * (time.monotonic() - self._opened):
+            self.transport.abort()
+            return
+        super().data_received(data)

@@ -1,0 +1,120 @@
+"""Whose sessions and tokens are valid: one picture of all of them, read from the store as needed.
+
+Whoever is in it is known at once, also by a process that has never met them. A secret that is not
+in it waits for the next reading, which all such requests share: neither the store nor anybody who
+is known is the slower for what strangers send. While the store does not answer, the last picture
+says who may order an EMERGENCY.
+"""
+
+import asyncio
+import contextlib
+import hashlib
+import math
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Generic, TypeVar
+
+from heliotrope.errors import HeliotropeError
+
+#: A picture is trusted for this long, and for EMERGENCY alone, s.
+TRUSTED, LONG_TRUSTED = 5.0, 3600.0
+#: Least pause between two readings, and longest while nobody asks, s.
+_PAUSE, _PERIOD = 0.25, 2.5
+#: An EMERGENCY waits this long for a reading, s.
+_WAITS = 1.0
+
+T = TypeVar("T")
+#: "session" or "token", and the SHA-256 of its secret.
+Key = tuple[str, str]
+
+
+class Roster(Generic[T]):
+    """The valid sessions and tokens.
+
+    Parameters
+    ----------
+    read
+        Returns the owner of each, given the keys of the tokens that were used since the last
+        reading; raises `HeliotropeError` if the store cannot say.
+    monotonic
+        Returns the time, s.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[list[str]], Awaitable[Mapping[Key, T]]],
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._read, self._now = read, monotonic
+        self._kept: Mapping[Key, T] = {}
+        #: When the reading of the picture began, and the earliest that would be good enough, s.
+        self._at = self._least = -math.inf
+        self._used = set[str]()
+        self._wanted = asyncio.Event()
+        self._waiting: list[asyncio.Future[None]] = []
+
+    async def run(self) -> None:
+        """Read whenever somebody waits, and now and then, until cancelled."""
+        while True:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_PERIOD):
+                    await self._wanted.wait()
+            self._wanted.clear()
+            await self._read_once()
+            await asyncio.sleep(_PAUSE)
+
+    async def _read_once(self) -> None:
+        """Read, and answer those that waited before."""
+        waiting, self._waiting = self._waiting, []
+        used, self._used = self._used, set()
+        begun, problem = self._now(), None
+        try:
+            self._kept, self._at = await self._read(sorted(used)), begun
+        except HeliotropeError as error:
+            self._used |= used
+            problem = error
+        for one in waiting:
+            if one.done():  # whoever waited has left
+                continue
+            if problem is None:
+                one.set_result(None)
+            else:
+                one.set_exception(problem)
+
+    async def find(self, by: str, secret: str) -> T | None:
+        """Return the owner of a secret, "session" or "token"; None if there is none.
+
+        Raises
+        ------
+        HeliotropeError
+            If the store cannot say.
+        """
+        key = _key(by, secret)
+        if key not in self._kept or self._at < max(self._now() - TRUSTED, self._least):
+            waiting: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            self._waiting.append(waiting)
+            self._wanted.set()
+            await waiting
+        if by == "token" and key in self._kept:
+            self._used.add(key[1])
+        return self._kept.get(key)
+
+    async def find_for_emergency(self, by: str, secret: str) -> T | None:
+        """Return the owner of a secret as `find` does; as last known if the store cannot say."""
+        try:
+            async with asyncio.timeout(_WAITS):
+                return await self.find(by, secret)
+        except (HeliotropeError, TimeoutError) as error:
+            last = self._kept.get(_key(by, secret))
+            if last is None or self._at < self._now() - LONG_TRUSTED:
+                why = str(error) or "no answer"
+                raise HeliotropeError(f"the store cannot say who this is ({why})") from None
+            return last
+
+    def forget(self) -> None:
+        """Answer nobody from the present picture: something has changed."""
+        self._least = self._now()
+
+
+def _key(by: str, secret: str) -> Key:
+    return by, hashlib.sha256(secret.encode(errors="replace")).hexdigest()

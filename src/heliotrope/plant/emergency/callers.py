@@ -1,0 +1,129 @@
+"""The emergency orders of persons: one for each, until it is withdrawn.
+
+An order that a person gives again merges with the one that stands: nothing is recorded or sent for
+it, so a program that gives it hundreds of times a second fills neither the store nor the list of
+events. A person whose order is withdrawn while they (or a program with their token) repeat it, or
+twice by somebody else, pauses before the next one is taken; nobody else does. The first order of a
+person is never refused, nor is the first one after another person has withdrawn theirs.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from heliotrope.plant import refusals
+from heliotrope.plant.emergency.standing import Call
+from heliotrope.safety import Act
+
+#: An order is being repeated if it was given this often within a time, s.
+REPEATED, REPEATED_SPAN = 10, 10.0
+#: The first pause, s; each later one is twice as long, up to the longest.
+PAUSE, LONGEST_PAUSE = 30.0, 480.0
+#: Withdrawals count for this long after the last one, s.
+REMEMBERED = 600.0
+#: Reasons of one order that are kept.
+MOST_REASONS = 5
+_BETWEEN = "; "
+
+
+@dataclass
+class _History:
+    """What is remembered of a person: when they gave their order, and what became of it."""
+
+    given: deque[float] = field(default_factory=lambda: deque(maxlen=REPEATED))
+    merged: int = 0
+    strikes: int = 0
+    struck: float = -math.inf
+    until: float = -math.inf
+
+
+class Callers:
+    """The persons whose emergency orders stand.
+
+    Parameters
+    ----------
+    calls
+        Orders that stood when the last program ended.
+    """
+
+    def __init__(self, calls: Iterable[Call] = ()) -> None:
+        self._calls = {call.who: call for call in calls}
+        self._histories: dict[str, _History] = {}
+
+    @property
+    def calls(self) -> tuple[Call, ...]:
+        """The orders that stand, one for each person."""
+        return tuple(self._calls.values())
+
+    def pause(self, who: str, now: float) -> float:
+        """Return the time until an order of a person is taken, s; 0 if it is taken now."""
+        history = self._histories.get(who)
+        if history is None or who in self._calls:
+            return 0.0
+        return max(0.0, history.until - now)
+
+    def take(self, who: str, act: Act, reason: str, at: float, now: float) -> bool:
+        """Take an order of a person.
+
+        Parameters
+        ----------
+        who, act, reason
+            As for `Call`. A person's order keeps the stronger act and each new reason.
+        at, now
+            POSIX s, and monotonic s.
+
+        Returns
+        -------
+        Whether it is more than what stands.
+
+        Raises
+        ------
+        RefusedError
+            If the person pauses.
+        """
+        if (wait := self.pause(who, now)) > 0.0:
+            raise refusals.EMERGENCY_PAUSED.error(who=who, wait=math.ceil(wait))
+        history, before = self._histories.setdefault(who, _History()), self._calls.get(who)
+        history.given.append(now)
+        if before is None:
+            history.merged = 0
+            self._calls[who] = Call(who, reason, act.name, at)
+            return True
+        reasons, stronger = before.reason, max(act, Act[before.act])
+        known = f"{_BETWEEN}{reasons}{_BETWEEN}"
+        if f"{_BETWEEN}{reason}{_BETWEEN}" not in known and known.count(_BETWEEN) <= MOST_REASONS:
+            reasons = f"{reasons}{_BETWEEN}{reason}"
+        self._calls[who] = Call(who, reasons, stronger.name, before.at)
+        new = self._calls[who] != before
+        history.merged += not new
+        return new
+
+    def withdraw(self, who: str, by: str, now: float) -> str:
+        """Withdraw a person's order.
+
+        Returns
+        -------
+        What people should know: how often it was repeated, and when the next one is taken.
+        """
+        self._calls.pop(who, None)
+        self._histories = {
+            name: one
+            for name, one in self._histories.items()
+            if name == who or name in self._calls or now < one.struck + REMEMBERED
+        }
+        history = self._histories.setdefault(who, _History())
+        if now >= history.struck + REMEMBERED:
+            history.strikes = 0
+        often = len(history.given) == REPEATED and now - history.given[0] < REPEATED_SPAN
+        told = f"it was repeated {history.merged:,} times" if history.merged else ""
+        if often or by != who:
+            # One withdrawal by somebody else has no pause: the person may know of something new.
+            history.strikes += 2 if often and not history.strikes else 1
+            history.struck = now
+            if history.strikes >= 2:
+                pause = min(LONGEST_PAUSE, PAUSE * 2.0 ** (history.strikes - 2))
+                history.until = now + pause
+                told += f"{told and _BETWEEN}{who}'s next one is taken in {pause:.0f} s"
+        history.merged = 0
+        return told
