@@ -478,7 +478,8 @@ def run(
     return Result(
         rows,
         f"{found.heliostats:,} heliostats: page after {found.page:.1f} s, "
-        f"{found.tracking:,} track, {len(found.seen.calibrated)} new calibrations in {minutes:g} min; "
+        f"{found.tracking:,} track, {len(found.seen.calibrated)} new calibrations in "
+        f"{minutes:g} min; "
         + (f"limits not kept: {', '.join(missed)}" if missed else "all limits kept"),
         {"heliostats": found.heliostats, "minutes": minutes},
         None if quick else not missed,
