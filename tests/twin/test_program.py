@@ -1,8 +1,11 @@
 """A simulated field as a program: its folder, its server, its clock, and its death."""
 
 import asyncio
+import contextlib
+import math
 import signal
 import socket
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -22,7 +25,7 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
-from heliotrope.plant.io.followed_clock import ClockReader, FollowedLoop
+from heliotrope.plant.io.followed_clock import ClockReader, ClockState, FollowedLoop
 from heliotrope.plant.io.links_file import read_links
 from heliotrope.twin.live import PacedLoop, World, WorldOptions
 from heliotrope.twin.live.live import true_mechanisms
@@ -107,16 +110,20 @@ def test_boards_store_what_the_plant_has_kept(tmp_path: Path) -> None:
 
 @pytest.fixture
 def served() -> Iterator[tuple[str, dict[str, Any]]]:
-    """The address of a server, and the state of its clock, which may be changed."""
+    """The address of a server, and the state of its clock, which may be changed and goes on."""
     state = {
         "now": 1000.0, "utc": START.timestamp(), "speed": 0.0, "asked": 2.0,
         "waits": True, "begun": False,
     }  # fmt: skip
     frame = Frame(np.full((16, 24), 9, dtype=np.uint8), "eye", START)
     loop, port = asyncio.new_event_loop(), free_port()
-    server = TwinServer(
-        ("127.0.0.1", port), SECRET, lambda: state, loop, lambda _: frame, bytes, bytes
-    )
+    begun = time.monotonic()
+
+    def clock() -> dict[str, Any]:
+        passed = state["speed"] * (time.monotonic() - begun)
+        return {**state, "now": state["now"] + passed, "utc": state["utc"] + passed}
+
+    server = TwinServer(("127.0.0.1", port), SECRET, clock, loop, lambda _: frame, bytes, bytes)
     server.start()
     yield f"http://127.0.0.1:{port}/{SECRET}", state
     server.close()
@@ -147,7 +154,7 @@ def test_a_plant_follows_the_clock_of_its_field(served: tuple[str, dict[str, Any
         loop = runner.get_loop()
         clock = reader.clock(loop)
         assert (clock.monotonic(), clock.utc()) == (1000.0, START), "it stands still"
-        state.update(now=1100.0, speed=50.0, begun=True)
+        state.update(speed=50.0, begun=True)
 
         async def wait() -> float:
             while not reader.state.begun:
@@ -158,8 +165,32 @@ def test_a_plant_follows_the_clock_of_its_field(served: tuple[str, dict[str, Any
 
         assert runner.run(wait()) >= 5.0
         passed = clock.utc().timestamp() - START.timestamp()
-        assert passed == pytest.approx(clock.monotonic() - 1000.0, abs=5.0), "0.1 s of this machine"
+        assert passed == pytest.approx(clock.monotonic() - 1000.0, abs=0.1)
     reader.close()
+
+
+def test_a_plant_does_not_run_ahead_of_a_field_that_does_not_answer() -> None:
+    state = ClockState(
+        wall=10.0, now=1000.0, utc=0.0, speed=50.0, asked=50.0, waits=True, begun=True
+    )
+    assert state.at(10.002) == pytest.approx(1000.1)
+    assert state.at(10.5) == state.at(60.0) == pytest.approx(1000.4)
+
+
+def test_a_plant_goes_on_without_a_field_that_is_gone(served: tuple[str, dict[str, Any]]) -> None:
+    address, state = served
+    state.update(speed=50.0, begun=True)
+    with contextlib.closing(ClockReader(address)) as reader:
+        reader.fetch = _gone  # type: ignore[method-assign]
+        until = time.monotonic() + 30.0
+        while math.isfinite(reader.state.ahead) and time.monotonic() < until:
+            time.sleep(0.01)
+        last = reader.state
+        assert last.at(last.wall + 2.0) == pytest.approx(last.now + 100.0)
+
+
+def _gone(path: str) -> bytes:
+    raise FetchError(f"{path}: gone")
 
 
 def test_a_field_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,6 +242,16 @@ def test_a_loop_stands_still_and_goes_on_at_another_speed() -> None:
             loop.speed = 40.0
             await asyncio.sleep(1.0)
             assert loop.time() >= begun + 1.0
+            loop.until = begun + 3.0
+            held = asyncio.ensure_future(asyncio.sleep(5.0))
+            while loop.time() < loop.until:
+                await asyncio.to_thread(time.sleep, 0.01)
+            await asyncio.to_thread(time.sleep, 0.3)  # 12 s at its speed
+            assert loop.time() == begun + 3.0
+            assert not held.done()
+            loop.until = math.inf
+            await held
+            assert loop.time() < begun + 8.0, "it goes on from there"
 
         runner.run(main())
 

@@ -1,6 +1,7 @@
 """The program of a simulated field: its clock, its clusters, and what it serves."""
 
 import asyncio
+import math
 import time
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,14 +21,18 @@ from heliotrope.twin.program.cameras import TwinCameras
 from heliotrope.twin.program.folder import FLUX, TwinFolder
 from heliotrope.twin.program.server import TwinServer
 
-#: Share of the speed at which time goes on until all clusters are connected; and while a lease of
-#: the plant is shorter than this, s.
-_FIRST, _SLOW, _SHORT = 0.02, 0.2, 1.5
+#: Share of the speed at which time goes on until all clusters are connected.
+_FIRST = 0.02
+#: A lease of the plant this long says that it leads the cluster, s.
+_LED = 1.5
+#: Time is held this long before the end of a lease, s: the plant, which renews it each second, then
+#: takes no status of a cluster for old. Wall time for which it is held for a plant that hangs, s.
+_HELD, _HANGS = 1.4, 10.0
 #: Time in which clusters have sent the orders with which they begin, and in which the plant has
 #: heard of a field that tracks, s.
 _BEGUN, _REPORTED = 0.5, 1.2
 #: Wall time between checks of the leases, s.
-_CHECKED = 0.1
+_CHECKED = 0.02
 #: Clusters call a plant that begins beside them soon again.
 _LINK = LinkSettings(longest_pause=0.2)
 #: Time between values of the sensors, s.
@@ -140,8 +145,10 @@ class TwinProgram:
             ):
                 tasks = [
                     group.create_task(self._sense(world)),
-                    group.create_task(self._lead(world, paced)),
+                    group.create_task(self._lead(world, cameras, paced)),
                 ]
+                if paced is not None:
+                    tasks.append(group.create_task(_hold(world, paced)))
                 await ending.wait()
                 for task in tasks:
                     task.cancel()
@@ -167,31 +174,21 @@ class TwinProgram:
             raise FetchError("the simulated field has not begun")
         return self._parts
 
-    async def _lead(self, world: World, loop: PacedLoop | None) -> None:
-        """Let the field begin once the plant leads it, and slow time down while the plant is late.
-
-        Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A
-        plant that leads no cluster any more has ended.
-        """
-        # To connect takes wall time, to be led takes simulated time.
+    async def _lead(self, world: World, cameras: TwinCameras, loop: PacedLoop | None) -> None:
+        """Let the field begin once the plant leads it."""
+        # To connect and to draw at first takes wall time, to be led takes simulated time.
+        await asyncio.to_thread(cameras.wait)
         while not all(cluster.connected for cluster in world.clusters):
             await _wall(_CHECKED)
         if loop is not None:
             loop.speed = self._options.speed
-        while min(cluster.lease_left for cluster in world.clusters) < _SHORT:
+        while min(cluster.lease_left for cluster in world.clusters) < _LED:
             await _wall(_CHECKED)
         await asyncio.sleep(_BEGUN)
         if self._options.up:
             world.put_up()
         await asyncio.sleep(_REPORTED)
         self._begun = True
-        while loop is not None:
-            left = [cluster.lease_left for cluster in world.clusters]
-            short = min(left) < _SHORT and max(left) > 0.0
-            speed = self._options.speed * (_SLOW if short else 1.0)
-            if speed != loop.speed:
-                loop.speed = speed
-            await _wall(_CHECKED)
 
     def _clock(self, clock: Clock, paced: PacedLoop | None) -> dict[str, Any]:
         """Return the state of the clock: monotonic s, UTC, speed, and whether the field is up."""
@@ -214,6 +211,23 @@ class TwinProgram:
             share = world.flux.share()
             await asyncio.to_thread(_replace, path, f"{share:.5f}\n")
             await asyncio.sleep(_SENSED)
+
+
+async def _hold(world: World, loop: PacedLoop) -> None:
+    """Hold the loop's time before a lease of the plant ends, without end.
+
+    Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A plant
+    that leads no cluster any more has ended, and one that renews nothing for long hangs.
+    """
+    renewed = time.monotonic()
+    while True:
+        led = [left for cluster in world.clusters if (left := cluster.lease_left) > 0.0]
+        least = min(led, default=math.inf)
+        if least > _HELD:
+            renewed = time.monotonic()
+        hangs = time.monotonic() - renewed > _HANGS
+        loop.until = math.inf if hangs else loop.time() + max(0.0, least - _HELD)
+        await _wall(_CHECKED)
 
 
 class _Go:
