@@ -32,6 +32,7 @@ from heliotrope.twin.live.live import true_mechanisms
 from heliotrope.twin.program import read_folder, write_folder
 from heliotrope.twin.program.boards import read_boards, write_boards
 from heliotrope.twin.program.server import TwinServer
+from heliotrope.twin.weather import WeatherStation
 from heliotrope.twin.yesterday import measure_yesterday, with_records
 from support.program import MAIN, Program
 
@@ -63,6 +64,9 @@ def test_a_folder_is_read_as_it_was_written(tmp_path: Path) -> None:
         f"http://127.0.0.1:8090/{made.secret}/cameras/camera-{side}.png"
         for side in ("left", "right")
     ]
+    assert read_links(tmp_path / "f" / "links.toml").document.sensors == {
+        name: f"{name}.txt" for name in ("dni", "receiver_flux_nominal", "wind_gust", "wind_mean")
+    }
     with pytest.raises(InputError, match="it exists; give another folder"):
         write_folder(design, tmp_path / "f", ("127.0.0.1", 4840), serves, steps_every=1)
 
@@ -273,6 +277,9 @@ def test_a_plant_outlives_its_field_and_leads_it_again(tmp_path: Path) -> None:
             "--no-console", "--data", str(tmp_path / "data"), "--every", "1", "--automatic",
         )  # fmt: skip
         plant.says("[1-6] of 6 track")
+        shown = {name: float((folder / f"{name}.txt").read_text()) for name in WeatherStation.names}
+        assert 300.0 < shown["dni"] < 1100.0
+        assert shown["wind_mean"] == pytest.approx(3.0, abs=2.0)
         field.process.send_signal(signal.SIGKILL)
         plant.says("1 of 1 clusters silent.*alarm")
         field.close()

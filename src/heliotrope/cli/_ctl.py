@@ -234,6 +234,8 @@ def status(context: typer.Context, as_json: Json = False) -> None:
     print(f"{answer['name']}, {answer['at']}")
     print_table(("state", "heliostats"), [(k, str(v)) for k, v in answer["states"].items()])
     print(f"{answer['clusters_alive']} of {answer['clusters']} clusters heard")
+    for name, value in answer["readings"].items():
+        print(f"{name}: {'no reading' if value is None else f'{value:.3g}'}")
     print(f"{answer['alarms']} alarms active or not acknowledged")
     print(f"{answer['holder'] or 'nobody'} has the command authority")
     if answer["emergency"]:

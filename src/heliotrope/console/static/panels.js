@@ -9,11 +9,15 @@ const look = (name) => { const row = store.index.get(name); if (row !== undefine
 const canCommand = () => me.role !== "viewer";
 const severe = { emergency: "bad", alarm: "bad", warning: "warn", fault: "bad" };
 
+// Names, units, their number in one of the reading's, and digits.
+const SENSORS = { dni: ["Direct sunlight", "W/m²", 1, 0], receiver_flux_nominal: ["Flux on the receiver, of the full field's", "%", 100, 0],
+  wind_gust: ["Wind gust (3 s)", "m/s", 1, 1], wind_mean: ["Mean wind (10 min)", "m/s", 1, 1], temperature: ["Air", "°C", 1, 0] };
+
 export function plant(box) {
-  const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" });
+  const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), sensors = h("div");
   const name = store.field.receivers[0];
   const figures = h("div");
-  box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light,
+  box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light, sensors,
     ...(name ? [h("h3", {}, `Predicted flux on ${name}`), figures, flux] : []));
   let seen = null;
   const show = () => {
@@ -29,6 +33,11 @@ export function plant(box) {
       ["Median error", `${mrad(head.calibration.quality?.median)} mrad`]]));
     light.replaceChildren(facts([["Azimuth", `${degrees(head.sun.azimuth, 1)}°`], ["Elevation", `${degrees(head.sun.elevation, 1)}°`],
       ["Shadow of the tower", head.sun.elevation > 0.02 ? `${number(store.field.tower[2] / Math.tan(head.sun.elevation), 0)} m to ${degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0)}°` : "none: the sun is down"]]));
+    const readings = Object.entries(head.readings);
+    sensors.replaceChildren(...(readings.length ? [h("h3", {}, "Sensors"), facts(readings.map(([of, value]) => {
+      const [label, unit, size, digits] = SENSORS[of] ?? [of.replaceAll("_", " "), "", 1, 2];
+      return [label, value === null ? "no reading" : `${number(size * value, digits)} ${unit}`];
+    }))] : []));
     proof.replaceChildren(...(head.order.on ? [h("p", { className: "hx-said bad" },
       `${head.order.act} of the field, ordered by ${head.order.who}: ${head.order.acknowledged} of ${head.order.heliostats} acknowledged, ${head.order.done} done. ${head.order.text}`), facts([
       ["Measured", head.order.measured ? "the flux, below its limit" : "nothing since the order"],

@@ -208,6 +208,7 @@ class Operations:
             self.plant.sentinel.on,
             self.automatic.waits,
             float(extra.pop("pace", 1.0)),
+            self.plant.sentinel.table.shown(now),
             extra,
         )
 

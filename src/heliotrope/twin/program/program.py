@@ -3,6 +3,7 @@
 import asyncio
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -15,11 +16,13 @@ from heliotrope.links.clock import Clock, SystemClock, VirtualClock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.link import LinkSettings, running
 from heliotrope.links.tcp import tcp_link
+from heliotrope.safety import FLUX_READING
 from heliotrope.twin.live import PacedLoop, World, WorldOptions
 from heliotrope.twin.program.boards import BOARDS, read_boards
 from heliotrope.twin.program.cameras import TwinCameras
-from heliotrope.twin.program.folder import FLUX, TwinFolder
+from heliotrope.twin.program.folder import TwinFolder, sensor_file
 from heliotrope.twin.program.server import TwinServer
+from heliotrope.twin.weather import WeatherStation
 
 #: Share of the speed at which time goes on until all clusters are connected.
 _FIRST = 0.02
@@ -204,12 +207,13 @@ class TwinProgram:
 
     async def _sense(self, world: World) -> None:
         """Write the values of the sensors into their files."""
-        if world.flux is None:
-            return
-        path = self._files.folder / FLUX
+        site = self._design.site
+        weather = WeatherStation(site.height, world.clock, world.sun, self._options.seed)
         while True:
-            share = world.flux.share()
-            await asyncio.to_thread(_replace, path, f"{share:.5f}\n")
+            values = weather.readings()
+            if world.flux is not None:
+                values[FLUX_READING] = world.flux.share()
+            await asyncio.to_thread(_write, self._files.folder, values)
             await asyncio.sleep(_SENSED)
 
 
@@ -254,7 +258,9 @@ async def _wall(seconds: float) -> None:
     await asyncio.to_thread(time.sleep, seconds)
 
 
-def _replace(path: Path, text: str) -> None:
-    new = path.with_suffix(".new")
-    new.write_text(text, encoding="ascii")
-    new.replace(path)
+def _write(folder: Path, values: Mapping[str, float]) -> None:
+    for name, value in values.items():
+        path = folder / sensor_file(name)
+        new = path.with_suffix(".new")
+        new.write_text(f"{value:.5f}\n", encoding="ascii")
+        new.replace(path)
