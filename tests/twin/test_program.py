@@ -16,6 +16,7 @@ import httpx
 import numpy as np
 import pytest
 
+from heliotrope.cluster.serial_bus import SerialBus
 from heliotrope.errors import FetchError, FormatError, InputError
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.field.layouts import malan_plant
@@ -23,7 +24,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.imaging.files import read_image
 from heliotrope.imaging.frame import Frame
 from heliotrope.lcu import states
-from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.clock import SystemClock, VirtualClock, run_virtual
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.io.followed_clock import ClockReader, ClockState, FollowedLoop
 from heliotrope.plant.io.links_file import read_links
@@ -260,6 +261,20 @@ def test_a_loop_stands_still_and_goes_on_at_another_speed() -> None:
         runner.run(main())
 
 
+def test_a_cluster_reads_its_boards_on_a_pseudo_terminal() -> None:
+    async def main() -> None:
+        options = WorldOptions(rendered=False, boards=True, pty=True)
+        world = World(malan_plant(3), SystemClock(), options)
+        (bus,) = world.buses.values()
+        assert isinstance(bus, SerialBus)
+        async with world.running(), asyncio.timeout(60.0):
+            while bus.statistics.answered < 20:
+                await asyncio.sleep(0.1)
+            assert (bus.problem, bus.statistics.spoilt) == ("", 0)
+
+    asyncio.run(main())
+
+
 # -- real processes ------------------------------------------------------------------------
 
 
@@ -292,3 +307,34 @@ def test_a_plant_outlives_its_field_and_leads_it_again(tmp_path: Path) -> None:
         field.close()
         if plant is not None:
             plant.close()
+
+
+def test_a_plant_leads_boards_on_pseudo_terminals(tmp_path: Path) -> None:
+    write_plant(at_noon(3), tmp_path / "plant.toml")
+    folder = tmp_path / "desk"
+    field = Program(
+        MAIN, "twin", str(tmp_path / "plant.toml"), "--folder", str(folder), "--boards", "--pty",
+        "--plant", f"127.0.0.1:{free_port()}",
+    )  # fmt: skip
+    plant = None
+    try:
+        field.says("now start")
+        plant = Program(
+            MAIN, "run", str(folder / "plant.toml"), "--clusters", str(folder / "links.toml"),
+            "--no-console", "--data", str(tmp_path / "data"), "--every", "1", "--automatic",
+        )  # fmt: skip
+        plant.says("3 move to their aims")
+    finally:
+        field.close()
+        if plant is not None:
+            plant.close()
+
+
+def test_a_pseudo_terminal_needs_boards(tmp_path: Path) -> None:
+    field = Program(MAIN, "twin", "--folder", str(tmp_path / "desk"), "--pty")
+    try:
+        assert field.ends() == 2
+        assert "--pty: only boards have a bus of bytes; give --boards too" in field.text
+        assert not (tmp_path / "desk").exists()
+    finally:
+        field.close()

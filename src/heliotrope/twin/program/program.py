@@ -56,6 +56,8 @@ class TwinOptions:
         Of how the mirrors really stand, and of all noise.
     boards
         Whether each heliostat is a firmware-true board; for small plants.
+    pty
+        Whether the bus of boards is a pseudo-terminal.
     up
         Whether the heliostats track as soon as the plant leads them; else they begin at stow.
     waits
@@ -67,6 +69,7 @@ class TwinOptions:
     speed: float = 1.0
     seed: int = 0
     boards: bool = False
+    pty: bool = False
     up: bool = False
     waits: bool = False
 
@@ -132,7 +135,9 @@ class TwinProgram:
             design = await self._stored(ending)
             if ending.is_set():
                 return
-            options = WorldOptions(self._options.seed, boards=self._options.boards, link=link)
+            options = WorldOptions(
+                self._options.seed, boards=self._options.boards, pty=self._options.pty, link=link
+            )
             world = World(design, clock, options)
             cameras = TwinCameras(world, loop, self._options.seed)
             self._parts = _Parts(world, cameras)
