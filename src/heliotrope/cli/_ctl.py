@@ -33,8 +33,8 @@ LockedReceivers = Annotated[
     list[str] | None, typer.Option("--receiver", help="Receiver; repeat it.", show_default=False)
 ]
 LockedTower = Annotated[bool, typer.Option("--tower", help="The tower: all heliostats.")]
-#: Status of an answer that asks for the code of a second factor.
-_NEEDS_CODE = 428
+#: Statuses of answers: name, password or code is wrong; the code of a second factor is needed.
+_REFUSED, _NEEDS_CODE = 401, 428
 Wait = Annotated[
     float, typer.Option("--wait", min=0, max=86_400, help="Longest wait for the end, s; 0: none.")
 ]
@@ -79,6 +79,12 @@ def _sign_in(client: "Client", name: str, password: str) -> None:
     try:
         client.sign_in(name, password)
     except RemoteError as error:
+        if error.status == _REFUSED:
+            raise RemoteError(
+                f"{error}; an account that the one-time link opened has no password until you set "
+                "one on the page /account",
+                error.status,
+            ) from None
         if error.status != _NEEDS_CODE:
             raise
         client.sign_in(name, password, typer.prompt("Code of your second factor"))

@@ -237,6 +237,12 @@ function several(names, key, shown) {
   return box;
 }
 
+// The points since the plant's last pause of an hour, or all while these span less than two minutes.
+function recent(points) {
+  const begin = points.findLastIndex((p, i) => i > 0 && p.at - points[i - 1].at > 3600);
+  return begin > 0 && points.at(-1).at - points[begin].at > 120 ? points.slice(begin) : points;
+}
+
 export function calibration(box) {
   const body = h("div"), lines = h("canvas", { className: "hx-chart" }), ahead = h("canvas", { className: "hx-chart" }), air = h("div"), nights = h("div");
   box.append(body, air, nights);
@@ -244,7 +250,7 @@ export function calibration(box) {
   let view = null;
   const draw = () => {
     if (!view) return;
-    const truth = view.quality.some((p) => p.truth_median !== null);
+    const quality = recent(view.quality), truth = quality.some((p) => p.truth_median !== null);
     const running = view.running.map((r) => h("li", {}, several([r.heliostat, ...r.others], r.target, shown), ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
     const key = (text, colour, dashed) => h("span", {}, h("i", { className: dashed ? "dashed" : "", style: `color:${colour}` }), text);
     body.replaceChildren(
@@ -262,7 +268,7 @@ export function calibration(box) {
         ...(truth ? [["True before → after", (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"]] : []),
         ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
     chart(lines, [["median", "APPROACHING"], ["percentile_90", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_percentile_90", "SEARCHING", [5, 4]]]
-      .map(([field, colour, dash]) => ({ points: view.quality.filter((p) => p[field] !== null).map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
+      .map(([field, colour, dash]) => ({ points: quality.filter((p) => p[field] !== null).map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
     if (view.outlooks.length) chart(ahead, outlookLines(view), dark());
   };
   const end = refreshed(async () => { view = await api("GET", "calibration"); draw(); },

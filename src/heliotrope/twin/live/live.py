@@ -89,8 +89,6 @@ class WorldOptions:
         field.
     boards
         Whether each heliostat is a firmware-true board; for small plants.
-    pty
-        Whether the bus of boards is a pseudo-terminal, which the cluster opens as a serial port.
     centroid
         Variance of centroids that are not photographed, m².
     link
@@ -99,6 +97,8 @@ class WorldOptions:
     bus_key
         Key with which the frames of every bus are signed; b"": none is, and a field of arrays
         obeys every frame.
+    pty
+        Whether the bus of boards is a pseudo-terminal, which the cluster opens as a serial port.
     """
 
     seed: int = 0
@@ -106,10 +106,10 @@ class WorldOptions:
     worker: Worker | None = None
     installed: Callable[[Mechanism], Mechanism] | None = None
     boards: bool = False
-    pty: bool = False
     centroid: float = 1e-5
     bus_key: bytes = b""
     link: Callable[[str], CarriedLink] | None = None
+    pty: bool = False
 
     def __post_init__(self) -> None:
         if not self.centroid >= 0.0:
