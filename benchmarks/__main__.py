@@ -1,5 +1,6 @@
 """``python -m benchmarks NAME [--json] [--quick]``; NAME may be all.
 
+A benchmark may have options of its own, as ``first_run --prototype``; README.md names them.
 ``all`` keeps every result in benchmarks/results, except with ``--quick``.
 """
 
@@ -12,21 +13,25 @@ from typing import Any
 
 from benchmarks._run import BUSY, BenchmarkError, Neighbours, keep, machine
 
-#: The registry: each is a module of this package with ``run(quick: bool) -> Result``.
+#: The registry: each is a module of this package with ``run(quick: bool) -> Result``; it may take
+#: more by name, from the parser that its ``options()`` returns.
 NAMES = (
     "tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames", "clusters",
     "control", "plant", "airborne", "console", "day", "learning", "signing",
     "splits", "coded", "production", "commission", "drifting", "obstruction", "floor",
-    "prototype", "heliopoint", "spots",
+    "prototype", "heliopoint", "spots", "first_run",
 )  # fmt: skip
 #: Width of a table that goes to a file or a pipe, characters.
 WIDTH = 180
 
 
-def _measure(name: str, quick: bool) -> dict[str, Any]:
+def _measure(name: str, quick: bool, words: list[str]) -> dict[str, Any]:
+    module = importlib.import_module(f"benchmarks.{name}")
+    own = getattr(module, "options", argparse.ArgumentParser)()
+    chosen = vars(own.parse_args(words))
     where = machine()
     neighbours, start = Neighbours(), time.perf_counter()
-    result = importlib.import_module(f"benchmarks.{name}").run(quick)
+    result = module.run(quick, **chosen)
     return {
         "name": name,
         "headline": result.headline,
@@ -89,7 +94,7 @@ def main() -> int:
     parser.add_argument("name", nargs="?", help=f"all, {', '.join(NAMES)}")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quick", action="store_true", help="small sizes, to see that it runs")
-    given = parser.parse_args()
+    given, words = parser.parse_known_args()
     if given.name is None:
         print("\n".join(NAMES))
         return 0
@@ -100,7 +105,7 @@ def main() -> int:
     results = {}
     for name in NAMES if given.name == "all" else (given.name,):
         try:
-            results[name] = _measure(name, given.quick)
+            results[name] = _measure(name, given.quick, words)
         except BenchmarkError as error:
             print(f"benchmarks: {name}: {error}", file=sys.stderr)
             return 1

@@ -3,6 +3,7 @@
 import functools
 import importlib
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -97,8 +98,11 @@ COLUMNS = {
         "background", "condition", "frames", "clean", "accepted", "east_mm", "up_mm", "rms_mm",
         "worst_mm", "in_68", "in_95", "wrong_accepts", "wrong_rejects", "faults", "faults_named",
     },
+    "first_run": {"figure", "value", "limit", "kept"},
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
+#: A browser with fifty viewers, and plants, take their time.
+SLOW = {"console", "production", "first_run"}
 RESULT = {
     "name", "headline", "within_budget", "quick", "seconds", "others_cores", "machine", "rows",
 }  # fmt: skip
@@ -137,7 +141,9 @@ def _no_number(text: str) -> float:
     "name",
     # A browser with fifty viewers, and plants, take their time.
     [
-        pytest.param(n, marks=pytest.mark.slow) if n in ("console", "production") else n
+        pytest.param(n, marks=pytest.mark.slow)
+        if n in ("console", "production", "first_run")
+        else n
         for n in COLUMNS
     ],
 )
@@ -296,6 +302,85 @@ def test_a_plant_runs_and_is_defocused() -> None:
         "all answers to it",
     ]
     assert all(row["cpu_s"] > 0.0 for row in result["rows"])
+
+
+STAT = (
+    "71 (a (b) c) S 70 71 71 0 -1 4194560 9 0 0 0 250 50 0 0 20 0 1 0 4242 860516352 3 0 0 0 0 0 0"
+)
+
+
+def test_a_process_is_read_by_its_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    first_run = _module(monkeypatch, "first_run")
+    found = first_run.process_of(STAT, b"python\0-c\0main()\0twin\0", 100.0)
+    assert found == first_run.Process(70, ("python", "-c", "main()", "twin"), 4242, 3.0)
+    mine = first_run.processes()[os.getpid()]
+    assert mine.parent == os.getppid()
+    assert mine.work == pytest.approx(sum(os.times()[:2]), abs=0.5)
+
+
+def test_each_process_of_a_plant_has_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    first_run = _module(monkeypatch, "first_run")
+    worker = ("python", "-c", "from multiprocessing.spawn import spawn_main")
+    known = {
+        number: first_run.Process(parent, command, 0, 0.0)
+        for number, parent, command in (
+            (1, 0, ("init",)),
+            (10, 1, ("python", "heliotrope", "run")),
+            (11, 10, ("python", "-c", "main()", "twin", "--child")),
+            (12, 11, worker),
+            (13, 10, worker),
+            (14, 10, ("python", "-m", "heliotrope.console.urgent_process")),
+            (15, 14, worker),
+            (16, 1, worker),
+        )
+    }
+    assert first_run.roles(10, known) == {
+        10: "plant", 11: "twin", 12: "drawing", 13: "computing", 14: "console", 15: "console",
+    }  # fmt: skip
+    assert first_run.roles(99, known) == {}
+
+
+def test_the_stream_shows_new_calibrations_and_lateness(monkeypatch: pytest.MonkeyPatch) -> None:
+    first_run = _module(monkeypatch, "first_run")
+    from heliotrope.console.stream import ROW, LiveMessage
+
+    def shows(utc: float, *calibrated: tuple[int, int]) -> LiveMessage:
+        rows = np.zeros(len(calibrated), ROW)
+        for row, (place, at) in zip(rows, calibrated, strict=True):
+            row["row"], row["calibrated"] = place, at
+        return LiveMessage({"utc": utc}, rows)
+
+    seen = first_run.Followed(4)
+    seen.take(shows(1000.5, (0, 0), (1, 500), (2, 0), (3, 600)), 50.0, 1000.75)
+    assert seen.calibrated == [], "those of yesterday are not new"
+    seen.take(shows(1001.5, (2, 1001)), 51.0, 1001.75)
+    assert (seen.calibrated, seen.behind) == ([1.0], 0.25)
+    seen.take(shows(1002.5, (1, 1002), (2, 1001)), 52.0, 1003.0)
+    assert (seen.calibrated, seen.behind) == ([1.0, 2.0], 0.5)
+    seen.take(shows(1008.5, (1, 1008)), 58.0, 1008.5)
+    assert seen.behind == 5.0, "nothing was shown meanwhile"
+    assert (seen.after(1.5 / 60.0), seen.after(5.0)) == (1, 3)
+
+
+def test_a_figure_that_was_not_seen_misses_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    limited = _module(monkeypatch, "first_run").limited
+    assert limited("a", 2.0, most=3.0) == {
+        "figure": "a",
+        "value": 2.0,
+        "limit": "≤ 3",
+        "kept": True,
+    }
+    assert limited("a", 2.0, least=3.0)["kept"] is False
+    assert limited("a", None, most=3.0) == {
+        "figure": "a", "value": None, "limit": "≤ 3", "kept": False,
+    }  # fmt: skip
+    assert limited("a", float("nan"))["value"] is limited("a", 1.0)["kept"] is None
+
+
+def test_options_belong_to_the_benchmark_that_has_them() -> None:
+    done = _run("startup", "--quick", "--minutes", "3")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "unrecognized arguments: --minutes 3" in done.stderr
 
 
 def test_no_damaged_frame_is_taken_for_true_and_packets_are() -> None:

@@ -203,6 +203,11 @@ TWO_AXIS = (
         ("axis_2 = [1, 0, 0]", "axis_2 = [0, 0, 3]", "so they are parallel"),
         ("axis_2 = [1, 0, 0]", "axis_2 = [0, 0, 0]", "axis_2: a vector of length 0"),
         ("axis_2 = [1, 0, 0]\n", "", "axis_2 is missing; kind two_axis needs it"),
+        (
+            "axis_2 = [1, 0, 0]\nnormal = [0, 1, 0]",
+            "",
+            "axis_2, normal are missing; kind two_axis needs them",
+        ),
         ("normal = [0, 1, 0]", "normal = [2, 0, 0]", "along the secondary axis"),
         ("normal = [0, 1, 0]", "normal = [0, nan, 0]", "normal.1: nan"),
     ],

@@ -30,6 +30,19 @@ async def main():
 
 asyncio.run(main())
 """
+#: A plant whose loop has ended, while the rest of its program has not.
+LOOP_OVER = """
+import asyncio
+import time
+from heliotrope.cli.run._shared import Ending
+
+async def main():
+    Ending().ask()
+
+asyncio.run(main())
+print("over", flush=True)
+time.sleep(600.0)
+"""
 PASSWORD = "a password of one's own"
 
 
@@ -118,3 +131,14 @@ def test_a_second_ctrl_c_kills_a_program_that_hangs() -> None:
         assert hangs.ends() == 130
     finally:
         hangs.close()
+
+
+def test_a_second_signal_is_silent_once_the_loop_has_ended() -> None:
+    plant = Program(LOOP_OVER)
+    try:
+        plant.says("over")
+        plant.process.send_signal(signal.SIGINT)
+        assert plant.ends() == 130
+        assert plant.text == "over\n"
+    finally:
+        plant.close()

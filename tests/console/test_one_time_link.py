@@ -7,7 +7,9 @@ from unittest.mock import patch
 
 import httpx
 import pytest
+from typer.testing import CliRunner
 
+from heliotrope.cli import app
 from heliotrope.console.people import FIRST, first_start, without_password
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
@@ -177,3 +179,14 @@ def test_a_store_without_a_password_gets_one_at_a_real_plant(tmp_path: Path) -> 
         assert not without_password(people, now)
     finally:
         keeper.close()
+
+
+def test_ctl_says_that_an_account_without_a_password_needs_one(
+    console: LiveConsole, link: str
+) -> None:
+    assert link
+    words = ["ctl", "--url", console.address, "token", "job", "--name", NAME, "--password", NEW]
+    refused = CliRunner().invoke(app, words)
+    assert refused.exit_code != 0
+    said = str(refused.exception or refused.output)
+    assert "has no password until you set one on the page /account" in said

@@ -13,6 +13,7 @@ import pytest
 from heliotrope.console._secrets import verify_password
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.store.keeper import Keeper
+from heliotrope.store.people import UNSET
 from support.live_console import PASSWORD, LiveConsole
 from support.pages import NEEDS_BROWSER, menu, said, until
 
@@ -42,6 +43,34 @@ def test_log_in_and_look(field: LiveConsole, enter: Callable[[str], Any]) -> Non
         document.querySelector('meta[name=heliotrope-csrf]').content}})).status"""
     )
     assert status == 403
+
+
+def test_a_one_time_link_opens_the_page_once(field: LiveConsole, browser: Any) -> None:
+    """A link that was used shows what to do; the person who used it goes on."""
+    people, name = field.keeper.people, "by link"
+    people.add(name, UNSET, "engineer", time.time())
+    link = field.interface.one_time_link(name, field.address)
+    first, other = browser.new_context(), browser.new_context()
+    try:
+        page = first.new_page()
+        page.goto(link)
+        page.wait_for_selector(".hx-legend b")
+        assert page.url == field.address
+        late = other.new_page()
+        answer = late.goto(link)
+        assert answer.status == 410
+        assert "This link is not valid" in late.inner_text("h1")
+        assert "it prints a new link" in late.inner_text("main")
+        late.click("text=sign in with it")
+        late.wait_for_url("**/login")
+        again = first.new_page()
+        assert again.goto(link).status == 410
+        again.click("text=open the console")
+        again.wait_for_selector(".hx-legend b")
+    finally:
+        first.close()
+        other.close()
+        people.remove(name)
 
 
 def test_first_start(field: LiveConsole, browser: Any, tmp_path: Path) -> None:

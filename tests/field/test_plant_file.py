@@ -122,6 +122,11 @@ max_angle_deg = 95
     path.write_text(text.replace("axis = [0, 1, 0]\n", ""))
     with pytest.raises(FormatError, match="axis is missing; kind single_axis needs it"):
         plant_file.read_plant(path)
+    gear = "kind = 'rotary'\nzero_deg = 0\n"
+    path.write_text(text.replace('kind = "direct"\n', gear))
+    message = "t.drives.rotation.rotary: 'steps_per_turn', 'gear_ratio' are missing; add them"
+    with pytest.raises(FormatError, match=message):
+        plant_file.read_plant(path)
     machine = "[groups.t.machine]\nstow_deg = [0, 0]\n[groups.t.machine.axes.rotation]\n"
     path.write_text(f"{text}{machine}acceleration_steps_per_s2 = 100\nbacklash_steps = 0\n")
     with pytest.raises(FormatError, match="local controllers drive two joints"):
@@ -450,7 +455,7 @@ def test_group_without_a_machine_reads_and_is_refused_where_one_is_needed(tmp_pa
         ("defocus_mrad = [100, 50]", "", "give one of defocus_deg, defocus_mrad, defocus_rad"),
         ("rate_steps_per_s = 8000", "rate_steps_per_s = 20000", "controller emits 10000 at most"),
         ("backlash_steps = 40", "", "groups.azel.machine.axes.azimuth.backlash_steps"),
-        ("max_deg = 93.6", "", "missing in _steps and _deg, and the drive has no stop"),
+        ("max_deg = 93.6", "", "max_deg is missing; its drive does not give it"),
         ("max_steps = 222222", "max_steps = 222222\nmax_deg = 1", "in steps and in deg; keep one"),
         ("max_steps = 222222", "max_steps = -222222", "the low end comes first"),
         ("axes.elevation]", "axes.roll]", "axes of azimuth, roll; give those of azimuth and elev"),

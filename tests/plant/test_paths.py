@@ -1,6 +1,7 @@
 """Commands that move axes by counts are proven too: no beam enters a keep-out volume."""
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -47,6 +48,7 @@ from heliotrope.twin.world.design import design_of
 from heliotrope.twin.world.scene import TARGETS, scene_of
 from support.live import LiveOptions, LivePlant
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
+from support.six_kinds import mixed
 
 #: South of the tower; P5A stands due south of it and shines to the tower.
 WALKWAY = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)
@@ -1224,3 +1226,32 @@ def test_poses_are_those_within_the_limits_of_the_motors() -> None:
     assert ((first(check) >= low) & (first(check) <= high)).all()
     free = first(BeamCheck(_stopless(design), design.names))
     assert (free[0] > high).any()
+
+
+def test_a_stop_that_the_safe_path_passes_is_named() -> None:
+    """A tilt-roll mirror whose tilt ends at 90° cannot lead a low sun's beam along the ground."""
+    design = mixed(["tilt_roll"], 4)
+    (group,) = design.groups.values()
+    quarter = 100_000  # steps
+    axis = replace(group.machines[0].axes[0], low=-quarter, high=quarter)
+    machines = tuple(replace(machine, axes=(axis, axis)) for machine in group.machines)
+    stopped = replace(design, groups={"t": replace(group, machines=machines)})
+    noon = datetime(2026, 6, 21, 12, tzinfo=UTC) - timedelta(hours=design.site.longitude_deg / 15)
+
+    def found(plant: Plant, hours: float) -> dict[str, str]:
+        paths = Paths(BeamCheck(plant, plant.names))
+        points = np.array([machine.standby for machine in group.machines], dtype=np.float64)
+        light = vector(noon + timedelta(hours=hours), plant.site)
+        return paths.approach(np.arange(4), paths.stow, points, lambda _: light)
+
+    morning = found(stopped, -5.0)
+    assert set(morning) == set(stopped.names)
+    for text in morning.values():
+        assert re.fullmatch(
+            r"point 1 of \d+ of the safe path, \(.*, 0\.0\) m: axis 1 would have to turn to "
+            r"-\d+\.\d°, and its stop is at -90\.0°; move the stop in the plant file, or give "
+            "other points as way_m",
+            text,
+        )
+    assert not any("stop" in text for text in found(stopped, 0.0).values())
+    assert not any("stop" in text for text in found(design, -5.0).values())

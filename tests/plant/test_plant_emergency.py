@@ -428,6 +428,26 @@ def test_a_sensor_that_falls_silent_counts_as_the_worst(tmp_path: Path) -> None:
     play(tmp_path, scene, settings=WINDY)
 
 
+def test_readings_of_sensors_are_shown_until_they_are_old(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        table = bench.plant.sentinel.table
+        shown = table.shown(bench.plant.now())
+        assert list(shown) == ["dni", FLUX_READING, "wind_gust"]
+        assert all(map(math.isnan, shown.values()))
+        bench.plant.put("dni", 640.0)
+        await feed(bench, 50, wind_gust=3.0)
+        shown = table.shown(bench.plant.now())
+        assert (shown["dni"], shown["wind_gust"]) == (640.0, 3.0)
+        await feed(bench, 12, wind_gust=4.0)
+        shown = table.shown(bench.plant.now())
+        assert math.isnan(shown["dni"])
+        assert shown["wind_gust"] == 4.0
+        assert bench.plant.sentinel.order is None
+
+    sensors = frozenset({"wind_gust", "dni", FLUX_READING})
+    play(tmp_path, scene, settings=PlantSettings(sensors=sensors))
+
+
 def test_a_silent_cluster_is_defocused_alone_and_told_again_when_it_is_back(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant

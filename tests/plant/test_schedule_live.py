@@ -10,6 +10,7 @@ from heliotrope.field.layouts import malan_plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.schedule import PlantSchedule, Scheduler, Settings, settings_for
+from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits import CycleSettings
 from support.live import LiveOptions, LivePlant
 
@@ -27,7 +28,8 @@ def test_the_settings_are_those_of_the_cycle() -> None:
 
 def test_a_plant_at_work_asks_its_schedule_and_tells_what_became_of_it() -> None:
     async def main(clock: VirtualClock) -> None:
-        options = LiveOptions(rendered=False, threads=0)
+        sensors = PlantSettings(sensors=frozenset({"dni"}))
+        options = LiveOptions(rendered=False, threads=0, plant=sensors)
         async with LivePlant(DESIGN, clock, options).running() as live:
             try:
                 schedule = live.assembly.schedule
@@ -36,6 +38,7 @@ def test_a_plant_at_work_asks_its_schedule_and_tells_what_became_of_it() -> None
                 _what_came_of_it(live, schedule)
                 _what_was_chosen(live, schedule)
                 _what_is_to_come(live, schedule)
+                _under_clouds(live, schedule)
                 _after_a_restart(live, schedule)
             finally:
                 # As an exit does: what is on its way is given up first.
@@ -43,6 +46,15 @@ def test_a_plant_at_work_asks_its_schedule_and_tells_what_became_of_it() -> None
                 await live.end()
 
     run_virtual(main, start=START)
+
+
+def _under_clouds(live: LivePlant, schedule: PlantSchedule) -> None:
+    ready = np.ones(len(live.plant.field), dtype=np.bool_)
+    live.plant.put("dni", 120.0)
+    assert schedule.weather.dni == 120.0
+    assert schedule.next("left", ready) is None
+    assert schedule.reason == "clouds: 120 W/m², below 300 W/m²"
+    live.plant.put("dni", 850.0)
 
 
 async def _visits(live: LivePlant, schedule: PlantSchedule) -> None:

@@ -224,6 +224,7 @@ def test_a_plant_takes_yesterday_over_and_goes_on_with_other_heliostats(tmp_path
             assert (np.isfinite(book.error) == mine).all()
             assert set(book.sightings[mine]) == {4, 8}
             assert np.isfinite(book.calibrated_at[mine]).all()
+            _shows_the_day_before(live)
             await asyncio.sleep(45.0)
             assert not live.plant.wanted.missing
             errors = live.errors()
@@ -246,6 +247,31 @@ def test_a_plant_takes_yesterday_over_and_goes_on_with_other_heliostats(tmp_path
     keeper = Keeper(tmp_path, inline=True)
     run_virtual(main, start=START)
     keeper.close()
+
+
+def _shows_the_day_before(live: LivePlant) -> None:
+    """The results of yesterday are in the page's table, in its trend and with each heliostat."""
+    view = live.operations.automatic.view()
+    kept = keeper_visits(live)
+    assert [(r.at, r.heliostat, r.text) for r in view.results] == kept
+    assert view.failed == 0
+    assert all(result.good and "(simulated)" in result.text for result in view.results)
+    trend = [point for point in view.quality if np.isnan(point.truth_median)]
+    counts = [point.calibrated for point in trend]
+    assert counts == sorted(counts)
+    assert counts[-1] == 12
+    assert all(0.0 < point.median <= point.percentile_90 for point in trend)
+    again = [r.heliostat for r in view.results if r.sightings == 8]
+    assert again, "some were visited twice"
+    history = live.operations.viewer.heliostat(again[0]).results
+    assert [(r.new, r.sightings) for r in history] == [(4, 4), (4, 8)]
+
+
+def keeper_visits(live: LivePlant) -> list[tuple[float, str, str]]:
+    """Return when visits ended, whose they were, and what came of them, the latest first."""
+    records = live.assembly.ports.records
+    assert records is not None
+    return [(visit.finished, visit.heliostat, visit.text) for visit in records.visits()]
 
 
 def test_records_of_several_models_make_one_plant() -> None:

@@ -34,8 +34,8 @@ LockedReceivers = Annotated[
     list[str] | None, typer.Option("--receiver", help="Receiver; repeat it.", show_default=False)
 ]
 LockedTower = Annotated[bool, typer.Option("--tower", help="The tower: all heliostats.")]
-#: Status of an answer that asks for the code of a second factor.
-_NEEDS_CODE = 428
+#: Statuses of answers: name, password or code is wrong; the code of a second factor is needed.
+_REFUSED, _NEEDS_CODE = 401, 428
 Wait = Annotated[
     float, typer.Option("--wait", min=0, max=86_400, help="Longest wait for the end, s; 0: none.")
 ]
@@ -80,6 +80,12 @@ def _sign_in(client: "Client", name: str, password: str) -> None:
     try:
         client.sign_in(name, password)
     except RemoteError as error:
+        if error.status == _REFUSED:
+            raise RemoteError(
+                f"{error}; an account that the one-time link opened has no password until you set "
+                "one on the page /account",
+                error.status,
+            ) from None
         if error.status != _NEEDS_CODE:
             raise
         client.sign_in(name, password, typer.prompt("Code of your second factor"))
@@ -235,6 +241,8 @@ def status(context: typer.Context, as_json: Json = False) -> None:
     print(f"{answer['name']}, {answer['at']}")
     print_table(("state", "heliostats"), [(k, str(v)) for k, v in answer["states"].items()])
     print(f"{answer['clusters_alive']} of {answer['clusters']} clusters heard")
+    for name, value in answer["readings"].items():
+        print(f"{name}: {'no reading' if value is None else f'{value:.3g}'}")
     print(f"{answer['alarms']} alarms active or not acknowledged")
     print(f"{answer['holder'] or 'nobody'} has the command authority")
     if answer["emergency"]:

@@ -49,6 +49,10 @@ def twin(
         bool,
         typer.Option("--boards", help="Each heliostat is a firmware-true board; for small plants."),
     ] = False,
+    pty: Annotated[
+        bool,
+        typer.Option("--pty", help="The bus of each cluster's boards is a pseudo-terminal."),
+    ] = False,
     up: Annotated[
         bool, typer.Option("--up", help="The heliostats track at the start, as on a day of work.")
     ] = False,
@@ -80,6 +84,8 @@ def twin(
     one_plant("twin", field, heliostats, prototype=prototype)
     if start == "now" and (speed != 1.0 or up):
         raise InputError("twin: --speed and --up need a --start: else it keeps this machine's time")
+    if pty and not (boards or prototype):
+        raise InputError("twin: --pty: only boards have a bus of bytes; give --boards too")
     if field is None and (folder / LINKS).exists():
         if start != "now":
             raise InputError(f"twin: {folder}: it ran before, and runs again with --start now only")
@@ -95,7 +101,7 @@ def twin(
             _free(_address(serve, "--serve")),
             steps_every=steps_every(len(design)),
         )
-    options = TwinOptions(begins, speed, seed, boards or prototype, up, waits=child)
+    options = TwinOptions(begins, speed, seed, boards or prototype, pty, up, waits=child)
     program = TwinProgram(design, files, options)
     if child:
         print(READY, flush=True)

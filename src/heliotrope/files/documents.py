@@ -1,7 +1,7 @@
 """TOML files of our own formats, checked against pydantic models with errors in plain words."""
 
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
@@ -65,16 +65,30 @@ def read_document(
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise FormatError(path, _explained(first, tables), where) from None
+        errors = error.errors(include_url=False)
+        missing, table = _missing(errors)
+        first = errors[0]
+        where = ".".join(str(part) for part in (table if missing else first["loc"]))
+        raise FormatError(path, missing or _explained(first, tables), where) from None
+
+
+def _missing(errors: Sequence[Any]) -> tuple[str, tuple[Any, ...]]:
+    """Return one line on all keys that the table of the first error lacks, and the table.
+
+    "" if the first error is another one.
+    """
+    if errors[0]["type"] != "missing":
+        return "", ()
+    table = errors[0]["loc"][:-1]
+    lacks = [e for e in errors if e["type"] == "missing" and e["loc"][:-1] == table]
+    keys = ", ".join(repr(str(error["loc"][-1])) for error in lacks)
+    text = f"{keys} are missing; add them" if len(lacks) > 1 else f"{keys} is missing; add it"
+    return text, table if len(lacks) > 1 else errors[0]["loc"]
 
 
 def _explained(error: Any, tables: Iterable[type[BaseModel]]) -> str:
     """Return one line from pydantic's description of an error."""
     key = str(error["loc"][-1]) if error["loc"] else ""
-    if error["type"] == "missing":
-        return f"{key!r} is missing; add it"
     if error["type"] == "extra_forbidden":
         known = sorted({name for table in tables for name in table.model_fields})
         close = get_close_matches(key, known, n=1)

@@ -248,15 +248,16 @@ class PlantAssembly:
                 running(self.plant),
                 contextlib.AsyncExitStack() as later,
             ):
+                group = await later.enter_async_context(asyncio.TaskGroup())
+                tasks = []
+                # The safety table waits for readings from the start.
+                if sensors is not None:
+                    tasks.append(group.create_task(self._sense(sensors)))
                 if self.ports.ready is not None:
                     await self.ports.ready()
                 await later.enter_async_context(running(self.operations))
-                group = await later.enter_async_context(asyncio.TaskGroup())
-                tasks = []
                 if cameras is not None:
                     tasks.append(group.create_task(self._look(cameras)))
-                if sensors is not None:
-                    tasks.append(group.create_task(self._sense(sensors)))
                 if self.ports.witnesses:
                     tasks.append(group.create_task(self._witness()))
                 yield self

@@ -245,7 +245,8 @@ class Ending:
         last = threading.Timer(AT_ONCE, os._exit, [_INTERRUPTED])
         last.daemon = True
         last.start()
-        self._loop.call_soon_threadsafe(self.at_once.set)
+        with contextlib.suppress(RuntimeError):  # the loop has ended, and the rest is soon over
+            self._loop.call_soon_threadsafe(self.at_once.set)
 
 
 @contextlib.contextmanager

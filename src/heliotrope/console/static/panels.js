@@ -9,11 +9,15 @@ const look = (name) => { const row = store.index.get(name); if (row !== undefine
 const canCommand = () => me.role !== "viewer";
 const severe = { emergency: "bad", alarm: "bad", warning: "warn", fault: "bad" };
 
+// Names, units, their number in one of the reading's, and digits.
+const SENSORS = { dni: ["Direct sunlight", "W/m²", 1, 0], receiver_flux_nominal: ["Flux on the receiver, of the full field's", "%", 100, 0],
+  wind_gust: ["Wind gust (3 s)", "m/s", 1, 1], wind_mean: ["Mean wind (10 min)", "m/s", 1, 1], temperature: ["Air", "°C", 1, 0] };
+
 export function plant(box) {
-  const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" });
+  const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), sensors = h("div");
   const name = store.field.receivers[0];
   const figures = h("div");
-  box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light,
+  box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light, sensors,
     ...(name ? [h("h3", {}, `Predicted flux on ${name}`), figures, flux] : []));
   let seen = null;
   const show = () => {
@@ -29,6 +33,11 @@ export function plant(box) {
       ["Median error", `${mrad(head.calibration.quality?.median)} mrad`]]));
     light.replaceChildren(facts([["Azimuth", `${degrees(head.sun.azimuth, 1)}°`], ["Elevation", `${degrees(head.sun.elevation, 1)}°`],
       ["Shadow of the tower", head.sun.elevation > 0.02 ? `${number(store.field.tower[2] / Math.tan(head.sun.elevation), 0)} m to ${degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0)}°` : "none: the sun is down"]]));
+    const readings = Object.entries(head.readings);
+    sensors.replaceChildren(...(readings.length ? [h("h3", {}, "Sensors"), facts(readings.map(([of, value]) => {
+      const [label, unit, size, digits] = SENSORS[of] ?? [of.replaceAll("_", " "), "", 1, 2];
+      return [label, value === null ? "no reading" : `${number(size * value, digits)} ${unit}`];
+    }))] : []));
     proof.replaceChildren(...(head.order.on ? [h("p", { className: "hx-said bad" },
       `${head.order.act} of the field, ordered by ${head.order.who}: ${head.order.acknowledged} of ${head.order.heliostats} acknowledged, ${head.order.done} done. ${head.order.text}`), facts([
       ["Measured", head.order.measured ? "the flux, below its limit" : "nothing since the order"],
@@ -248,6 +257,12 @@ function several(names, key, shown) {
   return box;
 }
 
+// The points since the plant's last pause of an hour, or all while these span less than two minutes.
+function recent(points) {
+  const begin = points.findLastIndex((p, i) => i > 0 && p.at - points[i - 1].at > 3600);
+  return begin > 0 && points.at(-1).at - points[begin].at > 120 ? points.slice(begin) : points;
+}
+
 export function calibration(box) {
   const body = h("div"), lines = h("canvas", { className: "hx-chart" }), ahead = h("canvas", { className: "hx-chart" }), air = h("div"), nights = h("div");
   box.append(body, air, nights);
@@ -255,7 +270,7 @@ export function calibration(box) {
   let view = null;
   const draw = () => {
     if (!view) return;
-    const truth = view.quality.some((p) => p.truth_median !== null);
+    const quality = recent(view.quality), truth = quality.some((p) => p.truth_median !== null);
     const running = view.running.map((r) => h("li", {}, several([r.heliostat, ...r.others], r.target, shown), ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
     const key = (text, colour, dashed) => h("span", {}, h("i", { className: dashed ? "dashed" : "", style: `color:${colour}` }), text);
     body.replaceChildren(
@@ -273,7 +288,7 @@ export function calibration(box) {
         ...(truth ? [["True before → after", (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"]] : []),
         ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
     chart(lines, [["median", "APPROACHING"], ["percentile_90", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_percentile_90", "SEARCHING", [5, 4]]]
-      .map(([field, colour, dash]) => ({ points: view.quality.map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
+      .map(([field, colour, dash]) => ({ points: quality.filter((p) => p[field] !== null).map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
     if (view.outlooks.length) chart(ahead, outlookLines(view), dark());
   };
   const end = refreshed(async () => { view = await api("GET", "calibration"); draw(); },

@@ -158,19 +158,24 @@ class _Reader:
             "two_axis": ("axis_1", "axis_2", "normal"),
             "single_axis": ("axis",),
         }
-        for key in needed.get(group.kind, ()):
-            if getattr(group, key) is None:
-                raise self.fail(f"{key} is missing; kind {group.kind} needs it")
-        if group.kind == "two_jacks" and not group.drives:
-            raise self.fail("drives are missing; kind two_jacks needs those of both joints")
         names = _joint_names(group.kind)
+        missing = [key for key in needed.get(group.kind, ()) if getattr(group, key) is None]
+        if group.drives or group.kind == "two_jacks":
+            missing += [f"drives.{joint}" for joint in names if joint not in group.drives]
         for joint in group.drives:
             if joint not in names:
                 raise self.fail(f"{joint!r} is no driven joint; they are {names}", "drives")
+        self.check_missing(missing, f"kind {group.kind} needs")
         if group.drives:
             arguments["drives"] = tuple(self.drive(joint) for joint in names)
         mechanism: Mechanism = builder(position, **arguments)
         return mechanism
+
+    def check_missing(self, keys: Sequence[str], why: str, where: str = "") -> None:
+        """Raise an error that names all missing keys, and why they are needed."""
+        if keys:
+            be, it = ("are", "them") if len(keys) > 1 else ("is", "it")
+            raise self.fail(f"{', '.join(keys)} {be} missing; {why} {it}", where)
 
     def drive(self, joint: str) -> Drive:
         if joint not in self.group.drives:
@@ -208,9 +213,8 @@ class _Reader:
             "pivot_radius_m",
             "initial_angle",
         )
-        for key in needed:
-            if key not in values:
-                raise self.fail(f"{key} is missing, here and as a column {where}.{key}", where)
+        missing = [key for key in needed if key not in values]
+        self.check_missing(missing, f"give here, or as columns {where}.KEY,", where)
         # Popped first: an unpacked generator would run only after **values.
         constants = [values.pop(key) for key in needed]
         return drive_kinds.linear_paint(*constants, **values)
@@ -225,8 +229,8 @@ class _Reader:
             column = self.column(f"drives.{joint}.{key}")
             if column is not None:
                 row[:, index] = column
-            elif key not in numbers:
-                raise self.fail(f"{key} is missing", f"drives.{joint}.numbers")
+        lacks = [k for k in _RAW if k not in numbers and self.column(f"drives.{joint}.{k}") is None]
+        self.check_missing(lacks, "a drive of kind raw needs", f"drives.{joint}.numbers")
         return Drive(row).replace()
 
     def chain(self, position: FloatArray) -> Mechanism:
@@ -342,6 +346,7 @@ class _Reader:
     def axis(self, drive: Drive, where: str, table: AxisTable) -> npt.NDArray[np.int64]:
         """Return low, high, rate, acceleration and backlash of one axis, (N, 5)."""
         stops = (slot.MIN_ANGLE, slot.MAX_ANGLE)
+        self.check_axis(drive, where, table)
         ends = [
             self.end(drive, f"{where}.{name}", getattr(table, f"{name}_steps"), deg, stop)
             for name, deg, stop in zip(
@@ -351,8 +356,6 @@ class _Reader:
         rate = self.number(f"{where}.rate_steps_per_s", table.rate_steps_per_s)
         if rate is None:
             rate = drive.table[:, slot.SPEED]
-            if not np.isfinite(rate).all():
-                raise self.fail("rate_steps_per_s is missing, and the drive has no speed", where)
         rest = [
             self.array(f"{where}.{key}", getattr(table, key))
             for key in ("acceleration_steps_per_s2", "backlash_steps")
@@ -361,6 +364,24 @@ class _Reader:
         low, high = np.minimum(*ends), np.maximum(*ends)
         columns = [np.broadcast_to(v, self.rows.shape) for v in (low, high, rate, *rest)]
         return np.round(np.stack(columns, axis=-1)).astype(np.int64)
+
+    def check_axis(self, drive: Drive, where: str, table: AxisTable) -> None:
+        """Check that the stops and the rate of an axis are given, here or by its drive."""
+        given = (
+            ("min_deg", (table.min_steps, table.min_deg), slot.MIN_ANGLE),
+            ("max_deg", (table.max_steps, table.max_deg), slot.MAX_ANGLE),
+            ("rate_steps_per_s", (table.rate_steps_per_s,), slot.SPEED),
+        )
+        columns = ("min_steps", "max_steps", *(key for key, _, _ in given))
+        known = {key for key in columns if self.column(f"{where}.{key}") is not None}
+        missing = [
+            key
+            for key, values, place in given
+            if all(value is None for value in values)
+            and not known & {key, key.replace("_deg", "_steps")}
+            and not np.isfinite(drive.table[:, place]).all()
+        ]
+        self.check_missing(missing, "its drive does not give", where)
 
     def end(
         self, drive: Drive, where: str, steps: int | None, deg: float | None, stop: int
@@ -373,8 +394,6 @@ class _Reader:
         if counts is not None:
             return np.broadcast_to(counts, self.rows.shape)
         radians = drive.table[:, stop] if angle is None else np.radians(angle)
-        if not np.isfinite(radians).all():
-            raise self.fail("it is missing in _steps and _deg, and the drive has no stop", where)
         return np.asarray(drive.counts(np.broadcast_to(radians, self.rows.shape)))
 
     def stow(self, drives: Drive, table: MachineTable) -> npt.NDArray[np.int64]:

@@ -8,9 +8,16 @@ field with its proof.
 from heliotrope.plant.emergency.order import EmergencyOrder, at_stow, carried_out
 from heliotrope.plant.emergency.sentinel import UNPROVEN, Sentinel
 from heliotrope.plant.emergency.standing import Call, EmergencyRecord, Standing, read_standing
-from heliotrope.plant.emergency.table import ORDERED, OWN_READINGS, PlantReadings, TableWatch
+from heliotrope.plant.emergency.table import (
+    DNI_READING,
+    ORDERED,
+    OWN_READINGS,
+    PlantReadings,
+    TableWatch,
+)
 
 __all__ = [
+    "DNI_READING",
     "ORDERED",
     "OWN_READINGS",
     "UNPROVEN",

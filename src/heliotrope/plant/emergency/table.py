@@ -60,6 +60,12 @@ NIGHT = "sun_below_horizon"
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
 #: Readings that the plant makes of a sensor's, and the sensor.
 DERIVED = {"flux_after_emergency": FLUX_READING}
+#: Direct normal irradiance, W/m²: for the schedule and for persons.
+DNI_READING = "dni"
+#: Readings of sensors that are in no row.
+_IN_NO_ROW = frozenset({DNI_READING, *DERIVED.values()})
+#: Age from which a reading is no longer shown, s.
+_SHOWN = 60.0
 #: Pause between two computations of the sun's elevation, s.
 SUN_PERIOD = 5.0
 
@@ -177,7 +183,7 @@ class TableWatch:
         self.tell = tell
         table = watched_by(rows, Watcher.PLANT)
         self._sensors = frozenset(sensors)
-        known = {row.reading for row in table} - OWN_READINGS | set(DERIVED.values())
+        known = {row.reading for row in table} - OWN_READINGS | _IN_NO_ROW
         for name in sorted(self._sensors - known):
             raise InputError(
                 f"sensor {name}: no row of the safety table that the plant watches takes it from a "
@@ -193,6 +199,7 @@ class TableWatch:
         self._state = start(able, now, subjects)
         self._own = readings
         self._put: dict[tuple[str, str], Reading] = {}
+        self._newest: dict[str, Reading] = {}
         self._told: dict[tuple[str, str], Alarm] = {}
 
     @property
@@ -210,8 +217,22 @@ class TableWatch:
         """
         if name not in self._sensors:
             raise UnknownNameError("sensor of the plant", name, self._sensors)
-        if name not in DERIVED.values():
+        if not subject:
+            self._newest[name] = Reading(value, at)
+        if name not in _IN_NO_ROW:
             self._put[name, subject] = Reading(value, at)
+
+    def shown(self, now: float) -> dict[str, float]:
+        """Return the newest readings of sensors, by name, in the units of the rows.
+
+        NaN: there is none, or an old one.
+        """
+        return {
+            name: reading.value
+            if (reading := self._newest.get(name)) and now - reading.at <= _SHOWN
+            else math.nan
+            for name in sorted(self._sensors)
+        }
 
     def evaluate(
         self,

@@ -193,6 +193,30 @@ class BeamCheck:
             current=counts,
         )
 
+    def stop(self, row: int, aim: FloatArray, sun: FloatArray, counts: FloatArray) -> str:
+        """Return which stop keeps a heliostat from an aim (3,), and what would help.
+
+        The sun is (3,), and the pose the one nearest to counts (2,).
+        """
+        table = self.drives.table[row]
+        free = table.copy()
+        free[:, [SLOTS["min_count"], SLOTS["min_angle"]]] = -np.inf
+        free[:, [SLOTS["max_count"], SLOTS["max_angle"]]] = np.inf
+        armature = Armature(self.armature.table[row])
+        wanted = track(armature, sun, aim, drives=Drive(free), current=counts).best_angles
+        ends = table[:, [SLOTS["min_count"], SLOTS["max_count"]]].T
+        turned = Drive(free).angles(np.where(np.isfinite(ends), ends, 0.0))
+        stops = np.sort(np.where(np.isfinite(ends), turned, ends), axis=0)
+        low = np.maximum(stops[0], table[:, SLOTS["min_angle"]])
+        high = np.minimum(stops[1], table[:, SLOTS["max_angle"]])
+        axis = int(np.maximum(wanted - high, low - wanted).argmax())
+        stop = high[axis] if wanted[axis] > high[axis] else low[axis]
+        return (
+            f"axis {axis + 1} would have to turn to {np.degrees(wanted[axis]):.1f}°, and its stop "
+            f"is at {np.degrees(stop):.1f}°; move the stop in the plant file, or give other points "
+            "as way_m"
+        )
+
     def problems(
         self,
         rows: npt.NDArray[np.intp],
@@ -224,7 +248,7 @@ class BeamCheck:
         status = solved.chosen(solved.status)
         for i in np.flatnonzero(status != TrackingStatus.OK):
             found[self.names[rows[i]]] = (
-                f"the aim {_point(aims[i])} m: {TrackingStatus(int(status[i])).text}"
+                f"the aim {point_text(aims[i])} m: {TrackingStatus(int(status[i])).text}"
             )
         if not self.volumes:
             return found
@@ -277,8 +301,8 @@ class BeamCheck:
             for row in np.unique(rows[lit]):
                 found.setdefault(
                     self.names[row],
-                    f"at rest its beam shines on the place {_point(self.eyes[eye])} m, where the "
-                    f"light of all beams together is {total[eye]:.2f} suns (limit "
+                    f"at rest its beam shines on the place {point_text(self.eyes[eye])} m, where "
+                    f"the light of all beams together is {total[eye]:.2f} suns (limit "
                     f"{MOST_SUNS:g}); choose another standby point",
                 )
         return found
@@ -309,7 +333,7 @@ class BeamCheck:
         status = solved.chosen(solved.status)
         for i in np.flatnonzero(status != TrackingStatus.OK):
             found[self.names[rows[i]]] = (
-                f"the aim {_point(aims[i])} m: {TrackingStatus(int(status[i])).text}"
+                f"the aim {point_text(aims[i])} m: {TrackingStatus(int(status[i])).text}"
             )
         good = status == TrackingStatus.OK
         if good.any():
@@ -541,5 +565,6 @@ def _disc(eye: FloatArray, aim: FloatArray, radius: float, apart: float) -> Floa
     return np.stack(points)
 
 
-def _point(point: FloatArray) -> str:
+def point_text(point: FloatArray) -> str:
+    """Return a point (3,), m, as an error names it."""
     return "(" + ", ".join(f"{x:.1f}" for x in point) + ")"

@@ -1,18 +1,19 @@
 """The clock of a simulated field, which the plant that leads it follows.
 
 A simulated field may begin at another time, run faster, and slow down where its machine is too
-slow. The plant asks for the state of its clock twice a second (`ClockReader`), and its event loop
-has that time (`FollowedLoop`). Both are made from the address in a links file with ``twin``, which
-no other link may stand beside, so a plant with real links has no such clock.
+slow. The plant asks for the state of its clock five times in a second of it (`ClockReader`), and
+its event loop has that time (`FollowedLoop`). Both are made from the address in a links file with
+``twin``, which no other link may stand beside, so a plant with real links has no such clock.
 """
 
 import asyncio
 import json
+import math
 import selectors
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from urllib.error import URLError
 from urllib.request import ProxyHandler, build_opener
@@ -20,8 +21,12 @@ from urllib.request import ProxyHandler, build_opener
 from heliotrope.errors import FetchError
 from heliotrope.links.clock import VirtualClock
 
-#: Time between two questions before the field is up, and later; longest wait for an answer, s.
-_SOON, _LATER, _PATIENCE = 0.05, 0.5, 5.0
+#: Time between two questions before the field is up, and later at its speed; the shortest; longest
+#: wait for an answer, s.
+_SOON, _LATER, _LEAST, _PATIENCE = 0.05, 0.2, 0.01, 5.0
+#: Longest time by which the plant goes on from the last answer, s: the field may be slower than its
+#: speed, and a plant far ahead of it would take its reports for old.
+_AHEAD = 0.4
 #: Time that a simulated field may take to begin, s.
 _STARTING = 30.0
 #: Time over which the true speed is measured, s.
@@ -42,6 +47,8 @@ class ClockState:
         Its seconds per second now, and as it was asked for.
     waits, begun
         Whether the field waits for its plant; whether the plant leads all of it.
+    ahead
+        Longest time by which the plant goes on from it, s; infinite for a field that is gone.
     """
 
     wall: float
@@ -51,10 +58,11 @@ class ClockState:
     asked: float
     waits: bool
     begun: bool
+    ahead: float = _AHEAD
 
     def at(self, wall: float) -> float:
-        """Return its monotonic time at another instant of this machine."""
-        return self.now + self.speed * (wall - self.wall)
+        """Return its monotonic time at another instant of this machine, as far as it is known."""
+        return self.now + min(self.speed * (wall - self.wall), self.ahead)
 
 
 class ClockReader:
@@ -148,11 +156,16 @@ class ClockReader:
         return state
 
     def _run(self) -> None:
-        while not self._stop.wait(_LATER if self.state.begun else _SOON):
+        later = max(_LEAST, _LATER / max(1.0, self.state.asked))
+        while not self._stop.wait(later if self.state.begun else _SOON):
             try:
                 self.state = self._read()
             except (FetchError, ValueError):
-                continue
+                # Its plant goes on without it, and sees that it is silent.
+                wall = time.monotonic()
+                now = self.state.at(wall)
+                utc = self.state.utc + now - self.state.now
+                self.state = replace(self.state, wall=wall, now=now, utc=utc, ahead=math.inf)
 
 
 class _Followed(selectors.DefaultSelector):

@@ -126,7 +126,8 @@ class LinksDocument(Table):
     )
     sensors: dict[str, str] = Field(
         default_factory=dict,
-        description='File with one number, or `"api"`, by reading of the safety table; '
+        description='File with one number, or `"api"`, by reading of the safety table, or `dni` '
+        "(W/m²); "
         '`receiver_flux_nominal` may be `"camera"`.',
     )
     receiver_light: str = Field(
@@ -394,7 +395,7 @@ def _check(found: LinksFile) -> None:
         if name not in FED:
             raise FormatError(
                 path,
-                f"no row of the safety table needs it; give one of {', '.join(sorted(FED))}",
+                f"there is no such reading; give one of {', '.join(sorted(FED))}",
                 f"sensors.{name}",
             )
     seen = [name for name, how in document.sensors.items() if how == CAMERA]

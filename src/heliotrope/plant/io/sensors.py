@@ -1,4 +1,6 @@
-"""Sensors: readings of the safety table from outside, as from files that other programs write.
+"""Sensors: readings from outside for the safety table and the schedule.
+
+Other programs write them to files, for example.
 
 A file holds one number in the unit of its row, and is replaced with each reading (written under
 another name, then renamed). A file that is not replaced gives no new reading: after some seconds
@@ -13,12 +15,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from heliotrope.plant.emergency import OWN_READINGS
+from heliotrope.plant.emergency import DNI_READING, OWN_READINGS
 from heliotrope.safety import CONDITIONS, FLUX_READING, Watcher, watched_by
 
 #: Readings that must come from outside.
 FED = frozenset(row.reading for row in watched_by(CONDITIONS, Watcher.PLANT)) - OWN_READINGS
-FED |= {FLUX_READING}
+FED |= {FLUX_READING, DNI_READING}
 #: Longest text of a number, bytes.
 _LONGEST = 64
 

@@ -15,7 +15,7 @@ from heliotrope.lcu.config import Config
 from heliotrope.mechanism.board_motion import Corners, safe_paths
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import TrackingStatus
-from heliotrope.plant.field.aims import BeamCheck
+from heliotrope.plant.field.aims import BeamCheck, point_text
 
 Rows = npt.NDArray[np.intp]
 
@@ -171,8 +171,14 @@ class Paths:
             light = normalize(now + share * (later - now), "sun")
             solved = check.poses(rows[left], points[left, place], light, at[left])
             good = solved.chosen(solved.status) == TrackingStatus.OK
-            for i in left[~good]:
-                found[check.names[rows[i]]] = "its beam does not reach all points of the safe path"
+            for i, status in zip(left[~good], solved.chosen(solved.status)[~good], strict=True):
+                why = TrackingStatus(int(status)).text
+                if status == TrackingStatus.STOPPED:
+                    why = check.stop(rows[i], points[i, place], light[left == i][0], at[i])
+                found[check.names[rows[i]]] = (
+                    f"point {place + 1} of {length[i]} of the safe path, "
+                    f"{point_text(points[i, place])} m: {why}"
+                )
             left, light = left[good], light[good]
             first, last = at[left], np.round(solved.best_counts[good])
             moves = self.turns if place == 0 else self.motion

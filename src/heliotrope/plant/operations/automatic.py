@@ -25,7 +25,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.attempts import Attempts, Retry, RetryLaw
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.calibrating import Calibrating, TrueErrors, Visits
-from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.calibration_book import RESULTS, CalibrationBook
 from heliotrope.plant.operations.errands import Step
 from heliotrope.plant.operations.flights import FlightIntake
 from heliotrope.plant.operations.foresight import POINT_EVERY, Foresight
@@ -234,6 +234,7 @@ class AutomaticControl:
         self._stopped = False
         if visits is not None:
             self._keeping.recall()
+            self.book.recall(self._keeping.results(RESULTS))
             self.learning.recall()
             self.flights.recall()
             self.timetable.recall()

@@ -1,6 +1,7 @@
 """The calibration of every heliostat, for people: predicted and measured errors over time."""
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,9 @@ from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, Si
 from heliotrope.plant.visits.expected_errors import expected_errors
 
 #: Numbers of points of the quality over time, and of results, that are held.
-_POINTS, _RESULTS = 4000, 2000
+_POINTS, RESULTS = 4000, 2000
+#: Number of points of the quality that earlier results give.
+_RECALLED = 60
 #: Number of heliostats whose priors give the error of an uncalibrated one.
 _SAMPLE = 100
 #: Outcomes without a calibration that are no failures.
@@ -52,7 +55,7 @@ class CalibrationBook:
         self.measured = np.full(count, np.nan)
         self.calibrated_at = np.full(count, np.nan)
         self.sightings = np.zeros(count, dtype=np.int32)
-        self.results: deque[CalibrationEntry] = deque(maxlen=_RESULTS)
+        self.results: deque[CalibrationEntry] = deque(maxlen=RESULTS)
         self.quality: deque[QualityPoint] = deque(maxlen=_POINTS)
         self.failed = 0
         plant.beliefs.subscribe(self._believe)
@@ -84,6 +87,24 @@ class CalibrationBook:
             self.measured[row] = 0.5 * entry.measured
         self.failed += not (entry.good or entry.outcome in _NO_FAILURE)
         self.results.append(entry)
+
+    def recall(self, entries: Sequence[CalibrationEntry]) -> None:
+        """Take the results of earlier programs, oldest first, and their quality over time.
+
+        The quality is left out where the results do not cover every calibrated heliostat.
+        """
+        self.results.extend(entries)
+        predicted: dict[str, float] = {}
+        points: list[QualityPoint] = []
+        every, nan = max(1, len(entries) // _RECALLED), float("nan")
+        for k, entry in enumerate(entries):
+            if np.isfinite(entry.predicted):
+                predicted[entry.heliostat] = entry.predicted
+            if predicted and (k + 1) % every == 0:
+                shares = _shares(np.array([*predicted.values()]))
+                points.append(QualityPoint(entry.at, len(predicted), *shares, nan, nan))
+        if len(predicted) >= self.calibrated:
+            self.quality.extend(points)
 
     def refresh(self) -> None:
         """Predict the errors of all calibrated heliostats for the present sun and aims."""

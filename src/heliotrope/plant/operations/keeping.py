@@ -158,6 +158,39 @@ class Keeping:
         except StoreError as error:
             self.lost = str(error)
 
+    def results(self, limit: int) -> tuple[CalibrationEntry, ...]:
+        """Return the results of the last visits of earlier programs, oldest first.
+
+        Errors that are not kept are NaN.
+        """
+        visits = [] if self._records is None else self._records.visits(limit)
+        nan, known, found = float("nan"), dict[str, int](), list[CalibrationEntry]()
+        for visit in visits:
+            name = visit.heliostat
+            if name not in self._names:
+                continue  # the plant file has changed
+            count = known.get(name, self._beliefs.count(name))
+            known[name] = max(0, count - visit.sightings)
+            found.append(
+                CalibrationEntry(
+                    visit.finished,
+                    name,
+                    visit.target,
+                    visit.outcome,
+                    visit.error_before,
+                    visit.error_after,
+                    nan,
+                    visit.sigma_after,
+                    nan,
+                    nan,
+                    count,
+                    visit.sightings,
+                    visit.text,
+                    visit.version,
+                )
+            )
+        return tuple(reversed(found))
+
     def keep(self, entry: CalibrationEntry, begun: float, sigma: float) -> None:
         """Keep the result of a visit.
 

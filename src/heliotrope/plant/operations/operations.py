@@ -211,6 +211,7 @@ class Operations:
             self.plant.sentinel.on,
             self.automatic.to_resume,
             float(extra.pop("pace", 1.0)),
+            self.plant.sentinel.table.shown(now),
             extra,
         )
 

@@ -726,6 +726,9 @@ class Summary:
         Why automatic control waits for a person's Resume, "" if it does not.
     pace
         Seconds of the plant's time per second over the last half minute: 1 for a real plant.
+    readings
+        Newest readings of sensors, by name, in the units of the safety table (`dni`: W/m²); NaN
+        where there is none, or an old one.
     extra
         More rows, such as the speed of a twin.
     """
@@ -743,4 +746,5 @@ class Summary:
     emergency: bool
     resume: str
     pace: float
+    readings: Mapping[str, float]
     extra: Mapping[str, Any]

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.schedule.choice import Assignment
 from heliotrope.plant.schedule.prospect import FieldProspect, ReceiverVisitTime
@@ -60,15 +61,12 @@ class PlantSchedule:
 
     Attributes
     ----------
-    weather
-        Weather, as far as it is measured; set it when it changes.
     attempts
         See `Scheduler`.
     """
 
     def __init__(self, plant: PlantController, scheduler: Scheduler) -> None:
         self._plant, self.scheduler = plant, scheduler
-        self.weather = Weather()
         self._plan: tuple[PlannedVisit, ...] = ()
         self._draft: list[PlannedVisit] = []
         self._coming: Iterator[Assignment | None] | None = None
@@ -103,6 +101,12 @@ class PlantSchedule:
             return None
         self._sent[target].append(assignment.heliostat)
         return _planned(assignment)
+
+    @property
+    def weather(self) -> Weather:
+        """Weather, as far as sensors measure it."""
+        seen = self._plant.sentinel.table.shown(self._plant.now())
+        return Weather(seen.get(DNI_READING, np.nan), seen.get("wind_gust", np.nan))
 
     @property
     def reason(self) -> str:

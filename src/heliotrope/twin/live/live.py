@@ -46,7 +46,9 @@ from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import CONDITIONS, Watcher, watched_by
 from heliotrope.store.records import Records
+from heliotrope.twin.boards.bus import TwinBus
 from heliotrope.twin.boards.clocks import SimulatedTime
+from heliotrope.twin.boards.pty_line import PtyLine
 from heliotrope.twin.cameras import ExactCamera, FieldSnapshot, RenderedCamera
 from heliotrope.twin.drawing import Optics
 from heliotrope.twin.field.field import Field
@@ -95,6 +97,8 @@ class WorldOptions:
     bus_key
         Key with which the frames of every bus are signed; b"": none is, and a field of arrays
         obeys every frame.
+    pty
+        Whether the bus of boards is a pseudo-terminal, which the cluster opens as a serial port.
     """
 
     seed: int = 0
@@ -105,6 +109,7 @@ class WorldOptions:
     centroid: float = 1e-5
     bus_key: bytes = b""
     link: Callable[[str], CarriedLink] | None = None
+    pty: bool = False
 
     def __post_init__(self) -> None:
         if not self.centroid >= 0.0:
@@ -208,11 +213,12 @@ class World:
             self.far.append(far)
         key = self.options.bus_key
         own = [key_of(self.names[row]) for row in span] if key else ()
-        bus: Bus = (
-            self.field.bus(span)
-            if isinstance(self.field, BoardField)
-            else FieldBus(self.field, span, keys=own)
-        )
+        bus: Bus
+        if isinstance(self.field, BoardField):
+            boards = self.field.bus(span)
+            bus = self._serial(boards) if self.options.pty else boards
+        else:
+            bus = FieldBus(self.field, span, keys=own)
         members = tuple(
             Member(self.names[row], i + 1, 1 + row, key_of(self.names[row]))
             for i, row in enumerate(rows)
@@ -231,6 +237,15 @@ class World:
         self.clusters.append(Cluster(config, bus, far, self.clock, time, bus_keys=ring))
         self._parts += [bus, time]
         self.buses[name] = bus
+
+    def _serial(self, boards: TwinBus) -> Bus:
+        """Return a serial bus whose other end are boards."""
+        # Only this needs a library of serial ports.
+        from heliotrope.cluster.serial_bus import SerialBus
+
+        line = PtyLine(self.clock, boards.stations)
+        self._parts.append(line)
+        return SerialBus(line.path, self.clock)
 
     def _new_cameras(self) -> ExactCamera | RenderedCamera:
         seed, sight = self.options.seed, FieldSnapshot(self.clock, self.mirrors, self.sun)

@@ -2,10 +2,12 @@
 
 Loop time is wall time times the speed, but it never passes a timer that has not fired. Where the
 machine is too slow for the speed, or stands still for a while, simulated time slows down instead of
-jumping over leases and deadlines; `PacedLoop.lag` tells by how much.
+jumping over leases and deadlines; `PacedLoop.lag` gives by how much. Nor does it pass
+`PacedLoop.until`, by which a program waits for another.
 """
 
 import asyncio
+import math
 import selectors
 import time
 from collections.abc import Callable
@@ -25,7 +27,7 @@ class _Pace(selectors.DefaultSelector):
 
     def __init__(self, speed: float, start: float, wall: Callable[[], float]) -> None:
         super().__init__()
-        self.speed, self.now, self.lag = speed, start, 0.0
+        self.speed, self.now, self.lag, self.until = speed, start, 0.0, math.inf
         self.wall, self._begin, self._start = wall, wall(), start
 
     def _target(self) -> float:
@@ -38,20 +40,24 @@ class _Pace(selectors.DefaultSelector):
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         if timeout is None:
             events = super().select(None)
-            self.now = max(self.now, self._target())
+            self._advance(math.inf)
             return events
         due = self.now + max(timeout, 0.0)
         if timeout <= 0.0:
             wait = 0.0
+        elif self.speed > 0.0 and due <= self.until:
+            wait = max(0.0, due - self._target()) / self.speed
         else:
-            wait = max(0.0, due - self._target()) / self.speed if self.speed > 0.0 else _STILL
+            wait = _STILL
         events = super().select(wait)
-        most = due if timeout > 0.0 else self.now + _BUSY
-        target = self._target()
-        if target - most > LATE:
-            self.lag += target - most - LATE
-        self.now = max(self.now, min(target, most))
+        self._advance(due if timeout > 0.0 else self.now + _BUSY)
         return list(events)
+
+    def _advance(self, most: float) -> None:
+        """Let time go on, up to the next timer at ``most`` and to `until`."""
+        target = self._target()
+        self.lag += max(0.0, target - most - LATE, target - max(self.until, self.now))
+        self.now = max(self.now, min(target, most, self.until))
 
 
 class PacedLoop(asyncio.SelectorEventLoop):
@@ -96,6 +102,15 @@ class PacedLoop(asyncio.SelectorEventLoop):
     @speed.setter
     def speed(self, speed: float) -> None:
         self._pace.change(speed)
+
+    @property
+    def until(self) -> float:
+        """Loop time that is not passed, s; infinite if nothing holds it."""
+        return self._pace.until
+
+    @until.setter
+    def until(self, until: float) -> None:
+        self._pace.until = until
 
     @property
     def lag(self) -> float:

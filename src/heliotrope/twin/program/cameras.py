@@ -54,6 +54,11 @@ class TwinCameras:
         if self._scenes:
             self._drawer.start()
 
+    def wait(self) -> None:
+        """Wait until it draws, which takes some seconds at first; to be called in a thread."""
+        for name in list(self._scenes)[:1]:
+            self.photograph(name)
+
     def close(self) -> None:
         """End it."""
         self._drawer.close()

@@ -15,9 +15,10 @@ from heliotrope.links.keys import KeyFile
 from heliotrope.plant.io.links_file import read_links
 from heliotrope.plant.settings import clusters_of
 from heliotrope.safety import FLUX_READING
+from heliotrope.twin.weather import WeatherStation
 
 #: Names of the files in the folder.
-PLANT, LINKS, KEYS, FLUX = "plant.toml", "links.toml", "keys.toml", f"{FLUX_READING}.txt"
+PLANT, LINKS, KEYS = "plant.toml", "links.toml", "keys.toml"
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,9 @@ def write_folder(
     for name in (PLANT, LINKS, KEYS):
         if (folder / name).exists():
             raise InputError(f"{folder / name}: it exists; give another folder, or delete it")
-    homes = clusters_of(design)
+    homes, sensors = clusters_of(design), set(WeatherStation.names)
+    if design.receivers:
+        sensors.add(FLUX_READING)
     secret = secrets.token_urlsafe(24)
     base = _address(serves, secret)
     cameras = tuple(
@@ -92,7 +95,7 @@ def write_folder(
         "tcp": {"listen": f"{plant[0]}:{plant[1]}"},
         "polling": {"steps_every_s": steps_every},
         "witness": {"none": True},
-        "sensors": {FLUX_READING: FLUX} if design.receivers else {},
+        "sensors": {name: sensor_file(name) for name in sorted(sensors)},
         "clusters": dict.fromkeys(homes, "tcp"),
     }
     (folder / LINKS).write_text(tomli_w.dumps(document), encoding="utf-8")
@@ -117,6 +120,11 @@ def read_folder(folder: Path) -> TwinFolder:
     keys = {name: ring.newest for name, ring in file.keys.items()}
     serves = found.hostname, found.port
     return TwinFolder(folder, keys, (host.strip("[]"), int(port)), serves, found.path.strip("/"))
+
+
+def sensor_file(reading: str) -> str:
+    """Return the name of the file of a sensor."""
+    return f"{reading}.txt"
 
 
 def _address(serves: tuple[str, int], secret: str) -> str:

@@ -1,7 +1,9 @@
 """The program of a simulated field: its clock, its clusters, and what it serves."""
 
 import asyncio
+import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -14,20 +16,26 @@ from heliotrope.links.clock import Clock, SystemClock, VirtualClock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.link import LinkSettings, running
 from heliotrope.links.tcp import tcp_link
+from heliotrope.safety import FLUX_READING
 from heliotrope.twin.live import PacedLoop, World, WorldOptions
 from heliotrope.twin.program.boards import BOARDS, read_boards
 from heliotrope.twin.program.cameras import TwinCameras
-from heliotrope.twin.program.folder import FLUX, TwinFolder
+from heliotrope.twin.program.folder import TwinFolder, sensor_file
 from heliotrope.twin.program.server import TwinServer
+from heliotrope.twin.weather import WeatherStation
 
-#: Share of the speed at which time goes on until all clusters are connected; and while a lease of
-#: the plant is shorter than this, s.
-_FIRST, _SLOW, _SHORT = 0.02, 0.2, 1.5
+#: Share of the speed at which time goes on until all clusters are connected.
+_FIRST = 0.02
+#: A lease of the plant this long says that it leads the cluster, s.
+_LED = 1.5
+#: Time is held this long before the end of a lease, s: the plant, which renews it each second, then
+#: takes no status of a cluster for old. Wall time for which it is held for a plant that hangs, s.
+_HELD, _HANGS = 1.4, 10.0
 #: Time in which clusters have sent the orders with which they begin, and in which the plant has
 #: heard of a field that tracks, s.
 _BEGUN, _REPORTED = 0.5, 1.2
 #: Wall time between checks of the leases, s.
-_CHECKED = 0.1
+_CHECKED = 0.02
 #: Clusters call a plant that begins beside them soon again.
 _LINK = LinkSettings(longest_pause=0.2)
 #: Time between values of the sensors, s.
@@ -48,6 +56,8 @@ class TwinOptions:
         Of how the mirrors really stand, and of all noise.
     boards
         Whether each heliostat is a firmware-true board; for small plants.
+    pty
+        Whether the bus of boards is a pseudo-terminal.
     up
         Whether the heliostats track as soon as the plant leads them; else they begin at stow.
     waits
@@ -59,6 +69,7 @@ class TwinOptions:
     speed: float = 1.0
     seed: int = 0
     boards: bool = False
+    pty: bool = False
     up: bool = False
     waits: bool = False
 
@@ -124,7 +135,9 @@ class TwinProgram:
             design = await self._stored(ending)
             if ending.is_set():
                 return
-            options = WorldOptions(self._options.seed, boards=self._options.boards, link=link)
+            options = WorldOptions(
+                self._options.seed, boards=self._options.boards, pty=self._options.pty, link=link
+            )
             world = World(design, clock, options)
             cameras = TwinCameras(world, loop, self._options.seed)
             self._parts = _Parts(world, cameras)
@@ -140,8 +153,10 @@ class TwinProgram:
             ):
                 tasks = [
                     group.create_task(self._sense(world)),
-                    group.create_task(self._lead(world, paced)),
+                    group.create_task(self._lead(world, cameras, paced)),
                 ]
+                if paced is not None:
+                    tasks.append(group.create_task(_hold(world, paced)))
                 await ending.wait()
                 for task in tasks:
                     task.cancel()
@@ -167,31 +182,21 @@ class TwinProgram:
             raise FetchError("the simulated field has not begun")
         return self._parts
 
-    async def _lead(self, world: World, loop: PacedLoop | None) -> None:
-        """Let the field begin once the plant leads it, and slow time down while the plant is late.
-
-        Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A
-        plant that leads no cluster any more has ended.
-        """
-        # To connect takes wall time, to be led takes simulated time.
+    async def _lead(self, world: World, cameras: TwinCameras, loop: PacedLoop | None) -> None:
+        """Let the field begin once the plant leads it."""
+        # To connect and to draw at first takes wall time, to be led takes simulated time.
+        await asyncio.to_thread(cameras.wait)
         while not all(cluster.connected for cluster in world.clusters):
             await _wall(_CHECKED)
         if loop is not None:
             loop.speed = self._options.speed
-        while min(cluster.lease_left for cluster in world.clusters) < _SHORT:
+        while min(cluster.lease_left for cluster in world.clusters) < _LED:
             await _wall(_CHECKED)
         await asyncio.sleep(_BEGUN)
         if self._options.up:
             world.put_up()
         await asyncio.sleep(_REPORTED)
         self._begun = True
-        while loop is not None:
-            left = [cluster.lease_left for cluster in world.clusters]
-            short = min(left) < _SHORT and max(left) > 0.0
-            speed = self._options.speed * (_SLOW if short else 1.0)
-            if speed != loop.speed:
-                loop.speed = speed
-            await _wall(_CHECKED)
 
     def _clock(self, clock: Clock, paced: PacedLoop | None) -> dict[str, Any]:
         """Return the state of the clock: monotonic s, UTC, speed, and whether the field is up."""
@@ -207,13 +212,31 @@ class TwinProgram:
 
     async def _sense(self, world: World) -> None:
         """Write the values of the sensors into their files."""
-        if world.flux is None:
-            return
-        path = self._files.folder / FLUX
+        site = self._design.site
+        weather = WeatherStation(site.height, world.clock, world.sun, self._options.seed)
         while True:
-            share = world.flux.share()
-            await asyncio.to_thread(_replace, path, f"{share:.5f}\n")
+            values = weather.readings()
+            if world.flux is not None:
+                values[FLUX_READING] = world.flux.share()
+            await asyncio.to_thread(_write, self._files.folder, values)
             await asyncio.sleep(_SENSED)
+
+
+async def _hold(world: World, loop: PacedLoop) -> None:
+    """Hold the loop's time before a lease of the plant ends, without end.
+
+    Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A plant
+    that leads no cluster any more has ended, and one that renews nothing for long hangs.
+    """
+    renewed = time.monotonic()
+    while True:
+        led = [left for cluster in world.clusters if (left := cluster.lease_left) > 0.0]
+        least = min(led, default=math.inf)
+        if least > _HELD:
+            renewed = time.monotonic()
+        hangs = time.monotonic() - renewed > _HANGS
+        loop.until = math.inf if hangs else loop.time() + max(0.0, least - _HELD)
+        await _wall(_CHECKED)
 
 
 class _Go:
@@ -240,7 +263,9 @@ async def _wall(seconds: float) -> None:
     await asyncio.to_thread(time.sleep, seconds)
 
 
-def _replace(path: Path, text: str) -> None:
-    new = path.with_suffix(".new")
-    new.write_text(text, encoding="ascii")
-    new.replace(path)
+def _write(folder: Path, values: Mapping[str, float]) -> None:
+    for name, value in values.items():
+        path = folder / sensor_file(name)
+        new = path.with_suffix(".new")
+        new.write_text(f"{value:.5f}\n", encoding="ascii")
+        new.replace(path)

@@ -1,0 +1,71 @@
+"""Weather stations of a simulated plant: an anemometer, and a pyrheliometer under a clear sky."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray
+from heliotrope.links.clock import Clock
+from heliotrope.plant.emergency import DNI_READING
+from heliotrope.twin.wind import Wind
+
+#: Irradiance outside the air that the formula of `clear_sky` is fitted with, W/m².
+_OUTSIDE = 1353.0
+#: Wind of a day without alarms: its mean, and the mean height of gusts, m/s.
+_MEAN, _GUST = 3.0, 0.5
+
+
+def clear_sky(elevation: float, altitude: float) -> float:
+    """Return the direct normal irradiance under a clear sky, W/m²; 0 with the sun down.
+
+    Meinel's fit to measurements with its term for altitude, and Kasten and Young's air mass, both
+    as on https://www.pveducation.org (Air Mass; Calculation of Solar Insolation).
+
+    Parameters
+    ----------
+    elevation
+        Of the sun, rad.
+    altitude
+        Of the site, m; counted as 0 to 3,000 m.
+    """
+    if elevation <= 0.0:
+        return 0.0
+    degrees = np.degrees(elevation)
+    mass = 1.0 / (np.sin(elevation) + 0.50572 * (degrees + 6.07995) ** -1.6364)
+    height = 0.14 * np.clip(1e-3 * altitude, 0.0, 3.0)
+    return float(_OUTSIDE * ((1.0 - height) * 0.7 ** (mass**0.678) + height))
+
+
+class WeatherStation:
+    """Wind and direct irradiance at a simulated plant; the mirrors do not feel this wind.
+
+    Parameters
+    ----------
+    altitude
+        Of the site, m.
+    clock
+        Clock of the loop.
+    sun
+        Returns the true direction to the sun, (3,).
+    seed
+        Of the wind.
+
+    Attributes
+    ----------
+    names
+        Its readings.
+    """
+
+    names = frozenset({"wind_gust", "wind_mean", DNI_READING})
+
+    def __init__(
+        self, altitude: float, clock: Clock, sun: Callable[[], FloatArray], seed: int
+    ) -> None:
+        self._altitude, self._clock, self._sun = altitude, clock, sun
+        self._wind = Wind(_MEAN, gust=_GUST, compliance=0.0, seed=seed)
+
+    def readings(self) -> dict[str, float]:
+        """Return the readings now, m/s and W/m²."""
+        elevation = float(np.arcsin(np.clip(self._sun()[2], -1.0, 1.0)))
+        wind = self._wind.readings(np.zeros(3), self._clock.monotonic())
+        return wind | {DNI_READING: clear_sky(elevation, self._altitude)}
