@@ -251,7 +251,7 @@ class Sentinel(Part):
 
     def ends_by(self, condition: str) -> bool:
         """Return whether nothing but one row of the table, whose cause has gone, demands it."""
-        return self.on and not self._calls and not self.table.caused(but=condition)
+        return self.on and not self.calls and not self.table.caused(but=condition)
 
     def call(self, who: str, act: Act, reason: str, at: float) -> EmergencyOrder:
         """Order an emergency for a person; it holds until it is withdrawn.
