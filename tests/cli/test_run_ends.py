@@ -133,12 +133,6 @@ def test_a_second_ctrl_c_kills_a_program_that_hangs() -> None:
         hangs.close()
 
 
-def test_a_simulated_plant_begins_without_an_alarm(plant: Program) -> None:
-    """What it reads at once, as its sensors, is there."""
-    plant.says(r"UTC: 6 of 6 track")
-    assert "alarm" not in plant.text
-
-
 def test_a_second_signal_is_silent_once_the_loop_has_ended() -> None:
     plant = Program(LOOP_OVER)
     try:
