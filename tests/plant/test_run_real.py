@@ -786,6 +786,6 @@ def test_a_sensor_that_no_row_needs_is_refused(folder: Path) -> None:
     links = folder / "links.toml"
     links.write_text(links.read_text().replace("[clusters]", "[sensors]\nrain = 'x'\n[clusters]"))
     with pytest.raises(
-        FormatError, match=r"sensors.rain: there is no such reading; give one of .*wind_gust"
+        FormatError, match=r"sensors.rain: there is no such reading; give .*wind_gust"
     ):
         read_links(links)

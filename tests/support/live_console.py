@@ -239,7 +239,8 @@ class LiveConsole:
             return not self._why
 
         for call in self.call(lambda: here.plant.sentinel.calls):
-            self.call(partial(here.withdraw, who, call.who))
+            # As its own: an order that others withdraw again and again makes its person pause.
+            self.call(partial(here.withdraw, Person(call.who, Role.ENGINEER)))
         try:
             self.until(quiet)
         except AssertionError:

@@ -338,3 +338,24 @@ def test_a_pseudo_terminal_needs_boards(tmp_path: Path) -> None:
         assert not (tmp_path / "desk").exists()
     finally:
         field.close()
+
+
+def test_its_sensors_read_before_its_plant_begins(tmp_path: Path) -> None:
+    folder = tmp_path / "desk"
+    field = Program(
+        MAIN, "twin", "--heliostats", "6", "--folder", str(folder), "--start", "2026-06-21",
+        "--plant", f"127.0.0.1:{free_port()}",
+    )  # fmt: skip
+    try:
+        field.says("now start")
+        document = read_links(folder / "links.toml").document
+        with contextlib.closing(ClockReader(document.twin)) as reader:
+            until = time.monotonic() + 60.0
+            while not reader.state.waits and time.monotonic() < until:
+                time.sleep(0.05)
+            assert reader.state.speed == 0.0, "its time waits for the plant"
+        assert len(document.sensors) == 4
+        for name, file in document.sensors.items():
+            assert np.isfinite(float((folder / file).read_text())), name
+    finally:
+        field.close()

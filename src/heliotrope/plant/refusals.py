@@ -164,8 +164,8 @@ EMERGENCY_GOES_ON = Refusal(
 )
 EMERGENCY_PAUSED = Refusal(
     "emergency paused",
-    "A person's emergency order was withdrawn while it was being repeated, or twice by others "
-    "within ten minutes. That person alone pauses: 30 s, then twice as long each time.",
+    "A person's emergency order was withdrawn while it was being repeated, or five times "
+    "by others within ten minutes. That person alone pauses: 30 s, then twice as long each time.",
     "EMERGENCY: that of {who} was withdrawn again and again; the next one is taken in {wait} s",
     "Let another person order it: nobody else pauses. If a program repeats it, disable the account "
     "or revoke its token.",

@@ -3,7 +3,7 @@
 An order that a person gives again merges with the one that stands: nothing is recorded or sent for
 it, so a program that gives it hundreds of times a second fills neither the store nor the list of
 events. A person whose order is withdrawn while they (or a program with their token) repeat it, or
-twice by somebody else, pauses before the next one is taken; nobody else does. The first order of a
+five times by others within ten minutes, pauses before the next one is taken; nobody else does. The first order of a
 person is never refused, nor is the first one after another person has withdrawn theirs.
 """
 
@@ -20,6 +20,8 @@ from heliotrope.safety import Act
 REPEATED, REPEATED_SPAN = 10, 10.0
 #: The first pause, s; each later one is twice as long, up to the longest.
 PAUSE, LONGEST_PAUSE = 30.0, 480.0
+#: Withdrawals by others after which a person pauses: with fewer, the person may know of something.
+MOST_WITHDRAWN = 5
 #: Withdrawals count for this long after the last one, s.
 REMEMBERED = 600.0
 #: Reasons of one order that are kept.
@@ -118,11 +120,10 @@ class Callers:
         often = len(history.given) == REPEATED and now - history.given[0] < REPEATED_SPAN
         told = f"it was repeated {history.merged:,} times" if history.merged else ""
         if often or by != who:
-            # One withdrawal by somebody else has no pause: the person may know of something new.
-            history.strikes += 2 if often and not history.strikes else 1
+            history.strikes = max(history.strikes + 1, MOST_WITHDRAWN if often else 0)
             history.struck = now
-            if history.strikes >= 2:
-                pause = min(LONGEST_PAUSE, PAUSE * 2.0 ** (history.strikes - 2))
+            if (more := history.strikes - MOST_WITHDRAWN) >= 0:
+                pause = min(LONGEST_PAUSE, PAUSE * 2.0**more)
                 history.until = now + pause
                 told += f"{told and _BETWEEN}{who}'s next one is taken in {pause:.0f} s"
         history.merged = 0

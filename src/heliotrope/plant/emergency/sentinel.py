@@ -117,13 +117,15 @@ class Sentinel(Part):
         #: Orders to single heliostats while their rows hold: number, and time of the next.
         self._tries: dict[str, tuple[int, float]] = {}
         self._repeated_at = -math.inf
+        #: Alarms of orders since the last beat.
+        self._news: list[Alarm] = []
 
     # -- the table -------------------------------------------------------------------------
 
     def on_beat(self, now: float) -> None:
         """Evaluate the table, do what it demands, and report its alarms."""
         self._unproven = {n: at for n, at in self._unproven.items() if now - at < _PROVEN_SHOWS}
-        news = self._evaluate(now)
+        news, self._news = self._news + self._evaluate(now), []
         self._obey_field(now)
         self._obey_night()
         self._obey_clusters()
@@ -272,9 +274,8 @@ class Sentinel(Part):
             order = self.order
             if new:
                 self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
-        if first:  # its row trips now, even if the order is withdrawn before a beat
-            for alarm in self._evaluate(self._clock.monotonic()):
-                self.table.tell(alarm)
+        if first:  # its row trips now, even if the order is withdrawn before the next beat
+            self._news += self._evaluate(self._clock.monotonic())
         self._keep(order.at)
         return order
 

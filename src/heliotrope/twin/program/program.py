@@ -142,6 +142,9 @@ class TwinProgram:
             cameras = TwinCameras(world, loop, self._options.seed)
             self._parts = _Parts(world, cameras)
             cameras.start()
+            sensors = _Sensors(world, self._options.seed)
+            # The plant reads them as soon as it begins.
+            _write(self._files.folder, sensors.readings())
             self._waits = True
             if paced is not None:
                 await _first(go.event, ending)
@@ -152,7 +155,7 @@ class TwinProgram:
                 asyncio.TaskGroup() as group,
             ):
                 tasks = [
-                    group.create_task(self._sense(world)),
+                    group.create_task(self._sense(sensors)),
                     group.create_task(self._lead(world, cameras, paced)),
                 ]
                 if paced is not None:
@@ -210,15 +213,10 @@ class TwinProgram:
             "begun": self._begun,
         }
 
-    async def _sense(self, world: World) -> None:
+    async def _sense(self, sensors: "_Sensors") -> None:
         """Write the values of the sensors into their files."""
-        site = self._design.site
-        weather = WeatherStation(site.height, world.clock, world.sun, self._options.seed)
         while True:
-            values = weather.readings()
-            if world.flux is not None:
-                values[FLUX_READING] = world.flux.share()
-            await asyncio.to_thread(_write, self._files.folder, values)
+            await asyncio.to_thread(_write, self._files.folder, sensors.readings())
             await asyncio.sleep(_SENSED)
 
 
@@ -237,6 +235,19 @@ async def _hold(world: World, loop: PacedLoop) -> None:
         hangs = time.monotonic() - renewed > _HANGS
         loop.until = math.inf if hangs else loop.time() + max(0.0, least - _HELD)
         await _wall(_CHECKED)
+
+
+class _Sensors:
+    """All sensors of a world."""
+
+    def __init__(self, world: World, seed: int) -> None:
+        self._flux = world.flux
+        self._weather = WeatherStation(world.design.site.height, world.clock, world.sun, seed)
+
+    def readings(self) -> dict[str, float]:
+        """Return their readings now."""
+        flux = {} if self._flux is None else {FLUX_READING: self._flux.share()}
+        return self._weather.readings() | flux
 
 
 class _Go:
