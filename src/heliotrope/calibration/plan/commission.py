@@ -362,7 +362,7 @@ class _Choices:
     view: TargetView
     slant: FloatArray
     spread: FloatArray
-    seen: FloatArray
+    share_seen: FloatArray
     looks: FloatArray
     alone: _Queue
     lost: _Queue
@@ -559,7 +559,7 @@ class _Commissioning:
         own = joint and not produces and self._own(choices, rows)
         if own:
             # The stack that verifies new parameters is a sighting, too.
-            missed, stacks = self._misses(choices.seen[rows]), 2.0
+            missed, stacks = self._misses(choices.share_seen[rows]), 2.0
         scale = np.sqrt(stacks) * self.sigma[rows] / self.terms.accuracy(joint, produces=produces)
         scale = np.where(missed, 0.0, scale)[:, None, None]
         known = _gain.updated(self.field.covariance[rows], choices.view.slope[rows] * scale)

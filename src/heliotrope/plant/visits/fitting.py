@@ -316,7 +316,7 @@ def _of_one(
     i: int,
     flown: Identities,
 ) -> JudgedFit:
-    whole, mine = found.fitted, found.seen.heliostat == i
+    whole, mine = found.fitted, found.sightings.heliostat == i
     here = slice(i, i + 1)
     fitted = replace(
         whole,
@@ -331,7 +331,7 @@ def _of_one(
         centre=whole.centre[here],
     )
     fitted = model.completed(fitted)
-    judged = _judged(believed, settings, model, fitted, found.seen.of(i), flown)
+    judged = _judged(believed, settings, model, fitted, found.sightings.of(i), flown)
     return replace(judged, revealed=(found.information[i], found.pull[i]))
 
 
