@@ -54,7 +54,7 @@ Texts = str | Sequence[str]
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is implausible about M sightings.
+    """The implausible features of M sightings.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:
 
 
 def _impossible(sightings: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
-    """Yield what is impossible for any mirror anywhere."""
+    """Yield the sightings that are impossible for any mirror anywhere."""
     time = sightings.time
     out = (time < EARLIEST) | (time > LATEST)
     yield out, YEAR
@@ -209,7 +209,7 @@ def _repeated(sightings: Sightings, photographed: Rows, reasons: Mapping[int, st
 def _contradicted(
     sightings: Sightings, site: Site, reasons: Mapping[int, str]
 ) -> tuple[Rows, Texts, str]:
-    """Return the suns that did not stand there at their time; a note where a mirror has most."""
+    """Return the suns that are wrong for their time; a note where most of a mirror's are."""
     able = sightings.source_at_infinity & np.isfinite(sightings.time)
     able[list(reasons)] = False
     if not able.any():
@@ -268,7 +268,7 @@ def _off_target(
 def _beyond_machine(
     sightings: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
 ) -> Iterator[tuple[Rows, Texts]]:
-    """Yield what the mirror of a sighting cannot do."""
+    """Yield the sightings that are beyond their mirror's abilities."""
     mirrors = mechanism[sightings.heliostat]
     pose = mirrors.pose(sightings.counts)
     near = np.zeros(len(sightings), np.bool_)

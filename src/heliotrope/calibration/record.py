@@ -338,5 +338,5 @@ def covariances_at(records: Sequence[HeliostatCalibration], time: float) -> Floa
 
 
 def root_mean_square(values: FloatArray) -> float:
-    """Return the root mean square; NaN of nothing."""
+    """Return the root mean square; NaN if there are no values."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

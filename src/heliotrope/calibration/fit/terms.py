@@ -61,7 +61,7 @@ class DriveTerm:
 def table_terms(joint: str, drive: int, knots: npt.ArrayLike, prior: float) -> list[DriveTerm]:
     """Return the terms of a look-up table: errors at knots, and straight lines between them.
 
-    Beyond the ends the error stays that of the end.
+    Beyond the ends the error is constant.
 
     Parameters
     ----------
@@ -104,8 +104,8 @@ class TermFit(Value, Framed):
         Covariance of the coefficients, (N, K, K).
     mechanism
         The nominal mechanisms with the parameters, but without the terms, (N,).
-    given
-        The heliostats as given; the terms are functions of the angles of their nominal drives.
+    original
+        The heliostats before the fit; the terms are functions of their nominal drives' angles.
     """
 
     fitted: FieldFit

@@ -46,7 +46,7 @@ def _default_limits() -> SightingLimits:
 
 @dataclass(frozen=True)
 class CommissionTerms:
-    """What a visit costs and tells, and what the plan is for.
+    """Cost and yield of a visit, and the purpose of the plan.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class CommissionTerms:
     settle, shots, interval
         A visit of one mirror, s: until it stands still, and its photographs; 80 s together.
     look
-        Further look for a beam that is not on the target, s.
+        Time of a further search photograph when the beam is not on the target, s.
     sigma
         Standard deviation of a photograph's beam in each direction, rad.
     joint
@@ -340,7 +340,7 @@ class _Queue:
     rows: Rows
 
     def first(self, free: Mask, most: int) -> Rows:
-        """Return the best that are free, at most so many."""
+        """Return the best free heliostats, at most ``most``."""
         reach = max(4 * most, 256)
         while True:
             free_rows = self.rows[:reach][free[self.rows[:reach]]]
@@ -447,7 +447,7 @@ class _Commissioning:
         self._until = end
 
     def _use(self, j: int, span: dict[str, float]) -> None:
-        """Account for the time of a target; that of the receiver is none of it."""
+        """Account for the time of a target, without that of the receiver."""
         if j < len(self.targets):
             for name, value in span.items():
                 self.seconds[name] += value

@@ -1,4 +1,4 @@
-"""Plans the sightings of one heliostat: the suns and targets that tell most about it.
+"""Plans the sightings of one heliostat: the suns and targets that reveal most about it.
 
 A camera-target sighting adds JᵀJ to the information on the parameters, with J the whitened
 derivative of normal minus bisector. The *D-optimal* choice maximises the determinant of the
@@ -368,7 +368,7 @@ def plan_sightings(
     exchange: bool = True,
     gap: float = 0.0,
 ) -> SightingPlan:
-    """Return the sightings of one heliostat that together tell most about it.
+    """Return the sightings of one heliostat that together reveal most about it.
 
     Parameters
     ----------

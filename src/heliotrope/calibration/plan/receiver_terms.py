@@ -1,4 +1,4 @@
-"""What a receiver visit costs and tells: mirrors measured where they shine."""
+"""Cost and yield of a receiver visit: mirrors measured where they shine."""
 
 from dataclasses import dataclass
 
