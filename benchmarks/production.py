@@ -147,7 +147,7 @@ async def _measured(built: PlantAssembly, world: World, token: int, most: int) -
     after = light.now()
     error, inside = [], []
     for result in results:
-        seen = plant.beliefs.seen(result.heliostat)
+        seen = plant.beliefs.known(result.heliostat)
         if seen is None:
             continue
         true = world.truth[np.array([world.names.index(result.heliostat)])]

@@ -86,7 +86,7 @@ def test_from_juelich_to_a_forecast_and_a_comparison() -> None:
         """
 import heliotrope as ht
 plant = ht.open(folder)
-seen = ht.read_field_sightings(plant, folder).seen["BF57"]
+seen = ht.read_field_sightings(plant, folder).sightings["BF57"]
 learned = ht.learn(plant["BF57"], seen, "jacks")
 times = ht.sun.daylight("2023-06-21", plant.site, min_elevation=0.2)[::30]
 forecast = learned.forecast("BF57", times, plant.targets[0])

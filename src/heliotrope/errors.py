@@ -67,7 +67,7 @@ def require(name: str, value: object, kind: type | tuple[type, ...], advice: str
 
 
 class FormatError(InputError):
-    """A file that cannot be read as what it claims to be.
+    """A file that cannot be read in the format that it claims.
 
     Parameters
     ----------

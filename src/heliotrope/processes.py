@@ -32,7 +32,7 @@ def end(pool: ProcessPoolExecutor) -> None:
 
 
 def _end_with_parent(begin: Callable[[], None] | None) -> None:
-    """Let this process end when its parent has ended."""
+    """Arrange for this process to end when its parent ends."""
     parent = parent_process()
     assert parent is not None
 

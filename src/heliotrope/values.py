@@ -50,7 +50,7 @@ class Value:
 
     @abstractmethod
     def _card(self) -> Card:
-        """Return how the value shows itself."""
+        """Return the value's representation."""
 
     def __repr__(self) -> str:
         line = " ".join(self._card().line.split())

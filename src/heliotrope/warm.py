@@ -37,7 +37,7 @@ def main() -> None:
 
 @contextmanager
 def compiling() -> Iterator[None]:
-    """Compile what a calibration takes, in two processes, if it has not been compiled.
+    """Compile the kernels of a calibration, in two processes, unless they are compiled.
 
     Tracking is compiled when the block begins, fitting when it ends. With one core, or where
     machine code cannot be kept, kernels are compiled when they are needed. The halves take as
@@ -59,13 +59,13 @@ def compiling() -> Iterator[None]:
 
 
 def controlling() -> None:
-    """Compile or load what the loop of a plant computes, which would hold it up for seconds."""
+    """Compile or load the kernels of a plant's loop, which would hold it up for seconds."""
     for part in (tracking, following, guarding):
         part()
 
 
 def computing() -> None:
-    """Load what is computed beside the loop of a plant."""
+    """Load the kernels of the processes beside a plant's loop."""
     from heliotrope.imaging import coded, photograph  # noqa: F401 - only loaded
 
     tracking()

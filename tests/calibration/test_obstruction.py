@@ -55,16 +55,16 @@ def test_what_neighbours_have_moved_is_moved_back(time: float) -> None:
     found = corrected(seen)
     usable = found.hidden < 0.35
     before = np.linalg.norm(seen.destination - true.destination, axis=1)[usable]
-    after = np.linalg.norm(found.seen.destination - true.destination, axis=1)[usable]
+    after = np.linalg.norm(found.sightings.destination - true.destination, axis=1)[usable]
     assert before.max() > 5e-3
     assert after.max() < 4e-3 + 0.2 * before.max()
     # The uncertainty that is added covers what is left.
-    extra = found.seen.destination_covariance - seen.destination_covariance
+    extra = found.sightings.destination_covariance - seen.destination_covariance
     sigma = np.sqrt(np.trace(extra, axis1=1, axis2=2))[usable]
     assert (after <= 4e-3 + 3.0 * sigma).all()
     # Everything else stays.
-    np.testing.assert_array_equal(found.seen.source, seen.source)
-    np.testing.assert_array_equal(found.seen.sigma, seen.sigma)
+    np.testing.assert_array_equal(found.sightings.source, seen.source)
+    np.testing.assert_array_equal(found.sightings.sigma, seen.sigma)
 
 
 def test_lonely_mirrors_and_other_sightings_stay_as_they_are() -> None:
@@ -75,7 +75,7 @@ def test_lonely_mirrors_and_other_sightings_stay_as_they_are() -> None:
     # Beside every target there is nothing to correct.
     away = camera_target(ROWS, seen.counts, seen.source, seen.destination + [0.0, 30.0, 0.0])
     found = corrected(away)
-    np.testing.assert_array_equal(found.seen.destination, away.destination)
+    np.testing.assert_array_equal(found.sightings.destination, away.destination)
     assert not found.hidden.any()
 
 

@@ -461,9 +461,9 @@ def test_no_row_and_no_mirror_ends_the_calibration_of_the_others(
     write_sightings(table, seen, NAMES, [KIND] * len(seen))
     field = workflow.read_field_sightings(PLANT, table, table, now=NOON)
     assert all(line.count("\n") == 0 for line in field.left_out)
-    assert len(field.seen) + len(field.left_out) == len(seen)
-    assert (field.seen.heliostat == 16).sum() == 20
-    learned = learning.learn(NOMINAL, field.seen, "guo6", rounds=2)
+    assert len(field.sightings) + len(field.left_out) == len(seen)
+    assert (field.sightings.heliostat == 16).sum() == 20
+    learned = learning.learn(NOMINAL, field.sightings, "guo6", rounds=2)
     assert FitOutcome(int(learned.static.outcome[16])) is FitOutcome.CONVERGED
     tilt = learned.static.values[16, learned.model.index("tilt_north")]
     assert tilt == pytest.approx(float(machines()[16].deviations["tilt_north"]), abs=1.5 * MRAD)
@@ -486,7 +486,7 @@ def test_a_folder_with_a_bad_year_and_a_copy_is_read(tmp_path: Path) -> None:
     table = "\n".join([lines[0], *mine, mine[7]])
     (tmp_path / "measurements.csv").write_text(f"{table}\n", encoding="utf-8")
     field = workflow.read_field_sightings(paint.read_plant(tmp_path), tmp_path)
-    assert len(field.seen) == 10
+    assert len(field.sightings) == 10
     assert [line.split(": ", 1)[1].split(":")[0] for line in field.left_out] == [
         "the year is out of range",
         "the year is out of range, 1970 to 2099",

@@ -162,7 +162,7 @@ def test_the_page_says_what_a_proof_has_measured_and_what_it_believes(
     field: LiveConsole, enter: Callable[..., Any]
 ) -> None:
     page, name = enter("operator"), field.live.names[3]
-    field.call(lambda: field.live.plant.drive_checks.seen(name, PHOTOGRAPH))
+    field.call(lambda: field.live.plant.drive_checks.observed(name, PHOTOGRAPH))
     page.click("#emergency")
     page.wait_for_selector(
         ".hx-alert:has-text('measured: the flux is below its limit (10% of nominal, where single')"

@@ -559,7 +559,7 @@ def test_the_folders_of_artist_open_as_they_are(tmp_path: Path) -> None:
     plant = open_plant(tmp_path)
     assert plant.names == ("AA31", "AA39")
     found = read_field_sightings(plant, str(tmp_path))
-    assert [plant.names[i] for i in found.seen.heliostat] == ["AA39"]
+    assert [plant.names[i] for i in found.sightings.heliostat] == ["AA39"]
     entry = beside(tmp_path / "AA39" / "123-flux.png")
     assert entry is not None
     assert entry.heliostat == "AA39"

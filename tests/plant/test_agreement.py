@@ -216,27 +216,27 @@ def test_a_new_calibration_counts_once_the_local_controller_has_it(tmp_path: Pat
     other, agreement = DESIGN["P5B"].calibrated, plant._agreement
     before = agreement._armature[row].copy()
     agreement.believe(row, other.armature.table, other.drives.table)
-    agreement._look(1.0)
+    agreement._check(1.0)
     assert np.array_equal(agreement._armature[row], before)
     plant.field.rows["armature_crc"][row] = crc32(items_of(other)["armature"])
-    agreement._look(2.0)
+    agreement._check(2.0)
     assert np.array_equal(agreement._armature[row], other.armature.table)
     assert np.array_equal(agreement._drives[row], other.drives.table)
     # Of drives alone no checksum comes with the status: they count once nothing wanted is missing.
     own = other.drives.table + 0.01
     plant.wanted.missing[NAME] = ("drives",)
     agreement.believe(row, other.armature.table, own)
-    agreement._look(3.0)
+    agreement._check(3.0)
     assert np.array_equal(agreement._drives[row], other.drives.table)
     del plant.wanted.missing[NAME]
-    agreement._look(4.0)
+    agreement._check(4.0)
     assert np.array_equal(agreement._drives[row], own)
 
 
 def test_one_that_disagrees_is_defocused_alone(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         agreement = bench.plant._agreement
-        agreement._wrong, agreement._at = {NAME: 0.1}, np.inf
+        agreement._named_errors, agreement._at = {NAME: 0.1}, np.inf
         await bench.wait(7.0)
         assert alarmed(bench, "pointing_disagrees") == {NAME}
         assert not bench.plant.sentinel.on
@@ -249,7 +249,7 @@ def test_one_that_disagrees_is_defocused_alone(tmp_path: Path) -> None:
 def test_many_that_disagree_defocus_the_field(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        plant._agreement._wrong = dict.fromkeys(plant.field.names, 0.1)
+        plant._agreement._named_errors = dict.fromkeys(plant.field.names, 0.1)
         plant._agreement._at = np.inf
         await bench.wait(5.0)
         assert alarmed(bench, "pointing_disagrees_many") == {""}

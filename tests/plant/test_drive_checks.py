@@ -121,7 +121,7 @@ def test_a_mirror_that_does_not_follow_joins_no_receiver(tmp_path: Path) -> None
             if follow == TILT_SENSOR:
                 await diagnosed(bench, name, diagnosis.MOVED_SECONDARY)
             else:
-                plant.drive_checks.seen(name, PHOTOGRAPH)
+                plant.drive_checks.observed(name, PHOTOGRAPH)
             assert not standing(bench, alarms.DRIVE_STALLED)
             assert plant.drive_checks.shown[name] == follow
 
@@ -185,8 +185,8 @@ def test_a_proof_says_which_mirrors_were_seen_to_follow_and_which_are_believed(
             AutomaticControl(plant, log, settings=AutomaticSettings(calibrate=False)),
         )
         await diagnosed(bench, "P5A", MOVED)
-        plant.drive_checks.seen("P5B", PHOTOGRAPH)
-        plant.drive_checks.seen("P5C", PHOTOGRAPH)
+        plant.drive_checks.observed("P5B", PHOTOGRAPH)
+        plant.drive_checks.observed("P5C", PHOTOGRAPH)
         bench.cluster_of("P1A").deaf.add("P1A")
         bench.cluster_of("P1A").set(states.TRACKING, "P1A")
         plant.raise_emergency("Olga", Act.STOW)

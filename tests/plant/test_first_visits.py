@@ -70,7 +70,7 @@ def test_new_mirrors_are_calibrated_and_verified_together() -> None:
         assert "the old parameters are back" in results[false].text
         for name in (stuck, false):
             assert plant.beliefs.record(name) is None
-            assert plant.beliefs.seen(name) is None
+            assert plant.beliefs.known(name) is None
             assert await stored(here, name) == ()
         assert {results[name].outcome for name in good} == {_CALIBRATED}, results
         assert all(results[name].new == 2 for name in good), "seen, and verified"
@@ -85,7 +85,7 @@ def test_new_mirrors_are_calibrated_and_verified_together() -> None:
         stated = here.live.operations.viewer.frame().error[rows]
         assert (after < 1.3 * stated).all(), (after, stated)
         for name in good:
-            assert len(plant.beliefs.seen(name)) == 2  # type: ignore[arg-type]
+            assert len(plant.beliefs.known(name)) == 2  # type: ignore[arg-type]
             assert await stored(here, name) != ()
         # Six codes in eight photographs, and two shared codes or more in eight.
         first = [stage for stage in here.stages if stage.startswith("photograph")]
@@ -161,7 +161,7 @@ def test_clouds_and_mirrors_that_trade_places_teach_nothing() -> None:
         live.cameras.light = clouded  # type: ignore[method-assign, assignment]
         results = await here.run()
         assert {r.verdict for r in results.values()} == {Verdict.CLOUD}, results
-        assert all(plant.beliefs.seen(name) is None for name in names)
+        assert all(plant.beliefs.known(name) is None for name in names)
         assert [await stored(here, name) for name in names] == [()] * 6
 
         cloudy[0] = False

@@ -92,7 +92,7 @@ class Site:
         )
         beliefs = self.plant.beliefs
         beliefs.note(name, "target", made)
-        seen = beliefs.seen(name)
+        seen = beliefs.known(name)
         assert seen is not None
         fit = fit_heliostat(Believed.of(beliefs, name), SETTINGS, FOUR, seen.sightings)
         beliefs.take(fit.record(beliefs, at + 100.0, person="Egon"))
@@ -215,7 +215,7 @@ def test_a_flight_improves_the_field_and_its_offset_is_not_the_mirrors(play: Pla
 
 
 def photos(site: Site, name: str):
-    seen = site.plant.beliefs.seen(name)
+    seen = site.plant.beliefs.known(name)
     assert seen is not None
     return seen.sightings
 
@@ -352,7 +352,7 @@ def test_flights_outlast_a_restart(play: Play) -> None:
         assert found[1] == [6 + POSES, POSES]
         # The rows from the air are not photographs.
         assert len(photos(site, NAMES[0])) == 6
-        assert site.plant.beliefs.seen(NAMES[1]) is None
+        assert site.plant.beliefs.known(NAMES[1]) is None
         assert site.plant.beliefs.count(NAMES[1]) == POSES
         assert (site.plant.beliefs.flights.identities(NAMES[1]) > 0).all()
 

@@ -390,8 +390,8 @@ def test_a_cluster_that_may_begin_no_motion_keeps_nothing_from_the_others(
             names = tuple(home.names[0] for home in homes)
             held = {homes[1].name}
 
-            def refusal(clusters: Collection[str]) -> str:
-                return reason if held.intersection(clusters) else ""
+            def refusal(clusters: Collection[str]) -> str | None:
+                return reason if held.intersection(clusters) else None
 
             def given() -> set[str]:
                 each = [(home, m) for home in homes for m in home.of((Command, Emergency))]

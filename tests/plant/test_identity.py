@@ -260,7 +260,7 @@ def test_the_other_of_a_pair_is_named_unless_it_answers_itself(tmp_path: Path) -
             stores(bench, "P5B", 54321)
             await bench.wait(2.0)
             assert named(bench) == set(PAIR)
-            assert bench.plant._identities.strange["P5B"] == (
+            assert bench.plant._identities.mismatched["P5B"] == (
                 "its parameters answer at the address of P5A"
             )
 

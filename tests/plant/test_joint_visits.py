@@ -71,7 +71,7 @@ def test_mirrors_on_one_target_are_calibrated_together() -> None:
         after = here.live.errors()
         assert np.median(after) < 0.75 * np.median(before)
         for name in here.names:
-            seen, row = plant.beliefs.seen(name), here.live.names.index(name)
+            seen, row = plant.beliefs.known(name), here.live.names.index(name)
             assert seen is not None
             true = here.live.truth[np.array([row])]
             assert beam_errors(true, seen.sightings).beam[0] < 0.6e-3, "what it saw is true"
@@ -100,7 +100,7 @@ def test_drawn_photographs_name_a_stuck_mirror_and_an_exchanged_pair() -> None:
         for name in bad:
             assert results[name].outcome is CalibrationOutcome.NOT_PROVEN
             assert here.live.plant.beliefs.record(name) is version[name]
-            assert here.live.plant.beliefs.seen(name) is None
+            assert here.live.plant.beliefs.known(name) is None
         good = [r for name, r in results.items() if name not in bad]
         assert {r.outcome for r in good} == {_CALIBRATED}, results
 
@@ -124,7 +124,7 @@ def test_a_cloud_teaches_nothing_and_leaves_what_local_controllers_store() -> No
         assert {r.verdict for r in results.values()} == {Verdict.CLOUD}, results
         assert {r.outcome for r in results.values()} == {CalibrationOutcome.NOT_PROVEN}
         for name in here.names:
-            assert plant.beliefs.seen(name) is None
+            assert plant.beliefs.known(name) is None
             assert plant.beliefs.record(name) is records[name]
             assert await plant.stored(name) == stored[name]
 
@@ -270,7 +270,7 @@ def test_an_emergency_or_a_blind_camera_ends_it_cleanly() -> None:
         await asyncio.sleep(10.0)
         assert not set(here.states().values()) & {"TRACKING", "IDLE"}
         assert here.lit() == []
-        assert all(plant.beliefs.seen(name) is None for name in here.names)
+        assert all(plant.beliefs.known(name) is None for name in here.names)
 
     joint(scene)
 

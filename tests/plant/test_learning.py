@@ -82,7 +82,7 @@ class Night:
         self.learning = Learning(self.plant, self.log, keeping, "malan8", self.here, AUTOMATIC)
         self.learning.recall()
         for name, each in list(zip(NAMES, SEEN, strict=False))[:seen]:
-            if self.plant.beliefs.seen(name) is None:
+            if self.plant.beliefs.known(name) is None:
                 self.plant.beliefs.note(name, "target", each)
 
     def step(self, *, night: bool = True) -> None:
@@ -95,7 +95,7 @@ class Night:
     def calibrate(self, name: str) -> None:
         """Calibrate a heliostat by what has been seen of it."""
         beliefs = self.plant.beliefs
-        seen = beliefs.seen(name)
+        seen = beliefs.known(name)
         assert seen is not None
         settings = CycleSettings(left=1.0, most=50.0)
         fit = fit_heliostat(

@@ -375,7 +375,7 @@ def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path,
         first = await whole.run(ENGINEER, token, NAME, "target")
         old = dict(cluster.stored[NAME])
         assert first.outcome is CalibrationOutcome.CALIBRATED
-        seen = plant.beliefs.seen(NAME)
+        seen = plant.beliefs.known(NAME)
         eye.error = {"azimuth_bias": 9e-3}
         begin = eye.count
 
@@ -403,7 +403,7 @@ def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path,
             assert cluster.stored[NAME] == old
         assert plant.wanted.items[NAME] == old
         assert plant.beliefs.record(NAME) is first.record
-        assert plant.beliefs.seen(NAME) is seen
+        assert plant.beliefs.known(NAME) is seen
         old_table = plant.beliefs.present(NAME)[0].armature.table
         assert (plant.beams.armature.table[plant.field.place(NAME)] == old_table).all()
 
@@ -430,7 +430,7 @@ def test_a_mirror_that_leaves_its_aim_is_not_believed(tmp_path: Path) -> None:
         eye.photograph = photograph  # type: ignore[method-assign]
         with pytest.raises(RefusedError, match="it left its aim while it was photographed"):
             await whole.run(ENGINEER, token, NAME, "target")
-        assert bench.plant.beliefs.seen(NAME) is None
+        assert bench.plant.beliefs.known(NAME) is None
 
     cycle(tmp_path, scene)
 
@@ -585,7 +585,7 @@ def test_the_plant_finds_a_worm_that_the_constants_leave(tmp_path: Path) -> None
             await bench.wait(3.0)
             bench.cluster_of(NAME).set(HOME, NAME)
         beliefs = bench.plant.beliefs
-        seen, nominal = beliefs.seen(NAME), beliefs.nominal(NAME)
+        seen, nominal = beliefs.known(NAME), beliefs.nominal(NAME)
         assert seen is not None
         constants = nominal.with_parameters(fit(nominal, seen.sightings, SIMPLE).parameters)
         real = nominal.with_parameters(eye.error)

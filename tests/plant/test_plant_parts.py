@@ -463,7 +463,7 @@ def test_a_visit_that_is_kept_says_so_only_if_its_sightings_are_kept_too(
     identities: list[int] | None, lost: str
 ) -> None:
     seen = None if identities is None else SimpleNamespace(identities=np.array(identities))
-    beliefs = SimpleNamespace(seen=lambda name: seen)
+    beliefs = SimpleNamespace(known=lambda name: seen)
     keeping = Keeping(("A",), beliefs, _Kept())  # type: ignore[arg-type]
     keeping.lost = "the disk is full"
     nan = float("nan")

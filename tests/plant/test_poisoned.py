@@ -59,7 +59,7 @@ def test_the_same_false_light_on_a_first_visit_changes_nothing(tmp_path: Path, l
             assert whole.states()[NAME] == "TRACKING"
             assert whole.miss(NAME) < before + 0.1
             assert plant.beliefs.record(NAME) is None
-            assert plant.beliefs.seen(NAME) is None
+            assert plant.beliefs.known(NAME) is None
             again = await plant.stored(NAME)
             assert {**again, "edition": 0} == {**stored, "edition": 0}
             wanted = plant.wanted.items[NAME]
@@ -128,7 +128,7 @@ def test_light_that_no_photograph_shows_to_move_is_not_kept(tmp_path: Path) -> N
             settings = CycleSettings(interval=5.0)
             cycle = CalibrationCycle(plant, Still(whole), settings, Centring(looks=1))
             results.append(await cycle.run(ENGINEER, token, NAME, "white"))
-            assert plant.beliefs.seen(NAME) is None
+            assert plant.beliefs.known(NAME) is None
 
     run_virtual(main, 1)
     (result,) = results
@@ -178,7 +178,7 @@ def test_light_that_followed_its_aim_once_and_is_gone_is_not_kept(tmp_path: Path
             camera = Passing(whole, stage)
             cycle = CalibrationCycle(plant, camera, CycleSettings(interval=5.0), Centring(looks=2))
             results.append(await cycle.run(ENGINEER, token, NAME, "white", stage.append))
-            assert plant.beliefs.seen(NAME) is None
+            assert plant.beliefs.known(NAME) is None
             # Each look begins in the middle, wherever the photographs before it ended.
             assert np.allclose(camera.looks, 0.0, atol=0.05)
             assert len(camera.looks) == 2

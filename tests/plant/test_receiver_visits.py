@@ -156,7 +156,7 @@ def test_mirrors_in_production_are_calibrated_where_they_shine() -> None:
         for name, result in results.items():
             assert result.verdict is None, result
             assert result.new == 1, result
-            seen, row = plant.beliefs.seen(name), here.live.names.index(name)
+            seen, row = plant.beliefs.known(name), here.live.names.index(name)
             assert seen is not None
             assert seen.targets == ("receiver",)
             true = here.live.truth[np.array([row])]
@@ -221,7 +221,7 @@ def test_drawn_photographs_prove_nothing_of_a_stuck_mirror_or_an_exchanged_pair(
         for name in bad:
             assert results[name].outcome is CalibrationOutcome.NOT_PROVEN
             assert plant.beliefs.record(name) is version[name], "nothing is pushed"
-            assert plant.beliefs.seen(name) is None
+            assert plant.beliefs.known(name) is None
         good = [r for name, r in results.items() if name not in bad]
         assert all(r.new == 1 for r in good), results
 

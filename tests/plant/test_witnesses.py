@@ -81,7 +81,7 @@ def test_none_joins_before_a_witness_has_agreed_and_each_day_anew() -> None:
     day.witnesses.take("another", day.sun(), 0.0)
     assert day.witnesses.refusal, "it is not one of those that count"
     day.witnesses.take(SENSOR, day.sun(), 0.0)
-    assert day.witnesses.refusal == ""
+    assert day.witnesses.refusal is None
     assert day.standing() == {}
     day.utc += DAY
     assert day.witnesses.refusal
@@ -104,7 +104,7 @@ def test_a_common_time_that_is_wrong_is_named_and_none_joins(late: float) -> Non
     assert "sun sensor sees the sun" in day.witnesses.refusal
     day.witnesses.take(SENSOR, day.sun(), 5e-3)
     assert day.standing() == {}
-    assert day.witnesses.refusal == ""
+    assert day.witnesses.refusal is None
 
 
 def test_a_common_site_that_is_wrong_contradicts_a_satellite_receiver() -> None:
@@ -128,7 +128,7 @@ def test_a_common_site_that_is_wrong_contradicts_a_satellite_receiver() -> None:
             seen = await witness.sun(design.site)
             assert seen is not None
             witnesses.take(witness.name, *seen)
-            assert (witnesses.refusal == "") is agrees
+            assert (witnesses.refusal is None) is agrees
 
     run_virtual(main)
 
@@ -149,7 +149,7 @@ def test_two_photographs_show_a_wrong_time_and_one_does_not() -> None:
     assert day.standing() == {"sun_contradicted": Severity.ALARM}
     day.photograph(first, 0.0)
     assert day.standing() == {}
-    assert day.witnesses.refusal == ""
+    assert day.witnesses.refusal is None
 
 
 def test_what_was_learnt_today_is_no_witness() -> None:
@@ -157,7 +157,7 @@ def test_what_was_learnt_today_is_no_witness() -> None:
     day.photograph(day.design.names[0], 0.0, calibrated=-3600.0)
     assert day.witnesses.refusal
     day.photograph(day.design.names[0], 0.0)
-    assert day.witnesses.refusal == ""
+    assert day.witnesses.refusal is None
 
 
 def test_mirrors_that_miss_each_in_its_own_direction_are_no_contradiction() -> None:
@@ -177,7 +177,7 @@ def test_a_plant_without_a_witness_says_so_once_a_day_unless_that_is_accepted() 
         each.utc += 8.0 * 3600.0
         each.witnesses.on_second(0.0)
         each.witnesses.on_second(0.0)
-        assert each.witnesses.refusal == ""
+        assert each.witnesses.refusal is None
     assert day.standing() == {"unwitnessed": Severity.WARNING}
     assert accepted.told == []
 

@@ -202,7 +202,7 @@ def test_latched_rows_need_their_person(name: str) -> None:
         assert "engineer must acknowledge, not operator" in refused("Ada", AcknowledgeRole.OPERATOR)
     assert run.feed(good, 1000.0).actions, "time alone must not release"
     run.state, why = safety.acknowledge(run.state, name, "Ada", AcknowledgeRole.SUPERVISOR)
-    assert why == ""
+    assert why is None
     assert run.state.tracks[name, ""].acknowledged_by == "Ada"
     assert run.feed(good, 1.0).actions == []
     # The next trip is a new one.

@@ -127,11 +127,11 @@ def limit(place: Path, told: int) -> None:
     except Exception as error:  # noqa: BLE001 - what it is, the test looks at
         lines.append(f"audit {type(error).__name__}")
     keeper.record_event(Event(0.0, "load", "while full"))
-    waiting = keeper.backlog
+    waiting = keeper.writer.backlog
     resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
     asyncio.run(keeper.confirm())
     audit.confirm()
-    lines.append(f"waited {waiting} problem {keeper.problem!r} backlog {keeper.backlog}")
+    lines.append(f"waited {waiting} problem {keeper.problem!r} backlog {keeper.writer.backlog}")
     keeper.close()
     os.write(told, ("\n".join(lines) + "\n").encode())
 

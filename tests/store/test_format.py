@@ -54,7 +54,6 @@ def test_sightings_and_calibrations_read_back(old: Keeper) -> None:
 def test_the_schedule_reads_back(old: Keeper) -> None:
     visits = (replace(old_store.VISITS[0], error_before=old_store.NAN), old_store.VISITS[1])
     assert_same(old.visits(), visits[::-1])
-    assert_same(old.plan(), old_store.PLAN)
     assert_same(old.campaigns(), old_store.CAMPAIGNS)
     assert set(old.holds()) == {
         Lockout(Kind.HELIOSTAT, "Größe/2", "anna", "broken", 5.0, 50.0),

@@ -31,7 +31,6 @@ from heliotrope.store.records import (
     Kind,
     Lockout,
     Outlook,
-    PlannedVisit,
     StoreError,
     VisitEntry,
 )
@@ -250,15 +249,6 @@ class TestSchedule:
         assert (other.gain, other.sigma_before, other.text) == (0.3, 0.01, "calibrated")
         assert [v.heliostat for v in keeper.visits(heliostat="A")] == ["A"]
         assert len(keeper.visits(limit=1)) == 1
-
-    def test_a_plan_replaces_the_one_before(self, keeper: Keeper) -> None:
-        keeper.record_plan([PlannedVisit("A", "west", 50.0, 0.5, "old")])
-        keeper.record_plan([PlannedVisit("C", "east", 70.0), PlannedVisit("B", "west", 60.0, 0.1)])
-        confirm(keeper)
-        assert [p.heliostat for p in keeper.plan()] == ["B", "C"]
-        keeper.record_plan([])
-        confirm(keeper)
-        assert keeper.plan() == []
 
     def test_an_outlook_replaces_the_one_made_at_its_time(self, keeper: Keeper) -> None:
         points = (FieldPoint(5.0, 2e-3, 1 / 300), FieldPoint(9.0, 1e-3, 2e-3))

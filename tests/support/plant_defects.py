@@ -132,8 +132,8 @@ def differing_moves(patch: pytest.MonkeyPatch) -> None:
 def unverified(patch: pytest.MonkeyPatch) -> None:
     """New parameters are taken without the photograph that confirms them."""
 
-    async def confirmed(*_: Any) -> str:
-        return ""
+    async def confirmed(*_: Any) -> None:
+        return None
 
     patch.setattr(Verification, "problem", confirmed)
 
@@ -141,9 +141,9 @@ def unverified(patch: pytest.MonkeyPatch) -> None:
 def any_light(patch: pytest.MonkeyPatch) -> None:
     """Light on the target counts as the heliostat's beam, whether it moves with the aim or not."""
 
-    def own(self: Any, target: Any, shot: Any, *_: Any) -> str:
+    def own(self: Any, target: Any, shot: Any, *_: Any) -> str | None:
         dark = seen(target, shot) is None and not shot.reasons
-        return "no light on the target" if dark else ""
+        return "no light on the target" if dark else None
 
     patch.setattr(Centred, "_astray", own)
 

@@ -48,7 +48,7 @@ def written_under_a_lock(patch: pytest.MonkeyPatch) -> None:
         for each in guards.GUARDS
     ]
     patch.setattr(guards, "GUARDS", tuple(rows))
-    patch.setattr(PathProofs, "resting", lambda self, heliostat, items: "")
+    patch.setattr(PathProofs, "resting", lambda self, heliostat, items: None)
 
 
 def unlisted_unseen(patch: pytest.MonkeyPatch) -> None:
@@ -88,14 +88,14 @@ def emergency_forgotten(patch: pytest.MonkeyPatch) -> None:
 
 def any_stow_position(patch: pytest.MonkeyPatch) -> None:
     """Stow positions are written unproven, and the proof believes a mirror that is at stow."""
-    lit = StrayBeams.lit
+    on_receiver = StrayBeams.on_receiver
 
     def off_stow(self: Any, rows: Any) -> Any:
-        found = lit(self, rows)
+        found = on_receiver(self, rows)
         return found & ~np.isin(self._field.rows["state"][rows], states.STOWED)
 
-    patch.setattr(PathProofs, "resting", lambda self, heliostat, items: "")
-    patch.setattr(StrayBeams, "lit", off_stow)
+    patch.setattr(PathProofs, "resting", lambda self, heliostat, items: None)
+    patch.setattr(StrayBeams, "on_receiver", off_stow)
 
 
 def counts_of_another_mirror(patch: pytest.MonkeyPatch) -> None:
@@ -128,7 +128,7 @@ def backup_unknown(patch: pytest.MonkeyPatch) -> None:
 
 def contradicted_and_joined(patch: pytest.MonkeyPatch) -> None:
     """Heliostats join the receiver by a sun that a witness contradicts."""
-    patch.setattr(Witnesses, "refusal", "")
+    patch.setattr(Witnesses, "refusal", None)
 
 
 #: A mirror after the other is missing in its cluster's file for a while, when mirrors are up.

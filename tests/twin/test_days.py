@@ -362,7 +362,7 @@ def visited(
             searched=0,
             pictures=[],
         )
-    beliefs = SimpleNamespace(record=lambda _: None, seen=lambda _: None, present=lambda _: None)
+    beliefs = SimpleNamespace(record=lambda _: None, known=lambda _: None, present=lambda _: None)
     operations: Any = SimpleNamespace(plant=SimpleNamespace(beliefs=beliefs))
     for k in range(count):
         if asks and k % asks == 0:

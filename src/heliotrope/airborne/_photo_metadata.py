@@ -22,7 +22,7 @@ _EXIF_IFD, _TAKEN, _OFFSET, _SUBSECOND = 0x8769, 0x9003, 0x9011, 0x9291
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a photograph's header states; NaN where it states nothing.
+    """The contents of a photograph's header; NaN where a value is missing.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-r"""Growth of a calibration's covariance with time: what the drives do after the last photograph.
+r"""Growth of a calibration's covariance with time: drift after the last photograph.
 
 The parameters drift as `heliotrope.calibration.learn.drift` describes. A mirror that goes on with
 the values of its calibration misses, after a time Δ, by what its processes have moved since:

@@ -31,7 +31,7 @@ class Unobstructed:
 
     Attributes
     ----------
-    seen
+    sightings
         The sightings with corrected destinations and the uncertainty of the correction.
     shift
         What was taken off, right and up on the target, m, (M, 2); 0 where nothing hides.
@@ -39,7 +39,7 @@ class Unobstructed:
         Share of the mirror that neighbours hid, (M,).
     """
 
-    seen: Sightings
+    sightings: Sightings
     shift: FloatArray
     hidden: FloatArray
 

@@ -54,7 +54,7 @@ Texts = str | Sequence[str]
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is implausible about M sightings.
+    """The implausible features of M sightings.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Judgement:
 
 
 def judge(
-    seen: Sightings,
+    sightings: Sightings,
     *,
     mechanism: Mechanism | None = None,
     site: Site | None = None,
@@ -77,14 +77,14 @@ def judge(
     kinds: Sequence[str] = (),
     now: float | None = None,
 ) -> Judgement:
-    """Return which sightings cannot have happened, and why.
+    """Return the reasons why some of the sightings cannot have happened.
 
     A sighting gets the first reason that applies. The more is known of the plant, the more is
     judged.
 
     Parameters
     ----------
-    seen
+    sightings
         M sightings.
     mechanism
         The mechanisms of its rows, (N,): for stops, the back of a mirror, points on it.
@@ -98,35 +98,40 @@ def judge(
         The computer's clock, Unix seconds: for times that are still to come.
     """
     reasons: dict[int, str] = {}
-    for rows, text in _impossible(seen, now):
+    for rows, text in _impossible(sightings, now):
         _add(reasons, rows, text)
     notes = []
     if site is not None:
-        rows, text, note = _contradicted(seen, site, reasons)
+        rows, text, note = _contradicted(sightings, site, reasons)
         _add(reasons, rows, text)
         notes += [note] if note else []
-    given = np.array([kind == "camera_target" for kind in kinds or [""] * len(seen)], np.bool_)
+    photographed = np.array(
+        [kind == "camera_target" for kind in kinds or [""] * len(sightings)], np.bool_
+    )
     _add(
         reasons,
-        _repeated(seen, given, reasons),
+        _repeated(sightings, photographed, reasons),
         "the point of the beam is the same to the last digit in all sightings of this mirror, "
         "though sun and counts change: it was not measured; if the beam was steered to a mark by "
         "hand, leave kind empty",
     )
     if surfaces and kinds:
-        _add(reasons, *_off_target(seen, given & ~seen.destination_at_infinity, surfaces))
-    if mechanism is not None and len(seen):
-        for rows, text in _beyond_machine(seen, mechanism, reasons):
+        _add(
+            reasons,
+            *_off_target(sightings, photographed & ~sightings.destination_at_infinity, surfaces),
+        )
+    if mechanism is not None and len(sightings):
+        for rows, text in _beyond_machine(sightings, mechanism, reasons):
             _add(reasons, rows, text)
     return Judgement(reasons, tuple(notes))
 
 
 def judge_in(
-    plant: Plant, seen: Sightings, kinds: Sequence[str] = (), now: float | None = None
+    plant: Plant, sightings: Sightings, kinds: Sequence[str] = (), now: float | None = None
 ) -> Judgement:
     """Return the judgement by all that a plant knows; rows are those of its heliostats."""
     return judge(
-        seen,
+        sightings,
         mechanism=plant.nominal if len(plant.groups) == 1 else None,
         site=plant.site,
         surfaces=(*plant.targets, *plant.receivers),
@@ -138,14 +143,14 @@ def judge_in(
 def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:
     """Give rows their reason, one text for all of them or one for each, where they have none."""
     places = np.flatnonzero(rows)
-    each = [texts] * len(places) if isinstance(texts, str) else texts
-    for i, text in zip(places, each, strict=True):
+    row_texts = [texts] * len(places) if isinstance(texts, str) else texts
+    for i, text in zip(places, row_texts, strict=True):
         reasons.setdefault(int(i), text)
 
 
-def _impossible(seen: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
-    """Yield what is impossible for any mirror anywhere."""
-    time = seen.time
+def _impossible(sightings: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
+    """Yield the sightings that are impossible for any mirror anywhere."""
+    time = sightings.time
     out = (time < EARLIEST) | (time > LATEST)
     yield out, YEAR
     if now is not None:
@@ -155,39 +160,39 @@ def _impossible(seen: Sightings, now: float | None) -> Iterator[tuple[Rows, Text
             ahead,
             f"the time is more than a year ahead of this computer's clock, {clock}: correct one",
         )
-    low = seen.source_at_infinity & (seen.source[:, 2] < np.sin(LOWEST))
-    angles = np.degrees(np.arcsin(np.clip(seen.source[low, 2], -1.0, 1.0)))
+    low = sightings.source_at_infinity & (sightings.source[:, 2] < np.sin(LOWEST))
+    angles = np.degrees(np.arcsin(np.clip(sightings.source[low, 2], -1.0, 1.0)))
     yield low, [f"the sun is below the horizon: its elevation is {angle:.1f}°" for angle in angles]
-    yield copies(seen), "a copy of another sighting"
+    yield copies(sightings), "a copy of another sighting"
 
 
-def copies(seen: Sightings) -> Rows:
-    """Return which sightings repeat an earlier one, (M,).
+def copies(sightings: Sightings) -> Rows:
+    """Return a mask of the sightings that repeat an earlier one, (M,).
 
     Mirror, counts and destination are the same to the last digit, and so is the source; a sun may
     have moved by less than `SAME`.
     """
-    again = np.zeros(len(seen), np.bool_)
-    if not len(seen):
+    again = np.zeros(len(sightings), np.bool_)
+    if not len(sightings):
         return again
-    table = np.hstack([seen.heliostat[:, None], seen.counts, seen.destination])
+    table = np.hstack([sightings.heliostat[:, None], sightings.counts, sightings.destination])
     _, group, count = np.unique(table, axis=0, return_inverse=True, return_counts=True)
     rows = np.flatnonzero(count[group] > 1)
     while len(rows):
         # The first of each group that is left, and those that repeat it.
         _, first, of_group = np.unique(group[rows], return_index=True, return_inverse=True)
         lead = rows[first[of_group]]
-        gap = np.linalg.norm(seen.source[rows] - seen.source[lead], axis=1)
-        near = gap <= np.where(seen.source_at_infinity[rows], SAME, 0.0)
+        gap = np.linalg.norm(sightings.source[rows] - sightings.source[lead], axis=1)
+        near = gap <= np.where(sightings.source_at_infinity[rows], SAME, 0.0)
         again[rows[near & (rows != lead)]] = True
         rows = rows[~near]
     return again
 
 
-def _repeated(seen: Sightings, given: Rows, reasons: Mapping[int, str]) -> Rows:
+def _repeated(sightings: Sightings, photographed: Rows, reasons: Mapping[int, str]) -> Rows:
     """Return the sightings by a camera of mirrors whose beam never moved, though they did."""
-    rows = given & ~np.isin(np.arange(len(seen)), list(reasons))
-    mirror = seen.heliostat[rows]
+    rows = photographed & ~np.isin(np.arange(len(sightings)), list(reasons))
+    mirror = sightings.heliostat[rows]
     if not len(mirror):
         return rows
 
@@ -195,28 +200,28 @@ def _repeated(seen: Sightings, given: Rows, reasons: Mapping[int, str]) -> Rows:
         table = np.unique(np.hstack([mirror[:, None], values[rows]]), axis=0)
         return np.bincount(table[:, 0].astype(np.intp))
 
-    stuck = (different(seen.destination) == 1) & (different(seen.counts) > 1)
+    stuck = (different(sightings.destination) == 1) & (different(sightings.counts) > 1)
     stuck &= np.bincount(mirror) >= REPEATED
     rows[rows] = stuck[mirror]
     return rows
 
 
 def _contradicted(
-    seen: Sightings, site: Site, reasons: Mapping[int, str]
+    sightings: Sightings, site: Site, reasons: Mapping[int, str]
 ) -> tuple[Rows, Texts, str]:
-    """Return the suns that did not stand there at their time; a note where a mirror has most."""
-    able = seen.source_at_infinity & np.isfinite(seen.time)
+    """Return the suns that are wrong for their time; a note where most of a mirror's are."""
+    able = sightings.source_at_infinity & np.isfinite(sightings.time)
     able[list(reasons)] = False
     if not able.any():
         return able, "", ""
-    expected, away = np.zeros((len(seen), 3)), np.zeros(len(seen))
-    expected[able] = solar.vector(seen.time[able], site)
-    away[able] = angle_between(seen.source[able], expected[able])
+    expected, away = np.zeros((len(sightings), 3)), np.zeros(len(sightings))
+    expected[able] = solar.vector(sightings.time[able], site)
+    away[able] = angle_between(sightings.source[able], expected[able])
     rows = away > MOVED
-    wrong, known = (np.bincount(seen.heliostat[mask]) for mask in (rows, able))
+    mistaken, known = (np.bincount(sightings.heliostat[mask]) for mask in (rows, able))
     mostly = np.zeros(len(known), np.bool_)
-    mostly[: len(wrong)] = 2 * wrong > known[: len(wrong)]
-    whole = rows & mostly[seen.heliostat] if rows.any() else rows
+    mostly[: len(mistaken)] = 2 * mistaken > known[: len(mistaken)]
+    whole = rows & mostly[sightings.heliostat] if rows.any() else rows
     note = ""
     if whole.any():
         middle = float(np.degrees(np.median(away[whole])))
@@ -226,22 +231,22 @@ def _contradicted(
             "[site]"
         )
         rows = rows & ~whole
-    where, there = azimuth_elevation(seen.source[rows]), azimuth_elevation(expected[rows])
+    stated, computed = azimuth_elevation(sightings.source[rows]), azimuth_elevation(expected[rows])
     texts = [
         f"the sun is given at azimuth {a % 360.0:.1f}°, elevation {e:.1f}°, and stood at "
         f"{b % 360.0:.1f}°, {f:.1f}° at that time: correct one of them"
-        for a, e, b, f in zip(*np.degrees(where), *np.degrees(there), strict=True)
+        for a, e, b, f in zip(*np.degrees(stated), *np.degrees(computed), strict=True)
     ]
     return rows, texts, note
 
 
 def _off_target(
-    seen: Sightings, given: Rows, surfaces: Sequence[Target | Receiver]
+    sightings: Sightings, photographed: Rows, surfaces: Sequence[Target | Receiver]
 ) -> tuple[Rows, Texts]:
-    away = np.full((len(surfaces), len(seen)), np.inf)
-    on = np.zeros(len(seen), np.bool_)
+    away = np.full((len(surfaces), len(sightings)), np.inf)
+    on = np.zeros(len(sightings), np.bool_)
     for k, surface in enumerate(surfaces):
-        gap = seen.destination - surface.center
+        gap = sightings.destination - surface.center
         away[k] = np.linalg.norm(gap, axis=1)
         if isinstance(surface, Receiver):
             on |= away[k] <= np.hypot(surface.width, surface.height)
@@ -250,7 +255,7 @@ def _off_target(
             [surface.width, surface.height]
         )
         on |= (across <= OFF).all(axis=1) & (np.abs(gap @ surface.normal) <= OFF)
-    rows = given & ~on
+    rows = photographed & ~on
     nearest = np.argmin(away[:, rows], axis=0)
     texts = [
         f"the beam's point is on no target: {away[k, i]:.1f} m from the centre of "
@@ -261,64 +266,65 @@ def _off_target(
 
 
 def _beyond_machine(
-    seen: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
+    sightings: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
 ) -> Iterator[tuple[Rows, Texts]]:
-    """Yield what the mirror of a sighting cannot do."""
-    each = mechanism[seen.heliostat]
-    pose = each.pose(seen.counts)
-    near = np.zeros(len(seen), np.bool_)
+    """Yield the sightings that are beyond their mirror's abilities."""
+    mirrors = mechanism[sightings.heliostat]
+    pose = mirrors.pose(sightings.counts)
+    near = np.zeros(len(sightings), np.bool_)
     for points, far in (
-        (seen.source, seen.source_at_infinity),
-        (seen.destination, seen.destination_at_infinity),
+        (sightings.source, sightings.source_at_infinity),
+        (sightings.destination, sightings.destination_at_infinity),
     ):
         near |= ~far & (np.linalg.norm(points - pose.vertex, axis=1) < NEAREST)
     yield near, f"the ray begins or ends within {NEAREST} m of the mirror"
     with np.errstate(invalid="ignore", divide="ignore"):
-        source, way = ray_directions(seen, pose.vertex)
-        total = source + way
+        source, destination = ray_directions(sightings, pose.vertex)
+        total = source + destination
         size = np.linalg.norm(total, axis=1)
         edge = ~near & ~(size > 2.0 * np.cos(EDGE_ON))
         miss = angle_between(pose.normal, total / np.maximum(size, 1e-9)[:, None])
     yield edge, f"the beam passes the mirror edge-on, {np.degrees(EDGE_ON):.0f}° from its normal"
     # Only a nominal mechanism that holds for most of a mirror's sightings judges the others.
-    good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(seen)), list(reasons)))
+    good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(sightings)), list(reasons)))
     holds = np.zeros(len(mechanism), np.bool_)
-    for row in np.unique(seen.heliostat[good]):
-        mine = good[seen.heliostat[good] == row]
+    for row in np.unique(sightings.heliostat[good]):
+        mine = good[sightings.heliostat[good] == row]
         holds[row] = np.nan_to_num(np.median(miss[mine]), nan=np.inf) < FAR
-    judged = holds[seen.heliostat]
+    judged = holds[sightings.heliostat]
     for drive, joint in enumerate(mechanism.driven):
-        value, low, high, most, unit = _reach(each, seen.counts, drive)
+        value, low, high, most, unit = _reach(mirrors, sightings.counts, drive)
         rows = ~((value >= low) & (value <= high)) & (judged | ~(np.abs(value) <= most))
         yield (
             rows,
             [
-                f"the counts {seen.counts[i, drive]:.10g} of {mechanism.joints[joint]} are beyond "
-                f"its stops: {value[i]:.5g}{unit} is outside {low[i]:.5g} to {high[i]:.5g}{unit}"
+                f"the counts {sightings.counts[i, drive]:.10g} of {mechanism.joints[joint]} are "
+                f"beyond its stops: {value[i]:.5g}{unit} is outside {low[i]:.5g} to "
+                f"{high[i]:.5g}{unit}"
                 for i in np.flatnonzero(rows)
             ],
         )
     behind = judged & (
-        np.minimum((pose.normal * source).sum(axis=1), (pose.normal * way).sum(axis=1))
+        np.minimum((pose.normal * source).sum(axis=1), (pose.normal * destination).sum(axis=1))
         < -np.sin(PLAY)
     )
     yield behind, "the beam comes from the back of the mirror at these counts"
 
 
 def _reach(
-    each: Mechanism, counts: FloatArray, drive: int
+    mirrors: Mechanism, counts: FloatArray, drive: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
-    """Return what a drive did, its limits with play, what no zero or sense explains, and the unit.
+    """Return the values of a drive, its limits with play, the most a zero explains, and the unit.
 
     All (M,), in counts where the drive has limits of counts, else in degrees.
     """
-    table = each.drives.table[:, drive]
+    table = mirrors.drives.table[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_count", "max_count"))
     if np.isfinite(low).all() and np.isfinite(high).all():
         play = 0.02 * (high - low)
         most = 2.0 * np.maximum(np.abs(low), np.abs(high))
         return counts[:, drive], low - play, high + play, most, " counts"
-    angle = each.drives.angles(counts)[:, drive]
+    angle = mirrors.drives.angles(counts)[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_angle", "max_angle"))
     limits = np.clip(np.array([low - PLAY, high + PLAY]), -MOST_TURNS, MOST_TURNS)
     most = np.full(len(counts), np.degrees(MOST_TURNS))

@@ -212,7 +212,7 @@ class HeliostatCalibration(Value, Framed):
         at: float,
         fitted: FieldFit,
         nominal: Mechanism,
-        seen: Sightings,
+        sightings: Sightings,
         identities: npt.ArrayLike,
         *,
         model: str,
@@ -234,7 +234,7 @@ class HeliostatCalibration(Value, Framed):
             A fit of batch shape (1,).
         nominal
             The mechanism that the values deviate from, batch shape (1,).
-        seen, identities
+        sightings, identities
             The sightings given to the fit (heliostat row 0), and their numbers, (M,).
         used
             Mask of the sightings that the fit used, (M,); default all.
@@ -247,13 +247,13 @@ class HeliostatCalibration(Value, Framed):
             If numbers and sightings differ in count, or the fit failed.
         """
         numbers = np.asarray(identities, np.int64).reshape(-1)
-        if len(numbers) != len(seen):
+        if len(numbers) != len(sightings):
             raise InputError(
-                f"calibration of {heliostat}: {len(numbers)} numbers for {len(seen)} sightings; "
-                "number the sightings first"
+                f"calibration of {heliostat}: {len(numbers)} numbers for {len(sightings)} "
+                "sightings; number the sightings first"
             )
-        mask = np.ones(len(seen), np.bool_) if used is None else np.asarray(used, np.bool_)
-        taken = seen.take(np.flatnonzero(mask))
+        mask = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
+        taken = sightings.take(np.flatnonzero(mask))
         first = beam_errors(nominal, taken)
         last = beam_errors(nominal.with_parameters(fitted.parameters), taken)
         return cls(
@@ -338,5 +338,5 @@ def covariances_at(records: Sequence[HeliostatCalibration], time: float) -> Floa
 
 
 def root_mean_square(values: FloatArray) -> float:
-    """Return the root mean square; NaN of nothing."""
+    """Return the root mean square; NaN if there are no values."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

@@ -108,7 +108,7 @@ def read_sightings(
     sigma = _sigma(rows)
     spread = {end: _covariance(rows, end) for end in _ENDS}
     good = rows.good
-    seen = sightings(
+    unnamed = sightings(
         heliostat[good],
         counts[good],
         ends["source"][good],
@@ -120,7 +120,7 @@ def read_sightings(
         source_covariance=spread["source"][good],
         destination_covariance=spread["destination"][good],
     )
-    named = replace(seen, names=tuple(names))
+    named = replace(unnamed, names=tuple(names))
     if judge is not None:
         named = _without(rows, named, judge(named, [kinds[i] for i in good]))
     return named, tuple(kinds[i] for i in rows.good), rows.left_out
@@ -134,11 +134,11 @@ def _times(rows: Rows, column: str, *, optional: bool) -> FloatArray:
     return seconds
 
 
-def _without(rows: Rows, seen: Sightings, reasons: Mapping[int, str]) -> Sightings:
+def _without(rows: Rows, sightings: Sightings, reasons: Mapping[int, str]) -> Sightings:
     """Refuse the rows of sightings with a reason, and return the others."""
     good = rows.good
     rows.reasons |= {int(good[k]): ("", reason) for k, reason in reasons.items()}
-    return seen.take(np.isin(good, rows.good))
+    return sightings.take(np.isin(good, rows.good))
 
 
 def write_sightings(
@@ -250,7 +250,7 @@ def read_malan(
             f" m is more than {_FARTHEST_OFFSET:g} m; is it in another unit?",
         )
     good = rows.good
-    seen = camera_target(
+    targeted = camera_target(
         index[heliostat],
         np.stack(counts, axis=-1)[good],
         direction(np.radians(azimuth[good]), np.radians(elevation[good])),
@@ -258,8 +258,8 @@ def read_malan(
         time=time[good],
         sigma=sigma,
     )
-    seen = _without(rows, seen, plausibility.judge(seen).reasons)
-    return replace(seen, names=tuple(names)), rows.left_out
+    targeted = _without(rows, targeted, plausibility.judge(targeted).reasons)
+    return replace(targeted, names=tuple(names)), rows.left_out
 
 
 def _is_parquet(path: Path) -> bool:
@@ -273,7 +273,7 @@ def _check_columns(rows: Rows) -> list[str]:
     """Return the columns of counts; refuse missing and misspelt columns."""
     ends = [f"{end}_{axis}" for end in _ENDS for axis in (*_AXES, "at_infinity")]
     rows.need(["heliostat", "count_1", *ends])
-    there = list(rows.columns)
+    columns = list(rows.columns)
     drives = ["count_1"]
     while f"count_{len(drives) + 1}" in rows.columns:
         drives.append(f"count_{len(drives) + 1}")
@@ -288,8 +288,8 @@ def _check_columns(rows: Rows) -> list[str]:
     if "sigma_mrad" not in rows.columns:
         rows.need(["sigma_rad"])
     known = ["heliostat", "time", "kind", *drives, *ends, *sigmas, *covariances]
-    likely = [n for n in (*known, f"count_{len(drives) + 1}") if n not in there]
-    for name in there:
+    likely = [n for n in (*known, f"count_{len(drives) + 1}") if n not in columns]
+    for name in columns:
         if name not in known and name.startswith(("source_", "destination_", "count_", "sigma")):
             close = get_close_matches(name, likely, n=1)
             hint = f"did you mean {close[0]}?" if close else "give it another name or remove it"
@@ -317,27 +317,27 @@ def _check_kinds(rows: Rows, kinds: Sequence[str], far: dict[str, npt.NDArray[np
     for i, kind in enumerate(kinds):
         if kind and kind not in KINDS:
             rows.refuse(i, "kind", str(UnknownNameError("kind of sighting", kind, KINDS)))
-        for end, wanted in zip(_ENDS, KINDS.get(kind, ()), strict=False):
-            if far[end][i] != wanted:
+        for end, infinite in zip(_ENDS, KINDS.get(kind, ()), strict=False):
+            if far[end][i] != infinite:
                 rows.refuse(
                     i,
                     f"{end}_at_infinity",
                     f"{str(bool(far[end][i])).lower()}, but for kind {kind} it is "
-                    f"{str(wanted).lower()}; correct one of them",
+                    f"{str(infinite).lower()}; correct one of them",
                 )
 
 
 def _sigma(rows: Rows) -> FloatArray:
     name = "sigma_rad" if "sigma_rad" in rows.columns else "sigma_mrad"
     unit = name.removeprefix("sigma_")
-    given = rows.numbers(name, f"the ray's standard deviation in {unit}")
+    values = rows.numbers(name, f"the ray's standard deviation in {unit}")
     # Division rounds once; 1e-3 itself is not exact in binary.
     scale = 1.0 if unit == "rad" else 1e3
-    sigma = given / scale
+    sigma = values / scale
     rows.check(
         name,
         (sigma < SMALLEST_SIGMA) | (sigma > LARGEST_SIGMA),
-        given,
+        values,
         f" {unit} is outside {scale * SMALLEST_SIGMA:g} to {scale * LARGEST_SIGMA:g} {unit}; is it "
         "in another unit?",
     )
@@ -377,16 +377,18 @@ def _columns(
             f"sightings: heliostat row {int(s.heliostat.max())} of {len(names)} names; give the "
             "names of all heliostats"
         )
-    given = [""] * len(s) if kinds is None else list(kinds)
-    if len(given) != len(s):
-        raise InputError(f"sightings: {len(given)} kinds for {len(s)} sightings; give one for each")
-    for kind in given:
+    all_kinds = [""] * len(s) if kinds is None else list(kinds)
+    if len(all_kinds) != len(s):
+        raise InputError(
+            f"sightings: {len(all_kinds)} kinds for {len(s)} sightings; give one for each"
+        )
+    for kind in all_kinds:
         if kind and kind not in KINDS:
             raise UnknownNameError("kind of sighting", kind, KINDS)
     columns: dict[str, list[Any]] = {
         "heliostat": [str(names[i]) for i in s.heliostat],
         "time": [format_time(t) for t in s.time.tolist()],
-        "kind": given,
+        "kind": all_kinds,
     }
     for d in range(s.counts.shape[-1]):
         columns[f"count_{d + 1}"] = s.counts[:, d].tolist()

@@ -220,11 +220,11 @@ def sightings(
     far_source = spread(source_at_infinity, "source_at_infinity", np.bool_)
     far_destination = spread(destination_at_infinity, "destination_at_infinity", np.bool_)
     ends = []
-    for name, given, far in (
+    for name, end, far in (
         ("source", source, far_source),
         ("destination", destination, far_destination),
     ):
-        points = np.array(_rows(_numbers(given, name), (*batch, 3), name)).reshape(rows, 3)
+        points = np.array(_rows(_numbers(end, name), (*batch, 3), name)).reshape(rows, 3)
         _finite(points, name)
         with np.errstate(over="ignore"):
             loose = far & (np.abs(np.linalg.norm(points, axis=-1) - 1.0) > _UNIT)
@@ -233,9 +233,9 @@ def sightings(
         ends.append(points)
     _finite(table, "counts")
     spreads = spread(sigma, "sigma")
-    wrong = ~((spreads <= LARGEST_SIGMA) & (spreads >= SMALLEST_SIGMA))
-    if wrong.any():
-        i = int(np.flatnonzero(wrong)[0])
+    bad = ~((spreads <= LARGEST_SIGMA) & (spreads >= SMALLEST_SIGMA))
+    if bad.any():
+        i = int(np.flatnonzero(bad)[0])
         raise InputError(
             f"sighting {i}: sigma {spreads[i]} rad must be {SMALLEST_SIGMA} to {LARGEST_SIGMA} "
             "rad; milliradians need a factor of 1e-3, degrees numpy.radians"
@@ -256,13 +256,13 @@ def sightings(
     )
 
 
-def _numbers(given: npt.ArrayLike, name: str) -> FloatArray:
+def _numbers(values: npt.ArrayLike, name: str) -> FloatArray:
     """Return an array of numbers, some of which may be NaN: the row is named later."""
     try:
-        return as_float(given)
+        return as_float(values)
     except (TypeError, ValueError):
         # Its error says what is wrong.
-        return as_numbers(given, f"sightings: {name}")
+        return as_numbers(values, f"sightings: {name}")
 
 
 def _rows(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
@@ -270,18 +270,18 @@ def _rows(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
     try:
         return np.broadcast_to(values, shape)
     except ValueError:
-        one = "3 numbers" if name in ("source", "destination") else "a number"
+        shape_text = "3 numbers" if name in ("source", "destination") else "a number"
         raise InputError(
             f"sightings: {name} of shape {values.shape}; there are {shape[0]} rows of counts: give "
-            f"{one} for all of them, or shape {shape}"
+            f"{shape_text} for all of them, or shape {shape}"
         ) from None
 
 
-def _heliostats(given: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray[np.intp]:
-    values = _rows(_numbers(given, "heliostat"), batch, "heliostat").ravel()
-    wrong = ~((values >= 0.0) & (values == np.floor(values)))
-    if wrong.any():
-        i = int(np.flatnonzero(wrong)[0])
+def _heliostats(heliostat: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray[np.intp]:
+    values = _rows(_numbers(heliostat, "heliostat"), batch, "heliostat").ravel()
+    bad = ~((values >= 0.0) & (values == np.floor(values)))
+    if bad.any():
+        i = int(np.flatnonzero(bad)[0])
         raise InputError(
             f"sighting {i}: heliostat {values[i]:g} is not a row; give whole numbers from 0 on"
         )
@@ -290,13 +290,13 @@ def _heliostats(given: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray[np.
 
 def _named(heliostat: npt.ArrayLike) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return rows and their names, in the order in which the names occur; () for rows."""
-    given = np.asarray(heliostat)
-    if given.dtype.kind not in "UO":
-        return given, ()
-    names = tuple(dict.fromkeys(str(name) for name in given.ravel()))
+    labels = np.asarray(heliostat)
+    if labels.dtype.kind not in "UO":
+        return labels, ()
+    names = tuple(dict.fromkeys(str(name) for name in labels.ravel()))
     place = {name: i for i, name in enumerate(names)}
-    rows = np.array([place[str(name)] for name in given.ravel()], dtype=np.intp)
-    return rows.reshape(given.shape), names
+    rows = np.array([place[str(name)] for name in labels.ravel()], dtype=np.intp)
+    return rows.reshape(labels.shape), names
 
 
 def _along_first(times: FloatArray, batch: tuple[int, ...]) -> FloatArray:
@@ -306,20 +306,20 @@ def _along_first(times: FloatArray, batch: tuple[int, ...]) -> FloatArray:
     return times
 
 
-def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
-    values = _numbers(given, name)
+def _covariances(covariance: npt.ArrayLike, rows: int, name: str) -> FloatArray:
+    values = _numbers(covariance, name)
     if values.ndim < 2:
         values = np.where(np.eye(3) > 0.0, values[..., None, None], 0.0)
     try:
         matrices = np.array(np.broadcast_to(values, (rows, 3, 3)))
     except ValueError:
         raise InputError(
-            f"sightings: {name} of shape {np.shape(given)}; give a variance, {rows} variances, "
-            f"or matrices (3, 3) or ({rows}, 3, 3)"
+            f"sightings: {name} of shape {np.shape(covariance)}; give a variance, {rows} "
+            f"variances, or matrices (3, 3) or ({rows}, 3, 3)"
         ) from None
-    wrong = ~is_covariance(matrices)
-    if wrong.any():
-        i = int(np.flatnonzero(wrong)[0])
+    bad = ~is_covariance(matrices)
+    if bad.any():
+        i = int(np.flatnonzero(bad)[0])
         raise InputError(
             f"sighting {i}: {name} {matrices[i].tolist()} is not symmetric and positive "
             "semidefinite; give variances and covariances in m² of a point, rad² of a direction"
@@ -328,7 +328,7 @@ def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
 
 
 def is_covariance(matrices: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which matrices (M, 3, 3) are finite, symmetric and positive semidefinite.
+    """Return a mask of the matrices (M, 3, 3) that are finite, symmetric and positive semidefinite.
 
     Tolerance: 1e-9 of the largest entry. Entries above 1e100 count as infinite.
     """
@@ -343,9 +343,9 @@ def is_covariance(matrices: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _finite(values: FloatArray, name: str) -> None:
-    wrong = ~np.isfinite(values).all(axis=-1)
-    if wrong.any():
-        i = int(np.flatnonzero(wrong)[0])
+    bad = ~np.isfinite(values).all(axis=-1)
+    if bad.any():
+        i = int(np.flatnonzero(bad)[0])
         raise InputError(f"sighting {i}: {name} {values[i]} is not finite; leave the row out")
 
 
@@ -357,8 +357,8 @@ def ray_directions(s: Sightings, vertex: npt.ArrayLike) -> tuple[FloatArray, Flo
         (s.source, s.source_at_infinity),
         (s.destination, s.destination_at_infinity),
     ):
-        way = np.where(far[:, None], points, points - m)
-        ends.append(way / np.linalg.norm(way, axis=-1, keepdims=True))
+        directions = np.where(far[:, None], points, points - m)
+        ends.append(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
     return ends[0], ends[1]
 
 
@@ -382,24 +382,24 @@ def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike
         Two unit axes across each bisector, (M, 2, 3).
     """
     m = as_float(vertex)
-    ways = ray_directions(s, m)
-    size = np.linalg.norm(ways[0] + ways[1], axis=-1)
+    rays = ray_directions(s, m)
+    size = np.linalg.norm(rays[0] + rays[1], axis=-1)
     across = as_float(axes) / size[:, None, None]
     # A turn ε of the ray t turns the bisector by the part of ε across the normal over |s + t|:
     # all of it across the plane of incidence, cos i of it within the plane.
-    turn = np.eye(3) - ways[1][:, :, None] * ways[1][:, None, :]
+    turn = np.eye(3) - rays[1][:, :, None] * rays[1][:, None, :]
     covariance = across @ turn @ np.swapaxes(across, -1, -2) * s.sigma[:, None, None] ** 2
-    for way, points, far, given in (
-        (ways[0], s.source, s.source_at_infinity, s.source_covariance),
-        (ways[1], s.destination, s.destination_at_infinity, s.destination_covariance),
+    for ray, points, far, end_covariance in (
+        (rays[0], s.source, s.source_at_infinity, s.source_covariance),
+        (rays[1], s.destination, s.destination_at_infinity, s.destination_covariance),
     ):
-        rows = np.flatnonzero(given.any(axis=(-1, -2)))
+        rows = np.flatnonzero(end_covariance.any(axis=(-1, -2)))
         if rows.size:
-            w = way[rows]
+            w = ray[rows]
             lever = np.where(far[rows], 1.0, np.linalg.norm(points[rows] - m[rows], axis=-1))
             turn = (np.eye(3) - w[:, :, None] * w[:, None, :]) / lever[:, None, None]
             part = across[rows] @ turn
-            covariance[rows] += part @ given[rows] @ np.swapaxes(part, -1, -2)
+            covariance[rows] += part @ end_covariance[rows] @ np.swapaxes(part, -1, -2)
     return as_float(covariance)
 
 
@@ -422,7 +422,7 @@ def of_measurements(
     kept = rows >= 0
     strangers = sorted({n for n, ok in zip(measurements.heliostat, kept, strict=True) if not ok})
     left_out = [f"measurements of {name}: the plant has no such heliostat" for name in strangers]
-    seen = sightings(
+    targeted = sightings(
         rows[kept],
         measurements.counts[kept],
         measurements.sun[kept],
@@ -430,7 +430,7 @@ def of_measurements(
         time=measurements.time[kept],
         sigma=sigma,
     )
-    return replace(seen, names=heliostats.names), left_out
+    return replace(targeted, names=heliostats.names), left_out
 
 
 def camera_target(

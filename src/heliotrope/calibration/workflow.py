@@ -54,7 +54,7 @@ class FieldSightings:
     ----------
     plant, group
         The plant, and the name of the group with the heliostats.
-    seen
+    sightings
         The sightings.
     ids
         Name of each sighting.
@@ -66,7 +66,7 @@ class FieldSightings:
 
     plant: Plant
     group: str
-    seen: Sightings
+    sightings: Sightings
     ids: tuple[str, ...]
     left_out: tuple[str, ...]
     notes: tuple[str, ...] = ()
@@ -124,7 +124,7 @@ def read_field_sightings(
         raise InputError(
             f"{place}: a plant without measurements; give --sightings TABLE, or a folder with both"
         )
-    if not len(field.seen):
+    if not len(field.sightings):
         reason = f"; the first: {field.left_out[0]}" if field.left_out else ""
         raise FormatError(table or place, f"no measurement can be used{reason}")
     return field
@@ -376,11 +376,11 @@ def calibrate(
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
     names, mechanism = field.heliostats.names, field.heliostats.mechanism
-    misfits = find_misfits(mechanism, field.seen, targets=field.plant.targets)
-    fits = ~np.isin(field.seen.heliostat, [misfit.row for misfit in misfits])
+    misfits = find_misfits(mechanism, field.sightings, targets=field.plant.targets)
+    fits = ~np.isin(field.sightings.heliostat, [misfit.row for misfit in misfits])
     comparison: tuple[str, ...] = ()
     if model == "auto":
-        choice = find_model(mechanism, field.seen, fits, steps)
+        choice = find_model(mechanism, field.sightings, fits, steps)
         model, mechanism, comparison = choice.parameters, choice.mechanism, choice.describe()
     options: dict[str, Any] = {"priors": priors, "runner": runner, "misfits": misfits}
     tested = None
@@ -388,7 +388,7 @@ def calibrate(
         tested = evaluate(
             names,
             mechanism,
-            field.seen,
+            field.sightings,
             model,
             split=split,
             fraction=fraction,
@@ -396,7 +396,7 @@ def calibrate(
             steps=steps,
             **options,
         ).assessment
-    learned = learn(mechanism, field.seen, model, progress=_step(steps, "learning"), **options)
+    learned = learn(mechanism, field.sightings, model, progress=_step(steps, "learning"), **options)
     clock = clock_of(field, learned)
     return CalibrationReport(
         names,
@@ -416,7 +416,7 @@ def calibrate(
 def clock_of(field: FieldSightings, learned: Learned) -> ClockCheck | None:
     """Return the common error of the clock by the sightings of all mirrors that fit."""
     rows = [misfit.row for misfit in learned.misfits]
-    observed = field.seen.take(~np.isin(field.seen.heliostat, rows))
+    observed = field.sightings.take(~np.isin(field.sightings.heliostat, rows))
     return check_clock(learned.mechanism, observed, learned.model, field.plant.site)
 
 

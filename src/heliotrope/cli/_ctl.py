@@ -821,7 +821,7 @@ def automatic(
 
 @app.command()
 def resume(context: typer.Context) -> None:
-    """Let automatic control go on after a loss of many heliostats."""
+    """Resume automatic control after a loss of many heliostats."""
     with _client(context) as client:
         client.ask("POST", "automatic/resume")
     print("automatic control resumed")

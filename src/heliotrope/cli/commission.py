@@ -181,7 +181,7 @@ def _fleets(
     flight: tuple[int, int],
     quiet: bool,
 ) -> "tuple[list[Fleet], Any, dict[str, Any] | None]":
-    """What is known of the heliostats, which were measured, and the figures of the flight."""
+    """Return the knowledge of the heliostats, the measured ones, and the figures of the flight."""
     import numpy as np
 
     from heliotrope.calibration.plan.fleets import fleets_of

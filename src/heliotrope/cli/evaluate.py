@@ -61,7 +61,7 @@ def evaluate(
         outcome = workflow.evaluate(
             field.heliostats.names,
             field.heliostats.mechanism,
-            field.seen if freed is None else freed.seen,
+            field.sightings if freed is None else freed.sightings,
             shared.parse_model(model),
             split=split,
             fraction=fraction,
@@ -106,7 +106,7 @@ def _unobstructed(field: "FieldSightings") -> "Unobstructed":
 
     plant = field.plant
     aim = (plant.receivers or plant.targets)[0].center
-    return unobstructed(field.heliostats, plant.targets, field.seen, aim)
+    return unobstructed(field.heliostats, plant.targets, field.sightings, aim)
 
 
 def _print_axes(document: dict[str, Any], shown: Callable[[Any], str]) -> None:

@@ -95,7 +95,7 @@ def plan(
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the table.")] = None,
     picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
 ) -> None:
-    """Plan the measurements that tell most: times, targets, and the beam error to expect."""
+    """Plan the measurements that reveal most: times, targets, and the beam error to expect."""
     from heliotrope.calibration.plan.campaign import Timing
     from heliotrope.calibration.plan.fleets import fleets_of
     from heliotrope.calibration.plan.report import check_picture

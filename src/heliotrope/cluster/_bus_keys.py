@@ -38,7 +38,7 @@ _OWN = "their own keys are not in the cluster's key file, or differ from it"
 
 
 class _Held:
-    """What is known of one local controller's keys of the bus."""
+    """The known state of one local controller's keys of the bus."""
 
     def __init__(self, boots: int) -> None:
         self.boots = boots

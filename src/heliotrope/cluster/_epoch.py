@@ -99,7 +99,7 @@ class Epoch:
         self.kept.begin(at_least, stored)
 
     def _use(self) -> None:
-        """Begin the stored epoch: only before SESSION, which tells it to the local controllers."""
+        """Begin the stored epoch: only before SESSION, which sends it to the local controllers."""
         if self._next is not None:
             self._exchange.begin_epoch(self._next)
             self._next = None

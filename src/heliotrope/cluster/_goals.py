@@ -208,7 +208,7 @@ class Goals:
             self._watches.pop(node.index, None)
 
     def _verdict(self, node: ClusterNode, watch: _Watch, asked_at: float) -> str | None:
-        """Return "" if it is done, a text if it has failed, None if neither."""
+        """Return the reason of a failure, an empty text once it is done, None while it goes on."""
         if asked_at < watch.since + _SETTLE:
             return None
         if watch.name in messages.SAFE and node.flags & names.COUNTS_UNKNOWN:

@@ -118,11 +118,11 @@ class PlantLink:
             role = AcknowledgeRole[message.role.upper()]
         except KeyError:
             known = " or ".join(role.name.lower() for role in AcknowledgeRole)
-            refusal = f"role {message.role!r} is not known; give {known}"
+            refusal: str | None = f"role {message.role!r} is not known; give {known}"
         else:
             refusal = self._watch.acknowledge(message.condition, message.who, role)
         stage = Stage.REFUSED if refusal else Stage.DONE
-        self._reports.add(message.identity, stage, text=refusal)
+        self._reports.add(message.identity, stage, text=refusal or "")
 
     # -- to the plant ----------------------------------------------------------------------
 

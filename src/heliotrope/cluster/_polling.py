@@ -26,13 +26,7 @@ _JUMP_SHOWS = 60.0
 
 
 class Polling:
-    """Polls the local controllers.
-
-    Attributes
-    ----------
-    overruns
-        Rounds that did not end within their second.
-    """
+    """Polls the local controllers."""
 
     def __init__(
         self,
@@ -55,7 +49,6 @@ class Polling:
         self._silent: set[int] = set()
         self._unreadable: set[int] = set()
         self._jumped: dict[str, float] = {}
-        self.overruns = 0
 
     @property
     def silent(self) -> int:
@@ -74,7 +67,6 @@ class Polling:
         for place in range(first, first + count):
             if now >= until or closing.is_set():
                 self._next = place % count
-                self.overruns += 1
                 return
             node = nodes[place % count]
             if node.missed < _ABSENT or (self._number + node.index) % _PROBE == 0:

@@ -69,7 +69,7 @@ class Reports:
     # -- to the sender ---------------------------------------------------------------------
 
     def publish(self) -> None:
-        """Let the sender take the waiting reports, if there are any."""
+        """Pass the waiting reports to the sender, if there are any."""
         if self._groups or self._out or self._status:
             self._published.set()
 

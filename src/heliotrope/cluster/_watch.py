@@ -222,7 +222,7 @@ class Watch:
                 Alarm(action.condition, self._cluster, action.severity, action.line)
             )
 
-    def acknowledge(self, condition: str, who: str, role: AcknowledgeRole) -> str:
-        """Acknowledge a row that latches; return why that is refused, "" if it is accepted."""
+    def acknowledge(self, condition: str, who: str, role: AcknowledgeRole) -> str | None:
+        """Acknowledge a row that latches; return the reason of a refusal, None if accepted."""
         self._state, refusal = acknowledge(self._state, condition, who, role)
         return refusal

@@ -341,7 +341,7 @@ def _install(
 
 
 def _placed(path: Path, table: PlantLinkTable) -> PlantLinkTable:
-    """Return a table whose files stand beside the cluster's file."""
+    """Return a table of files in the folder of the cluster's file."""
     if table.authority is None:
         return table
     return table.model_copy(update={"authority": str(path.parent / table.authority)})

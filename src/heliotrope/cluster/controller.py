@@ -156,11 +156,6 @@ class Cluster:
         """Remaining time of the plant's lease, s; below 0: no plant leads it."""
         return self._watch.lease_left(self._clock.monotonic())
 
-    @property
-    def overruns(self) -> int:
-        """Rounds of polling that did not end within their second."""
-        return self._polling.overruns
-
     async def run(self) -> None:
         """Run until closed; then defocus, and end.
 
@@ -221,7 +216,7 @@ class Cluster:
                 alarm.cancel()
 
     async def _second(self) -> float:
-        """Do what is due once a second, and return when the next one begins."""
+        """Run the tasks of one second, and return when the next one begins."""
         begin = self._clock.monotonic()
         present = self._time.time()
         self._polling.begin_second()

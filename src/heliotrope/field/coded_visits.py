@@ -97,7 +97,7 @@ class CodedSettings:
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:
-        """Return what each number is, by its name here."""
+        """Return the metadata of each number, by attribute name."""
         found = {one.name: one.metadata.get("setting") for one in fields(cls)}
         return {name: setting for name, setting in found.items() if setting is not None}
 

@@ -1,7 +1,7 @@
 """An example plant of 18 heliostats, ours: finer gears and larger mirrors than the prototype.
 
 Six groups of three heliostats of 2.2 m², south of a tower at Stellenbosch with a target 13 m up.
-One of them stands where Malan calibrated his (30.8 m south, 19.2 m east, its pivot 1.2 m up).
+One of them is where Malan calibrated his (30.8 m south, 19.2 m east, its pivot 1.2 m up).
 His own machine is `stellenbosch.prototype`.
 """
 

@@ -23,7 +23,7 @@ class XmlElement:
     tag
         Name of the element.
     attributes
-        Names and values as they stand in the file, in order.
+        Names and values, in the order of the file.
     children
         Child elements, in order; comments and text are not kept.
     line

@@ -616,7 +616,7 @@ def write_image(image: Frame | Pixels, path: str | Path, *, quality: int = 95) -
 def encode_image(
     image: Frame | Pixels, suffix: str, quality: int = 95, name: str = "image"
 ) -> bytes:
-    """Return what `write_image` writes into a file of a suffix; ``name`` is for errors.
+    """Return the bytes of an image file, as `write_image` writes them; ``name`` is for errors.
 
     Raises
     ------

@@ -463,7 +463,7 @@ def _difference(
 
 
 def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
-    """Return the deviation of noise, from differences of nearby places, free of beams."""
+    """Return the standard deviation of the noise, from nearby pixels without beams."""
     import cv2
 
     d, level, gradient, _ = parts

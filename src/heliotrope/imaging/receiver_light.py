@@ -161,7 +161,7 @@ class ReceiverSight:
 
 @dataclass(frozen=True)
 class ReceiverReference:
-    """What a camera sees of a receiver at known flux.
+    """A camera's view of a receiver at known flux.
 
     Levels are linear, as shares of the full scale.
 

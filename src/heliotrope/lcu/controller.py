@@ -305,7 +305,7 @@ class Controller:
         return True
 
     def _mark(self) -> None:
-        """Note in the journal what must outlast a reset, if it has changed."""
+        """Write changes that must outlast a reset to the journal."""
         motion = self.motion
         if motion.kind not in (HOLD, DEFOCUS):
             motion.aside = None

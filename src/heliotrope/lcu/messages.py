@@ -144,8 +144,8 @@ MESSAGES = (
      "axis low high rate_steps_per_s acceleration_steps_per_s2 backlash", ""),
     # Angles by which the axes turn when defocused.
     (0x58, "SET_DEFOCUS", KEY, "ff", "primary_rad secondary_rad", ""),
-    # The safe way from stow: the axis (0 or 1) that moves first when leaving and last when
-    # returning, the number of points (0: the way is found without them), and the points
+    # The safe path from stow: the axis (0 or 1) that moves first when leaving and last when
+    # returning, the number of points (0: the path is found without them), and the points
     # that the beam passes on its way from the ground to the standby point, ENU.
     (0x59, "SET_WAY", KEY, "BB12f", "azimuth_axis points path_m", ""),
     # Microsteps of a full step of each motor, and whether the drivers rest (0, 1): then stepping is

@@ -218,7 +218,7 @@ class Stepper:
         self.queued_ms = 0
 
     def still(self) -> bool:
-        """Whether both axes stand at their goals and the hardware has played everything."""
+        """Whether both axes are at their goals and the hardware has sent all steps."""
         return self.queued_ms <= 0 and self.axes[0].still() and self.axes[1].still()
 
     def advance(self, elapsed_ms: int, out: list[tuple[int, ...]], kind: int) -> None:

@@ -1,4 +1,4 @@
-"""Frames of the wire, version 2: bytes in, frames out, and which of them may act.
+"""Frames of the wire, version 2: bytes in, frames out, and a gate for those that may act.
 
 A frame, before byte stuffing (numbers little-endian)::
 

@@ -118,7 +118,7 @@ class VirtualClock:
         return self._start + timedelta(seconds=self.monotonic() - self._begin + self._jumped)
 
     def advance(self, seconds: float) -> None:
-        """Let time pass; only for a clock without a source.
+        """Advance the time; only for a clock without a source.
 
         Raises
         ------
@@ -341,7 +341,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._ready.held.setdefault(program, [])
 
     def thaw(self, program: str) -> None:
-        """Let a program go on: everything that has become due runs at once, in any order."""
+        """Continue a program: everything overdue runs at once, in any order."""
         self._ready.extend(self._ready.held.pop(program, ()))
 
     def kill(self, program: str) -> None:

@@ -179,7 +179,7 @@ def refuse_others(path: Path) -> None:
 
 
 def fingerprint(key: bytes) -> str:
-    """Return a short name of a key that tells nothing about it."""
+    """Return a short name of a key that reveals nothing about it."""
     return hashlib.sha256(b"heliotrope key " + key).hexdigest()[:8]
 
 

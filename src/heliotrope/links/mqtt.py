@@ -197,7 +197,7 @@ class _MqttCarrier:
         return self._client
 
     async def ready(self) -> None:
-        """Return at once, unless the broker no longer confirms messages."""
+        """Return at once; fail if the broker no longer confirms messages."""
         self._connected()
         if self._unconfirmed >= _UNCONFIRMED:
             raise LinkLostError(f"the broker left {_UNCONFIRMED} messages unconfirmed")
@@ -281,7 +281,7 @@ def _refuse_socket(client: paho.Client, userdata: object, sock: "paho.SocketLike
 
 
 async def _discard(client: aiomqtt.Client) -> None:
-    """End what is left of a client.
+    """Close what remains of a client.
 
     aiomqtt leaves the socket, its callbacks and a task behind when it gives up waiting for the
     broker's answer or is cancelled meanwhile, and has no public way to end them.

@@ -1,6 +1,6 @@
 """Papers of a program: key files and certificates, taken while it runs when they are renewed.
 
-Files are looked at every two seconds, in a thread: a slow disk holds nothing up. What cannot be
+Files are checked every two seconds, in a thread, so a slow disk delays nothing. What cannot be
 used raises an alarm, and what was in force stays so. The ends of certificates are watched.
 """
 
@@ -50,7 +50,7 @@ class _Renewal:
 
 
 class _Certificate:
-    """A certificate whose end is watched."""
+    """A certificate whose expiry is watched."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

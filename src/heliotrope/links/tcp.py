@@ -318,7 +318,7 @@ class _Newcomers:
         self._pipes: dict[_Pipe, None] = {}
 
     def enter(self, pipe: _Pipe) -> None:
-        """Let a connection in; beyond the limits end the oldest of the busiest address."""
+        """Admit a connection; beyond the limits close the oldest of the busiest address."""
         self._pipes[pipe] = None
         counts = Counter(other.address for other in self._pipes)
         busiest = pipe.address

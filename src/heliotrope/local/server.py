@@ -38,7 +38,7 @@ _BUFFER = 1 << 16
 
 
 class Caller(Protocol):
-    """Who is at the other end."""
+    """The caller at the other end."""
 
     @property
     def reserved(self) -> bool:

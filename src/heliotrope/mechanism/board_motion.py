@@ -107,7 +107,7 @@ def end_down_the_path(
     place
         Points below each heliostat, (K,); 0: it does not go back.
     begin, defocus
-        Present angles, and angles by which the axes turn, rad, (K, 2).
+        Present angles, and the turns of the axes, rad, (K, 2).
 
     Returns
     -------

@@ -77,7 +77,7 @@ def of_mechanism(mechanism: Mechanism, *, zeros: bool = False) -> tuple[GuoParam
     Raises
     ------
     InputError
-        If the mechanism is of another kind, or has what the formula does not know: axes that
+        If the mechanism is of another kind, or has features outside the formula: axes that
         do not meet, a vertex beside the normal through that point, a foundation that is turned.
     """
     if mechanism.kind != "azimuth_elevation":

@@ -132,7 +132,7 @@ class Machine:
         Whether the beam may pass a receiver or a target at some hours of the year while the mirror
         is at stow: it is one sun. Keep-out volumes are never passed.
     tilt_sensor
-        Whether the mirror carries a sensor of its tilt, by which a diagnosis sees it follow.
+        Whether the mirror carries a tilt sensor, which shows a diagnosis that the mirror moves.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Light between the sun, the mirrors and what they shine on.
+"""Light between the sun, the mirrors and the surfaces that they light.
 
 - `beam`: the sun's angular radius, the width of a beam and its strength along its axis. Every other
   module takes these from there.

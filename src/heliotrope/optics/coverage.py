@@ -18,7 +18,7 @@ from heliotrope.jit import INLINED, OPTIONS
 
 @njit(**OPTIONS)
 def cover_edges(edges, area):
-    """Add to ``area`` (H, W + 1) what the edges (E, 4) of closed polygons contribute.
+    """Add the contributions of the edges (E, 4) of closed polygons to ``area`` (H, W + 1).
 
     By Green's theorem an edge bounds everything to its right. Its part in a row is split at the
     borders of cells. A part of height d whose mean place is the share m across its cell covers

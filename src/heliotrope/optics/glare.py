@@ -1,4 +1,4 @@
-"""Glare: what a look into heliostats' beams may do to an eye. For information only.
+"""Glare: the effect of heliostats' beams on an eye. For information only.
 
 The form is that of Ho, Ghanbari and Diver, "Methodology to assess potential glint and glare hazards
 from concentrating solar power plants", J. Sol. Energy Eng. 133 (2011) 031021. Their text has not

@@ -593,7 +593,7 @@ def _centroid(flux: FloatArray, origin: FloatArray, step: float) -> FloatArray:
 
 
 def _axes(reach: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return columns and rows of a grid about 0 with a sample there, m."""
+    """Return columns and rows of a grid that is centred on a sample at 0, m."""
     count = np.ceil(reach / step).astype(int)
     if count.max() > _LARGEST // 2:
         raise InputError(

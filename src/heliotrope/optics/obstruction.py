@@ -71,7 +71,7 @@ class Neighbours:
         return np.asarray(within.any(axis=1))
 
     def of(self, chosen: npt.NDArray[np.bool_]) -> "Neighbours":
-        """Return some of them, chosen (J,)."""
+        """Return the chosen neighbours, (J,)."""
         return Neighbours(
             self.center[chosen], self.normal[chosen], self.width[chosen], self.height[chosen]
         )

@@ -1,4 +1,4 @@
-"""Beams of mirrors that stand still: over all suns of the year, and all together in the air."""
+"""Beams of mirrors at rest: over all suns of the year, and all together in the air."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -111,7 +111,7 @@ def _enters(
 def standing_beams(
     vertex: FloatArray, normal: FloatArray, sun: FloatArray, mirrors: MirrorOptics, reach: float
 ) -> Beams:
-    """Return the beams of mirrors that stand still.
+    """Return the beams of mirrors at rest.
 
     Parameters
     ----------

@@ -358,7 +358,7 @@ class PlantAssembly:
         return dict(found.most_common()), seconds
 
     def left(self) -> str:
-        """Return which heliostats are not stowed, in words; "" if all are."""
+        """Return the heliostats that are not stowed, in words; empty if all are."""
         rows, now = self.plant.field, self.clock.monotonic()
         away = np.flatnonzero(~(rows.live(now) & at_stow(rows.rows)))
         if not len(away):

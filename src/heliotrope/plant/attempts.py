@@ -97,7 +97,7 @@ class Attempts:
     law
         See `RetryLaw`.
     tell
-        Called with each alarm; None: nobody is told.
+        Called with each alarm; None: there are no alarms.
     """
 
     def __init__(self, law: RetryLaw, tell: Callable[[Alarm], None] | None = None) -> None:
@@ -164,7 +164,7 @@ class Attempts:
         return one is None or now >= one.next_at
 
     def shown(self, now: float) -> tuple[Retry, ...]:
-        """Return what waits for another try or was given up, for people."""
+        """Return the tasks that wait for another try or were given up, for display."""
         law = self.law
         return tuple(
             Retry(

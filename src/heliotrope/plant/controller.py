@@ -98,7 +98,7 @@ _SLOW_BEAT = 1.0
 
 @dataclass(frozen=True)
 class Stores:
-    """What outlives a program of the plant.
+    """Stores that outlive a program of the plant.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class PlantController:
         with the emergencies that stand.
     movements, locks, stepping
         Aims that visits have moved, heliostats that they have locked, and fine steps that they
-        need; the plant gives back what they leave.
+        need; the plant gives back what a visit leaves behind.
 
     Raises
     ------
@@ -239,7 +239,7 @@ class PlantController:
         self._last_safe: tuple[tuple[str, Act, tuple[str, ...]], Ticket] | None = None
 
     def _doubting(self) -> tuple[DriveChecks, DoubtfulPositions]:
-        """Return what is known of drives, and what keeps heliostats in doubt off the receiver."""
+        """Return the parts that judge drives and keep doubtful heliostats off the receiver."""
         sensed = (name for name, each in self.beams.machines.items() if each.tilt_sensor)
         checks = DriveChecks(
             self.field, self._clusters, sensed, self.design.site, self.clock, self._tell
@@ -253,7 +253,7 @@ class PlantController:
         )
 
     def _ordering(self, audit: Audit, disk: Disk) -> PlantOrders:
-        """Return what follows accepted commands to their ends."""
+        """Return the part that follows accepted commands to their ends."""
         return PlantOrders(
             self.clock,
             self.authority,
@@ -266,7 +266,7 @@ class PlantController:
         )
 
     def _syncing(self) -> ParameterSync:
-        """Return what compares and writes the parameters of local controllers."""
+        """Return the part that compares and writes the parameters of local controllers."""
         return ParameterSync(
             self.field,
             self.wanted,
@@ -311,7 +311,7 @@ class PlantController:
         )
 
     def _guarding(self) -> Guards:
-        """Return what stops heliostats."""
+        """Return the guards that stop heliostats."""
         return Guards(
             self.field,
             self.authority,
@@ -356,7 +356,7 @@ class PlantController:
         )
 
     def _compared(self, points: Points) -> Agreement:
-        """Return what compares reports with the plant's own knowledge."""
+        """Return the part that compares reports with the plant's own knowledge."""
         return Agreement(
             self.field,
             self.ledger,
@@ -368,7 +368,7 @@ class PlantController:
         )
 
     def _directed(self) -> Commands:
-        """Return what gives people's commands."""
+        """Return the part that gives people's commands."""
         return Commands(
             self._orders,
             self._joining,
@@ -381,7 +381,7 @@ class PlantController:
         )
 
     def _dispatching(self) -> JoinDispatcher:
-        """Return what sends heliostats whose turn to join has come."""
+        """Return the part that sends heliostats whose turn to join has come."""
         return JoinDispatcher(
             self._joining,
             self._orders,
@@ -393,7 +393,7 @@ class PlantController:
         )
 
     def _returning(self) -> GivingBack:
-        """Return what gives back what visits have left."""
+        """Return the part that gives back what visits have left behind."""
         return GivingBack(
             self.field,
             self.authority,
@@ -514,7 +514,7 @@ class PlantController:
 
     @property
     def standby_unknown(self) -> npt.NDArray[np.bool_]:
-        """Which heliostats may have any standby point, (N,); see `Points.unknown`."""
+        """A mask of the heliostats that may have any standby point, (N,); see `Points.unknown`."""
         return self._proofs.points.unknown("STANDBY")
 
     @property
@@ -553,7 +553,7 @@ class PlantController:
         return self._safe(who, Act.STOW, heliostats)
 
     def locked_for(self, heliostat: str) -> str:
-        """Return why a heliostat that is LOCKED is so, since when and until when, in words."""
+        """Return the reason for a heliostat's LOCKED, since when and until when, in words."""
         mandate = self.authority.visited().get(heliostat)
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
         held = self.guards.reasons(Asked("UNLOCK", (heliostat,)), NOT_NOW)
@@ -705,7 +705,7 @@ class PlantController:
         self.note(person, "ACKNOWLEDGE", f"{condition} {subject}".strip())
 
     def note(self, person: Person, what: str, note: str) -> None:
-        """Record what a person did that moves nothing, in the audit."""
+        """Record an act of a person that moves nothing, in the audit."""
         self._orders.note(person.name, person.role.title, what, note)
 
     # -- commands --------------------------------------------------------------------------
@@ -847,12 +847,12 @@ class PlantController:
         with self.doubtful.unverified(heliostat), self._proofs.unverified(heliostat):
             yield
 
-    def misled(self, heliostat: str, point: FloatArray) -> str:
-        """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
+    def misled(self, heliostat: str, point: FloatArray) -> str | None:
+        """Return the reason, if any, why unverified parameters block a path to a point (3,)."""
         return self._proofs.misled(heliostat, point)
 
     def _unwritable(self, heliostat: str) -> str | None:
-        """Return why nothing may be written to a heliostat, None if it may."""
+        """Return the reason why nothing may be written to a heliostat, None if it may."""
         asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
         return self.guards.reasons(asked, *kinds).get(heliostat)
 
@@ -899,7 +899,7 @@ class PlantController:
 
 
 def _expected(settings: PlantSettings) -> str:
-    """Return the checksum that clusters should report; "" if the plant is told nothing."""
+    """Return the checksum that clusters should report, empty if it is not configured."""
     return "" if settings.common is None else settings_checksum(settings.common)
 
 

@@ -63,7 +63,7 @@ class Cameras(Protocol):
         ...
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return what a new photograph shows of a heliostat's beam on the target."""
+        """Return a heliostat's beam on the target in a new photograph."""
         ...
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:

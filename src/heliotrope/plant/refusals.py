@@ -114,7 +114,7 @@ HOLDER_OUTRANKS = Refusal(
 )
 REASON_MISSING = Refusal(
     "reason missing",
-    "A command that needs a reason in the audit is given without one.",
+    "A command that needs a reason for the audit was given without one.",
     "{what}: a reason is needed; give one",
     "Give a reason.",
 )
@@ -298,7 +298,7 @@ UNWITNESSED = Refusal(
     "the sun of plant and clusters; or to the receiver, and none of those required has agreed "
     "today.",
     "no independent witness confirms the sun of this plant: {problem}",
-    "Follow the alarm `sun_contradicted` or `unwitnessed`. What is up may go to targets.",
+    "Follow the alarm `sun_contradicted` or `unwitnessed`. Raised heliostats may go to targets.",
 )
 PARAMETERS_NOT_HERE = Refusal(
     "parameters not here",

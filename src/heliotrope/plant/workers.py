@@ -29,7 +29,7 @@ class Worker(Protocol):
     """A place for computations."""
 
     async def __call__(self, work: Callable[[*Given], T], *given: *Given) -> T:
-        """Return what a function returns.
+        """Return the result of a function.
 
         Parameters
         ----------
@@ -46,7 +46,7 @@ class Worker(Protocol):
 
 
 async def at_once(work: Callable[[*Given], T], *given: *Given) -> T:
-    """Return what a function returns, computed in the loop itself; see `Worker`."""
+    """Return the result of a function, computed in the loop itself; see `Worker`."""
     return work(*given)
 
 
@@ -69,7 +69,7 @@ class WorkerProcesses:
             self._pool.submit(load)
 
     async def __call__(self, work: Callable[[*Given], T], *given: *Given) -> T:
-        """Return what a function returns; see `Worker`."""
+        """Return the result of a function; see `Worker`."""
         used = self._pool
         try:
             return await asyncio.get_running_loop().run_in_executor(
@@ -85,7 +85,7 @@ class WorkerProcesses:
             ) from None
 
     def close(self) -> None:
-        """End the processes at once; what they compute is lost."""
+        """End the processes at once; their results are lost."""
         end(self._pool)
 
 
@@ -98,7 +98,7 @@ def _begin() -> None:
 
 
 def _computed(work: Callable[[*Given], T], *given: *Given) -> T:
-    """Return what a function returns; its errors are such as reach another process."""
+    """Return the result of a function, with errors that can be sent to another process."""
     try:
         return work(*given)
     except HeliotropeError as error:

@@ -286,7 +286,7 @@ LOCKOUT = AlarmKind(
     Severity.WARNING,
     "Sign-ins for one name or from one address have failed too often.",
     "sign-ins as {who} from {address} are refused after too many failures",
-    "Who is signed in goes on; the refusal ends by itself, after an hour at most.",
+    "Open sessions go on; the refusal ends by itself, after an hour at most.",
     "Ask that person; if nobody tried, find who uses that address, and read the security events.",
     over="no sign-in was refused for ten minutes",
 )

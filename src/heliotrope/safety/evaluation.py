@@ -365,8 +365,8 @@ def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) 
 
 def acknowledge(
     state: SafetyState, condition: str, who: str, role: AcknowledgeRole, subject: str = ""
-) -> tuple[SafetyState, str]:
-    """Return the state after a person's acknowledgement, and the reason of a refusal or "".
+) -> tuple[SafetyState, str | None]:
+    """Return the state after a person's acknowledgement, and the reason of a refusal or None.
 
     Parameters
     ----------
@@ -396,7 +396,7 @@ def acknowledge(
     released = replace(
         track, tripped_at=None, cleared=False, beyond_since=None, acknowledged_by=who.strip()
     )
-    return replace(state, tracks={**state.tracks, (condition, subject): released}), ""
+    return replace(state, tracks={**state.tracks, (condition, subject): released}), None
 
 
 def _remains(row: Condition, track: Track, now: float) -> str:

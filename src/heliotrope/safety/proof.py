@@ -26,7 +26,7 @@ FLUX_READING = "receiver_flux_nominal"
 
 
 class FluxProof(Enum):
-    """What a proof says about the flux on the receiver; the value is its text."""
+    """The statement of a proof about the flux on the receiver; the value is its text."""
 
     #: No sensor feeds it: the proof rests on what each heliostat reports.
     NOT_MEASURED = "flux on the receiver not measured"

@@ -97,7 +97,7 @@ def points(connection: Connection) -> dict[str, dict[str, tuple[float, ...]]]:
 
 
 def doubt_points(connection: Connection) -> None:
-    """Let no assigned point count as taken by its local controller.
+    """Mark all assigned points as not taken by their local controllers.
 
     A point before that is like the assigned one says so; see `plant.field.assigned`.
     """

@@ -192,7 +192,7 @@ def heads(connection: Connection) -> tuple[Head, Head]:
 
 @dataclass(frozen=True)
 class Verified:
-    """What a check has found.
+    """The result of a check.
 
     Attributes
     ----------

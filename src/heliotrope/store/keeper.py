@@ -36,7 +36,6 @@ from heliotrope.store.records import (
     LearningEntry,
     Lockout,
     Outlook,
-    PlannedVisit,
     StoreError,
     TimetableRecord,
     VisitEntry,
@@ -117,11 +116,6 @@ class Keeper:
     def refused_count(self) -> int:
         """Number of records that the database refused for their content."""
         return self.writer.refused_count
-
-    @property
-    def backlog(self) -> int:
-        """Number of records that wait to be written."""
-        return self.writer.backlog
 
     def close(self) -> None:
         """Write the records that wait, and close.
@@ -269,7 +263,7 @@ class Keeper:
         with self.database.reading() as connection:
             return calibration_history(connection, heliostat)
 
-    # -- measurements and their plan -----------------------------------------------------
+    # -- measurements -----------------------------------------------------
 
     def record(self, fact: Fact) -> None:
         """Record a fact; see `Records`."""
@@ -277,17 +271,6 @@ class Keeper:
         number = {"number": self._take_numbers(table)} if table in _NUMBERED else {}
         row = rows.row_of(table, fact, **number)
         self.writer.put(lambda c: write(c, table, [row]))
-
-    def record_plan(self, plan: Sequence[PlannedVisit]) -> None:
-        """Record the plan of the schedule; it replaces the plan before."""
-        in_order = enumerate(sorted(plan, key=lambda visit: visit.at))
-        made = [rows.row_of(tables.plan, visit, place=place) for place, visit in in_order]
-
-        def work(connection: Connection) -> None:
-            connection.execute(delete(tables.plan))
-            rows.insert(connection, tables.plan, made)
-
-        self.writer.put(work)
 
     def flights(self) -> list[FlightEntry]:
         """Return the flights, the first taken first."""
@@ -318,10 +301,6 @@ class Keeper:
         if heliostat:
             query = query.where(tables.visit.c.heliostat == heliostat)
         return self._records(VisitEntry, query)
-
-    def plan(self) -> list[PlannedVisit]:
-        """Return the recorded plan, the first due first."""
-        return self._records(PlannedVisit, select(tables.plan).order_by(tables.plan.c.place))
 
     def campaigns(self) -> list[CampaignEntry]:
         """Return the campaigns, the latest first."""

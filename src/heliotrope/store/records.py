@@ -127,7 +127,7 @@ class AlarmEntry:
 
 
 class Kind(StrEnum):
-    """What a person locks."""
+    """The kind of place that a person locks."""
 
     HELIOSTAT = "heliostat"
     TARGET = "target"
@@ -491,11 +491,6 @@ class Records(Protocol):
         """Number of records that were refused for their content."""
         ...
 
-    @property
-    def backlog(self) -> int:
-        """Number of records that wait to be written."""
-        ...
-
     def record_sightings(
         self,
         names: Sequence[str],
@@ -514,10 +509,6 @@ class Records(Protocol):
 
     def record(self, fact: Fact) -> None:
         """Record a fact; a campaign, a timetable or an outlook replaces the one of its key."""
-        ...
-
-    def record_plan(self, plan: Sequence[PlannedVisit]) -> None:
-        """Record the plan of the schedule; it replaces the plan before."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -596,10 +587,6 @@ class Records(Protocol):
 
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
         """Return the measurements, the latest first."""
-        ...
-
-    def plan(self) -> list[PlannedVisit]:
-        """Return the recorded plan, the first due first."""
         ...
 
     def campaigns(self) -> list[CampaignEntry]:

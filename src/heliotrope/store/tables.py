@@ -334,6 +334,7 @@ visit = Table(
     Index(None, "heliostat"),
 )
 
+#: Empty, since no version has written it: the next necessary migration may drop it.
 plan = Table(
     "plan",
     metadata,

@@ -1,11 +1,10 @@
 """One writing thread behind a bounded queue, with one commit for everything that waits.
 
-A caller puts a piece of work into the queue and continues. The thread takes everything that is
-there, runs it in one transaction, and only then tells the callers that wait for it. If the database
-fails (disk full, read-only, server gone) nothing is lost and the queue is kept: the thread tries
-again, and `Writer.problem` gives the reason. A piece of work that the database refuses for its own
-content (not for the state of the disk) is dropped, reported in `Writer.refused`, and holds up
-nothing else.
+A caller puts a piece of work into the queue and continues. The thread takes everything in the
+queue, runs it in one transaction, and only then answers the callers. If the database fails (disk
+full, read-only, server gone) nothing is lost and the queue is kept: the thread tries again, and
+`Writer.problem` gives the reason. A piece of work that the database refuses for its own content
+(not for the state of the disk) is dropped, reported in `Writer.refused`, and holds up nothing else.
 """
 
 import threading
@@ -198,7 +197,7 @@ class Writer:
         return self._hasty or self._closing or len(self._queue) >= MOST
 
     def _step(self) -> bool:
-        """Write everything that waits; return False if the database failed."""
+        """Write everything in the queue; return False if the database failed."""
         with self._attempt:
             while self._queue:
                 batch = [self._queue[i] for i in range(min(MOST, len(self._queue)))]

@@ -484,7 +484,7 @@ def _delta_t(seconds: FloatArray, site: Site) -> FloatArray:
 
 
 def check_site(site: object) -> None:
-    """Refuse what is not a `Site`.
+    """Refuse anything but a `Site`.
 
     Raises
     ------

@@ -370,7 +370,7 @@ class RenderedCamera:
         return self._known[name]
 
     async def _expose(self, name: str) -> tuple[Exposure, float]:
-        """Expose a frame: return what it shows, and when it was exposed, monotonic s."""
+        """Expose a frame: return the light, and when it was exposed, monotonic s."""
         at = await self._sight.exposure()
         scene = self._scenes[name]
         self.taken += 1

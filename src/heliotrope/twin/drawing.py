@@ -57,7 +57,7 @@ class Optics:
 
 @dataclass(frozen=True)
 class Exposure:
-    """All that a photograph shows.
+    """The complete contents of a photograph.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class Drawer:
         return answer
 
     def close(self) -> None:
-        """End the process at once; who waits for a photograph is refused it."""
+        """End the process at once; calls that wait for a photograph are refused."""
         if (process := self._process) is not None:
             process.kill()
         with self._mine:

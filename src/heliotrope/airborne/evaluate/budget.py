@@ -1,4 +1,4 @@
-r"""The error budget of an orientation: what averages over many points, and what they share.
+r"""The error budget of an orientation: its shared part, and the part that averages over points.
 
 An error of a point's lines of sight to lamp and camera turns its measured normal. With s and t the
 unit vectors from the mirror to the two, v their bisector, and δ the displacement of the mirror

@@ -87,7 +87,7 @@ class Outlines:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Which of M mirrors each pixel of a photograph shows, where mirrors overlap.
+    """The mirror, of M, that each pixel of a photograph shows where mirrors overlap.
 
     Attributes
     ----------
@@ -239,7 +239,7 @@ def _whole_patches(mask: npt.NDArray[np.uint8], expected: float) -> Patches:
 
 
 def sample(picture: Picture, places: FloatArray) -> FloatArray:
-    """Return the light at pixels (..., 2), bilinear, (..., 3); outside, that of the border."""
+    """Return the light at pixels (..., 2), bilinear, (..., 3); outside, the light of the border."""
     height, width = picture.shape[:2]
     x = np.clip(places[..., 0], 0.0, width - 1.001).ravel()
     y = np.clip(places[..., 1], 0.0, height - 1.001).ravel()
@@ -352,7 +352,7 @@ def _lines(
 
 
 def _crossings(lines: FloatArray) -> FloatArray:
-    """Return the intersection of each edge's line with that of the edge before it, (M, 4, 2)."""
+    """Return the intersection of each edge's line with the line of the edge before, (M, 4, 2)."""
     before = np.roll(lines, 1, axis=1)
     det = before[..., 0] * lines[..., 1] - before[..., 1] * lines[..., 0]
     det = np.where(np.abs(det) < 0.05, np.nan, det)

@@ -29,7 +29,7 @@ class SvgElement:
 
 @dataclass
 class Panel:
-    """Axes of a drawing: a frame with ticks, and what is drawn inside it.
+    """Axes of a drawing: a frame with ticks, and the drawing inside it.
 
     Attributes
     ----------

@@ -157,7 +157,7 @@ def _fit(
     *,
     free: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return L, A, x₀ and s of profiles (K, S), (K, 4), and what they leave, relative to A, (K, S).
+    """Return L, A, x₀ and s of profiles (K, S), (K, 4), and the residuals relative to A, (K, S).
 
     Gauss and Newton; s only where it is free.
     """

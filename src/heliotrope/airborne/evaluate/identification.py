@@ -52,7 +52,7 @@ _TURNS, _CANDIDATES, _ROUNDS = 17, 10, 6
 
 @dataclass(frozen=True)
 class Identified:
-    """Which mirrors a photograph shows.
+    """The mirrors in a photograph.
 
     Attributes
     ----------
@@ -328,7 +328,7 @@ class _Fit:
         return self.apart < _BAD_FIT and self.matched > _GOOD_SHARE
 
     def differs(self, other: "_Fit") -> bool:
-        """Return whether another solution names most mirrors otherwise."""
+        """Return whether another solution gives most mirrors other names."""
         pairs = [
             set(zip(f.solution.patch.tolist(), f.solution.mirror.tolist(), strict=True))
             for f in (self, other)

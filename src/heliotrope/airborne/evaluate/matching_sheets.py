@@ -1,7 +1,7 @@
 """Photographs with numbered outlines, from which a person names mirrors.
 
-Each picture shows what looks like a mirror, numbered, and where the recorded position and gimbal
-expect which heliostat. A table beside them has a row for each number, without a name.
+Each picture shows possible mirrors, numbered, and the heliostats where the recorded position and
+gimbal put them. A table beside them has a row for each number, without a name.
 """
 
 import csv

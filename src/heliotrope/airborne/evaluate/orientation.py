@@ -152,12 +152,12 @@ class Orientation:
 
     @property
     def azimuth(self) -> float:
-        """Of the normal, clockwise from north, rad."""
+        """Azimuth of the normal, clockwise from north, rad."""
         return float(azimuth_elevation(self.normal)[0])
 
     @property
     def elevation(self) -> float:
-        """Of the normal, rad."""
+        """Elevation of the normal, rad."""
         return float(azimuth_elevation(self.normal)[1])
 
     @property

@@ -12,8 +12,8 @@ _WIDTH, _HEIGHT, _STEP = 250.0, 210.0, 320.0
 def rtk_drawing(check: RtkCheck) -> str:
     """Return RTK less photogrammetry as SVG: a histogram of each axis, about its mean.
 
-    The curve is the normal distribution of the differences' standard deviation; the title has
-    that of RTK alone.
+    The curve is the normal distribution of the differences' standard deviation; the title gives the
+    standard deviation of RTK alone.
     """
     gap = 1e3 * (check.difference - check.difference.mean(axis=0))
     low, high = around(gap)

@@ -57,7 +57,7 @@ class MeasuredFlight:
         return orientation_rows(self.found, self.budget, flight, self.places)
 
     def label(self, o: Orientation) -> str:
-        """Return the name of an orientation's heliostat, with that of the flight if it has one."""
+        """Return the name of an orientation's heliostat, with the flight's name if it has one."""
         name = self.found.names[o.heliostat]
         return f"{self.name}/{name}" if self.name else name
 

@@ -1,4 +1,4 @@
-"""Airspace: where a drone may fly, and routes around what it must stay clear of.
+"""Airspace: where a drone may fly, and routes around obstacles.
 
 Distances and containment on the ground are computed by shapely; heights are clipped here.
 """

@@ -103,7 +103,7 @@ class HoverStation:
 
     @property
     def pitch(self) -> float:
-        """Of the gimbal, rad; −π/2 is straight down."""
+        """Pitch of the gimbal, rad; −π/2 is straight down."""
         return float(azimuth_elevation(-self.pattern.direction)[1])
 
 

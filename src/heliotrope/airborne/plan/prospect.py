@@ -16,7 +16,7 @@ from heliotrope.geometry import FloatArray, as_float, tangent_axes
 
 @dataclass(frozen=True)
 class Prospect:
-    """What the photographs of K patterns will show of n mirrors.
+    """The expected views of n mirrors in the photographs of K patterns.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Prospect:
     side: FloatArray
 
     def take(self, rows: npt.ArrayLike) -> "Prospect":
-        """Return some of the K."""
+        """Return the views of some patterns."""
         index = np.asarray(rows)
         return Prospect(self.reflections[index], self.side[index])
 

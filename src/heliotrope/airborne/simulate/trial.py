@@ -68,7 +68,7 @@ class TrialConditions:
 
 @dataclass(frozen=True)
 class TrialMirror:
-    """One mirror with its truth, and what the evaluation is given.
+    """One mirror with its truth, and the input of the evaluation.
 
     Attributes
     ----------

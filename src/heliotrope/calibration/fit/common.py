@@ -77,7 +77,7 @@ class CommonFit:
     information, pull
         What each heliostat's sightings reveal of the shared errors: its part of their inverse
         covariance, (N, K, K), and of the inverse covariance times the mean, (N, K).
-    seen
+    sightings
         The sightings without the errors that were found.
     """
 
@@ -88,7 +88,7 @@ class CommonFit:
     shared_covariance: FloatArray
     information: FloatArray
     pull: FloatArray
-    seen: Sightings
+    sightings: Sightings
 
 
 def fit_common(

@@ -61,7 +61,7 @@ class DriveTerm:
 def table_terms(joint: str, drive: int, knots: npt.ArrayLike, prior: float) -> list[DriveTerm]:
     """Return the terms of a look-up table: errors at knots, and straight lines between them.
 
-    Beyond the ends the error stays that of the end.
+    Beyond the ends the error is constant.
 
     Parameters
     ----------
@@ -104,8 +104,8 @@ class TermFit(Value, Framed):
         Covariance of the coefficients, (N, K, K).
     mechanism
         The nominal mechanisms with the parameters, but without the terms, (N,).
-    given
-        The heliostats as given; the terms are functions of the angles of their nominal drives.
+    original
+        The heliostats before the fit; the terms are functions of their nominal drives' angles.
     """
 
     fitted: FieldFit
@@ -113,7 +113,7 @@ class TermFit(Value, Framed):
     values: FloatArray
     covariance: FloatArray
     mechanism: Mechanism
-    given: Members
+    original: Members
 
     @property
     def sigma(self) -> FloatArray:
@@ -137,7 +137,7 @@ class TermFit(Value, Framed):
         return Labelled(
             row,
             {
-                "heliostat": self.given.names or np.arange(len(self.values)),
+                "heliostat": self.original.names or np.arange(len(self.values)),
                 "term": names,
                 "term_2": names,
             },
@@ -151,13 +151,13 @@ class TermFit(Value, Framed):
             {"terms": "rad over the unit of the term's function, if that has one"},
         )
 
-    def without_terms(self, seen: Sightings) -> Sightings:
+    def without_terms(self, sightings: Sightings) -> Sightings:
         """Return sightings with the counts at which ``mechanism`` stands as the terms move it."""
-        seen = self.given.rows_of(seen)
-        row = seen.heliostat
-        shapes = _shapes(self.terms, self.given.mechanism[row], seen.counts)
-        moved = _moved(self.mechanism[row], seen.counts, shapes, self.terms, self.values[row])
-        return replace(seen, counts=moved)
+        sightings = self.original.rows_of(sightings)
+        row = sightings.heliostat
+        shapes = _shapes(self.terms, self.original.mechanism[row], sightings.counts)
+        moved = _moved(self.mechanism[row], sightings.counts, shapes, self.terms, self.values[row])
+        return replace(sightings, counts=moved)
 
     def to_send(self, heliostat: npt.ArrayLike, counts: npt.ArrayLike) -> FloatArray:
         """Return the counts to send, (M, D), so that mechanism and terms together reach a pose.
@@ -173,7 +173,7 @@ class TermFit(Value, Framed):
         row = np.broadcast_to(np.asarray(heliostat, dtype=np.intp), goal.shape[:-1])
         mechanism, nominal, values = (
             self.mechanism[row],
-            self.given.mechanism[row],
+            self.original.mechanism[row],
             self.values[row],
         )
         sent = goal.copy()

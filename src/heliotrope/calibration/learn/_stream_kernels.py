@@ -21,7 +21,7 @@ ALIKE = 0.3
 
 @njit(**INNER)
 def propagate(mean, covariance, first, amplitude, tau, days):
-    """Let the processes of one hypothesis pass ``days``, in place."""
+    """Advance the processes of one hypothesis by ``days``, in place."""
     for c in range(amplitude.shape[0]):
         k = first + c
         decay = math.exp(-days / tau[c])

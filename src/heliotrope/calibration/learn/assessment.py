@@ -70,7 +70,7 @@ class HeliostatFigures:
 
     def document(self) -> dict[str, Any]:
         """Return the figures for JSON, in mrad."""
-        found: dict[str, Any] = {
+        figures: dict[str, Any] = {
             "n": self.count,
             "n_held_out": self.beam.count,
             "median_beam_mrad": 1e3 * self.beam.median,
@@ -86,11 +86,11 @@ class HeliostatFigures:
             "steps": self.steps,
         }
         if self.axes is not None:
-            found["gamma_0_mrad"] = 1e3 * float(self.axes.gamma_0)
-            found["sigma_gamma_mrad"] = 1e3 * float(self.axes.sigma_gamma)
-            found["alpha_0_mrad"] = 1e3 * float(self.axes.alpha_0)
-            found["sigma_alpha_mrad"] = 1e3 * float(self.axes.sigma_alpha)
-        return found
+            figures["gamma_0_mrad"] = 1e3 * float(self.axes.gamma_0)
+            figures["sigma_gamma_mrad"] = 1e3 * float(self.axes.sigma_gamma)
+            figures["alpha_0_mrad"] = 1e3 * float(self.axes.alpha_0)
+            figures["sigma_alpha_mrad"] = 1e3 * float(self.axes.sigma_alpha)
+        return figures
 
 
 @dataclass(frozen=True)
@@ -135,14 +135,20 @@ class Assessment(Framed):
 
     def _labelled(self) -> Labelled:
         row = ("heliostat",)
-        each = [h.document() for h in self.heliostats]
+        documents = [h.document() for h in self.heliostats]
         units = {"mrad": "mrad"}
-        names = [n for n in (each[0] if each else {}) if all(n in one for one in each)]
+        names = [
+            n
+            for n in (documents[0] if documents else {})
+            if all(n in document for document in documents)
+        ]
         return Labelled(
             row,
             {"heliostat": [h.name for h in self.heliostats]},
             {
-                n: Variable(row, np.array([one[n] for one in each]), units.get(n[-4:], ""))
+                n: Variable(
+                    row, np.array([document[n] for document in documents]), units.get(n[-4:], "")
+                )
                 for n in names
             },
         )
@@ -172,7 +178,7 @@ BLUNDER = 5.3
 def assess(
     names: tuple[str, ...],
     learned: Learned,
-    found: Prediction | None = None,
+    prediction: Prediction | None = None,
     tested: npt.NDArray[np.bool_] | None = None,
 ) -> Assessment:
     """Return the errors of the sightings that were not used in learning.
@@ -183,39 +189,39 @@ def assess(
         Names of the N heliostats.
     learned
         Learnt from a part of its sightings.
-    found
-        Prediction of the tested ones, in their order, if it was made in another way.
+    prediction
+        Prediction of the tested ones, in their order, if it is known already.
     tested
         Mask of the sightings to test on, (M,); default: all that were not used.
     """
     rows = np.flatnonzero(~learned.used if tested is None else tested)
-    seen = learned.sightings.take(rows)
-    if found is None:
-        found = predict(learned, seen)
-    fits = ~np.isin(seen.heliostat, [misfit.row for misfit in learned.misfits])
-    beyond = rows[fits & ~found.usable]
-    found = replace(found, usable=found.usable & fits)
+    sightings = learned.sightings.take(rows)
+    if prediction is None:
+        prediction = predict(learned, sightings)
+    fits = ~np.isin(sightings.heliostat, [misfit.row for misfit in learned.misfits])
+    beyond = rows[fits & ~prediction.usable]
+    prediction = replace(prediction, usable=prediction.usable & fits)
     counts = np.bincount(learned.sightings.heliostat, minlength=len(names))
     figures = [
-        _one(
+        _figures_of(
             names[i],
             int(i),
             int(counts[i]),
             learned,
-            found,
-            np.flatnonzero((seen.heliostat == i) & found.usable),
-            seen,
+            prediction,
+            np.flatnonzero((sightings.heliostat == i) & prediction.usable),
+            sightings,
         )
         for i in np.flatnonzero(counts)
     ]
     judged = [h for h in figures if h.beam.count]
     fewest = ENOUGH if any(h.count >= ENOUGH for h in judged) else 0
     enough = [h for h in judged if h.count >= fewest]
-    inside = found.usable & np.isin(seen.heliostat, [names.index(h.name) for h in enough])
-    far = squared_distance(found.plane, found.covariance) > BLUNDER**2
-    strange = inside & far & (found.errors.beam > ELSEWHERE)
+    inside = prediction.usable & np.isin(sightings.heliostat, [names.index(h.name) for h in enough])
+    far = squared_distance(prediction.plane, prediction.covariance) > BLUNDER**2
+    unexplained = inside & far & (prediction.errors.beam > ELSEWHERE)
     means = [
-        found.errors.beam[(seen.heliostat == names.index(h.name)) & inside & ~strange]
+        prediction.errors.beam[(sightings.heliostat == names.index(h.name)) & inside & ~unexplained]
         for h in enough
     ]
     means = [m for m in means if len(m)]
@@ -225,42 +231,44 @@ def assess(
         tuple(figures),
         float(np.median([h.beam.median for h in enough])) if enough else np.nan,
         float(np.mean([h.mean for h in enough])) if enough else np.nan,
-        float(found.inside[inside].mean()) if inside.any() else np.nan,
-        summarise(found.errors.beam[inside]),
+        float(prediction.inside[inside].mean()) if inside.any() else np.nan,
+        summarise(prediction.errors.beam[inside]),
         fewest,
         int(far[inside].sum()),
-        rows[strange],
+        rows[unexplained],
         float(np.mean([m.mean() for m in means])) if means else np.nan,
         np.flatnonzero(unusable),
     )
 
 
-def _one(
+def _figures_of(
     name: str,
     i: int,
     count: int,
     learned: Learned,
-    found: Prediction,
+    prediction: Prediction,
     rows: npt.NDArray[np.intp],
-    seen: Sightings,
+    sightings: Sightings,
 ) -> HeliostatFigures:
     mine = learned.sightings.heliostat == i
-    beam = found.errors.beam[rows]
+    beam = prediction.errors.beam[rows]
     return HeliostatFigures(
         name=name,
         count=count,
         beam=summarise(beam),
-        normal=summarise(found.errors.normal[rows]),
+        normal=summarise(prediction.errors.normal[rows]),
         mean=float(beam.mean()) if len(rows) else np.nan,
-        coverage=float(found.inside[rows].mean()) if len(rows) else np.nan,
-        axes=_axes(learned, found.values[rows], seen.take(rows)) if len(rows) > 1 else None,
+        coverage=float(prediction.inside[rows].mean()) if len(rows) else np.nan,
+        axes=_axes(learned, prediction.values[rows], sightings.take(rows))
+        if len(rows) > 1
+        else None,
         outliers=int(learned.outlier[mine].sum()),
         regimes=len(np.unique(learned.regime[mine & (learned.regime >= 0)])),
         steps=len(learned.members[i].data.steps),
     )
 
 
-def _axes(learned: Learned, values: FloatArray, seen: Sightings) -> AxisAccuracy | None:
+def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAccuracy | None:
     """Return the zeros before the fit and the scatter after it, of held-out sightings.
 
     Guo's γ', α' are the drives' angles: those of the nominal drives for the zeros, (44) and
@@ -268,23 +276,27 @@ def _axes(learned: Learned, values: FloatArray, seen: Sightings) -> AxisAccuracy
     learnt drives for the scatter, (45) and (47). His γ, α, (43), are the angles at which the
     learnt mechanism sends the source to the destination that was seen.
     """
-    learnt = moved_by(learned.mechanism, seen.heliostat, learned.names, values)
-    vertex = learnt.pose(seen.counts).vertex
-    source, way = ray_directions(seen, vertex)
-    aim = np.where(seen.destination_at_infinity[:, None], vertex + FAR * way, seen.destination)
-    solved = track(learnt, source, aim, current=seen.counts)
+    learned_mirrors = moved_by(learned.mechanism, sightings.heliostat, learned.names, values)
+    vertex = learned_mirrors.pose(sightings.counts).vertex
+    source, destination = ray_directions(sightings, vertex)
+    aim = np.where(
+        sightings.destination_at_infinity[:, None],
+        vertex + FAR * destination,
+        sightings.destination,
+    )
+    solved = track(learned_mirrors, source, aim, current=sightings.counts)
     good = solved.reachable
-    driven = [learnt.joints[j] for j in learnt.driven]
+    driven = [learned_mirrors.joints[j] for j in learned_mirrors.driven]
     if good.sum() < 2 or len(driven) != 2:
         return None
     gamma = driven.index("azimuth") if "azimuth" in driven else 0
     alpha = 1 - gamma
     computed = solved.best_angles[good]
-    found = []
-    for mechanism in (learned.mechanism[seen.heliostat], learnt):
-        angles = mechanism.drives.angles(seen.counts)[good]
+    accuracies = []
+    for mechanism in (learned.mechanism[sightings.heliostat], learned_mirrors):
+        angles = mechanism.drives.angles(sightings.counts)[good]
         try:
-            found.append(
+            accuracies.append(
                 axis_accuracy(
                     angles[:, alpha], angles[:, gamma], computed[:, alpha], computed[:, gamma]
                 )
@@ -292,7 +304,7 @@ def _axes(learned: Learned, values: FloatArray, seen: Sightings) -> AxisAccuracy
         except InputError:
             # A mistaken sighting may lie over the top; its axes say nothing.
             return None
-    before, after = found
+    before, after = accuracies
     return replace(after, gamma_0=before.gamma_0, alpha_0=before.alpha_0)
 
 
@@ -323,9 +335,9 @@ def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, 
         white = np.linalg.norm(member.left_out()[1], axis=1)
         far = int((white * learned.sightings.sigma[kept] > ELSEWHERE).sum())
         beyond, count = int((learned.unusable & mine).sum()), int(mine.sum())
-        strange = far + int((elsewhere & mine).sum())
-        if count >= FEWEST and beyond + strange >= max(2, SHARE * count):
-            lines.append(f"{name}: {_reason(beyond, strange, count)}")
+        unexplained = far + int((elsewhere & mine).sum())
+        if count >= FEWEST and beyond + unexplained >= max(2, SHARE * count):
+            lines.append(f"{name}: {_reason(beyond, unexplained, count)}")
         if len(white) >= FEWEST and np.median(white) > SCATTERED:
             lines.append(f"{name}: {_scatter(white, learned.sightings.sigma[kept])}")
         strain = np.abs(learned.static.values[i] / learned.static.prior[i])
@@ -352,19 +364,19 @@ def _scatter(white: FloatArray, sigma: FloatArray) -> str:
     )
 
 
-def _reason(beyond: int, strange: int, count: int) -> str:
-    if beyond > strange:
+def _reason(beyond: int, unexplained: int, count: int) -> str:
+    if beyond > unexplained:
         return (
             f"{beyond} of {count} sightings have counts beyond the reach of its drives. Probably "
             "the counts were recorded wrongly, or the properties of its drives are wrong."
         )
-    if strange > NOTHING * count:
+    if unexplained > NOTHING * count:
         return (
-            f"{strange} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
-            "others put them; no parameters explain them together. Probably the counts were "
+            f"{unexplained} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where "
+            "the others put them; no parameters explain them together. Probably the counts were "
             "recorded wrongly."
         )
     return (
-        f"{strange} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
+        f"{unexplained} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
         "others, which agree, put them. Probably these photographs show another mirror's beam."
     )

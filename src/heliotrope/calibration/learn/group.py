@@ -1,8 +1,8 @@
 """Hyperparameters of a group of mirrors, learnt at night from the photographs of a running plant.
 
-The learning itself is step 3 of `learning`, as in ``heliotrope evaluate``. Around it stands what a
-plant needs that nobody watches: few enough sightings for a night, and the question whether the
-photographs were foretold better so. What was learnt serves each mirror's model (`applied`).
+The learning itself is step 3 of `learning`, as in ``heliotrope evaluate``. Around it is what an
+unattended plant needs: few enough sightings for a night, and a check that the new values would have
+predicted the photographs better. What was learnt serves each mirror's model (`applied`).
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ APART = 3600.0
 
 @dataclass(frozen=True)
 class GroupHistory:
-    """All that a group of mirrors has shown.
+    """All measurements of a group of mirrors.
 
     Attributes
     ----------

@@ -224,7 +224,7 @@ class Learned(Value, Framed):
         steered: Mechanism | None = None,
         sigma: float | None = None,
     ) -> Forecast:
-        """Return where a heliostat is expected to throw its beam, and how surely.
+        """Return the expected place of a heliostat's beam, with its uncertainty.
 
         Parameters
         ----------

@@ -101,20 +101,20 @@ def find_misfits(
     targets
         Targets of the plant; without them mirrored photographs are not looked for.
     """
-    given = sightings if used is None else sightings.take(used)
+    judged = sightings if used is None else sightings.take(used)
     names = parameter_table.model("full", mechanism.parameters)
-    usable = is_usable(linearise(mechanism[given.heliostat], given, names))
-    seen = given.take(usable)
-    found = list(_unmoved(mechanism, seen))
-    found += _of_photographs(mechanism, _without(seen, found), names, targets)
-    moved = _without(seen, found)
+    usable = is_usable(linearise(mechanism[judged.heliostat], judged, names))
+    within_reach = judged.take(usable)
+    misfits = list(_unmoved(mechanism, within_reach))
+    misfits += _of_photographs(mechanism, _without(within_reach, misfits), names, targets)
+    moved = _without(within_reach, misfits)
     fitted = fit(mechanism, moved, names, adapt_scale=False)
     error = _median_errors(mechanism, moved, fitted)
     # Counts beyond the reach of its drives are named as such, unless a mistake explains them.
-    for row in np.setdiff1d(given.heliostat, seen.heliostat):
-        reason = _mistake(mechanism, given.take(given.heliostat == row), int(row), names)
+    for row in np.setdiff1d(judged.heliostat, within_reach.heliostat):
+        reason = _mistake(mechanism, judged.take(judged.heliostat == row), int(row), names)
         if reason is not None:
-            found.append(Misfit(int(row), FitOutcome.MISFIT, reason))
+            misfits.append(Misfit(int(row), FitOutcome.MISFIT, reason))
     for row in np.flatnonzero(fitted.count):
         outcome = FitOutcome(int(fitted.outcome[row]))
         strain = float(((fitted.values[row] / fitted.prior[row]) ** 2).sum())
@@ -124,13 +124,13 @@ def find_misfits(
             and error[row] < ELSEWHERE
         ):
             continue
-        one = moved.take(moved.heliostat == row)
-        reason = _mistake(mechanism, one, int(row), names)
+        mine = moved.take(moved.heliostat == row)
+        reason = _mistake(mechanism, mine, int(row), names)
         if reason is None:
-            reason = _hopeless(mechanism, one, outcome, strain, float(error[row]))
+            reason = _hopeless(mechanism, mine, outcome, strain, float(error[row]))
         if reason is not None:
-            found.append(Misfit(int(row), FitOutcome.MISFIT, reason))
-    return tuple(sorted(found, key=lambda misfit: misfit.row))
+            misfits.append(Misfit(int(row), FitOutcome.MISFIT, reason))
+    return tuple(sorted(misfits, key=lambda misfit: misfit.row))
 
 
 def scattered(row: int, white: FloatArray, sigma: FloatArray) -> Misfit | None:
@@ -168,28 +168,31 @@ def costs(fitted: FieldFit, mechanism: Mechanism) -> FloatArray:
     return np.asarray(np.where(broken & (fitted.count > 0), np.inf, cost))
 
 
-def _without(seen: Sightings, misfits: Sequence[Misfit]) -> Sightings:
-    return seen.take(~np.isin(seen.heliostat, [misfit.row for misfit in misfits]))
+def _without(sightings: Sightings, misfits: Sequence[Misfit]) -> Sightings:
+    return sightings.take(~np.isin(sightings.heliostat, [misfit.row for misfit in misfits]))
 
 
-def _is_better(cost: float, given: float) -> bool:
+def _is_better(cost: float, unchanged: float) -> bool:
     """Return whether sightings that are read otherwise fit far better than as they are given."""
-    return cost < given - GAIN and cost < SHARE * given
+    return cost < unchanged - GAIN and cost < SHARE * unchanged
 
 
 def _of_photographs(
-    mechanism: Mechanism, seen: Sightings, names: tuple[str, ...], targets: Sequence[Target]
+    mechanism: Mechanism, sightings: Sightings, names: tuple[str, ...], targets: Sequence[Target]
 ) -> Iterator[Misfit]:
     """Yield all mirrors with a beam on a target, if their photographs are mirrored or turned."""
-    on = [target.holds(seen.destination) & ~seen.destination_at_infinity for target in targets]
-    shown = seen.take(np.any(on, axis=0)) if targets else seen.take([])
+    on = [
+        target.holds(sightings.destination) & ~sightings.destination_at_infinity
+        for target in targets
+    ]
+    shown = sightings.take(np.any(on, axis=0)) if targets else sightings.take([])
     counts = np.bincount(shown.heliostat, minlength=len(mechanism))
     chosen = np.argsort(-counts, kind="stable")[:MIRRORS]
     chosen = chosen[counts[chosen] >= FEW]
     if not len(chosen):
         return
     parts = [_some(shown.take(shown.heliostat == row), MOST) for row in chosen]
-    part = join([one.renumbered(np.full(len(one), k)) for k, one in enumerate(parts)])
+    part = join([mine.renumbered(np.full(len(mine), k)) for k, mine in enumerate(parts)])
     machines = mechanism[chosen]
 
     def read(sign: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
@@ -197,20 +200,20 @@ def _of_photographs(
         fitted = fit(machines, other, names, adapt_scale=False)
         return costs(fitted, machines), _median_errors(machines, other, fitted)
 
-    given, error = read((1.0, 1.0))
+    unchanged, error = read((1.0, 1.0))
     # A mirror that fits in no manner says nothing about the photographs of the others.
-    good = np.isfinite(given)
+    good = np.isfinite(unchanged)
     trials = {text: read(sign) for text, sign in PHOTOGRAPHS}
     best = min(trials, key=lambda text: float(trials[text][0][good].sum()))
-    cost, left = trials[best]
-    most = 2 * int((cost < given)[good].sum()) > len(given)
-    if not (most and _is_better(float(cost[good].sum()), float(given[good].sum()))):
+    cost, errors = trials[best]
+    most = 2 * int((cost < unchanged)[good].sum()) > len(unchanged)
+    if not (most and _is_better(float(cost[good].sum()), float(unchanged[good].sum()))):
         return
-    if np.median(left) > ELSEWHERE:
+    if np.median(errors) > ELSEWHERE:
         return
     text = (
         f"the photographs of the targets seem {best}: read like that, the sightings of "
-        f"{amount(len(chosen), 'heliostat')} fit to {1e3 * np.median(left):.2f} mrad of beam "
+        f"{amount(len(chosen), 'heliostat')} fit to {1e3 * np.median(errors):.2f} mrad of beam "
         f"instead of {1e3 * np.median(error):.2f}; correct the camera or what stores its frames"
     )
     for row in np.flatnonzero(counts):
@@ -221,26 +224,26 @@ def _reflected(
     points: FloatArray, targets: Sequence[Target], sign: tuple[float, float]
 ) -> FloatArray:
     """Return points with their places right of and above the middle of their target reflected."""
-    moved, left = points.copy(), np.ones(len(points), np.bool_)
+    moved, unassigned = points.copy(), np.ones(len(points), np.bool_)
     for target in targets:
-        on = left & target.holds(points)
-        left &= ~on
+        on = unassigned & target.holds(points)
+        unassigned &= ~on
         moved[on] += (target.plane_coordinates(points[on]) * (np.array(sign) - 1.0)) @ target.axes
     return moved
 
 
-def _some(seen: Sightings, most: int) -> Sightings:
-    """Return at most so many sightings, spread over all."""
-    places = np.linspace(0, len(seen) - 1, min(most, len(seen))).round().astype(np.intp)
-    return seen.take(np.unique(places))
+def _some(sightings: Sightings, most: int) -> Sightings:
+    """Return at most ``most`` sightings, spread over all."""
+    places = np.linspace(0, len(sightings) - 1, min(most, len(sightings))).round().astype(np.intp)
+    return sightings.take(np.unique(places))
 
 
-def _unmoved(mechanism: Mechanism, seen: Sightings) -> Iterator[Misfit]:
-    pose = mechanism[seen.heliostat].pose(seen.counts)
-    wanted = bisector(*ray_directions(seen, pose.vertex))
-    for row in np.unique(seen.heliostat):
-        mine = np.flatnonzero(seen.heliostat == row)
-        if _span(pose.normal[mine]) < STILL and _span(wanted[mine]) > TURNED:
+def _unmoved(mechanism: Mechanism, sightings: Sightings) -> Iterator[Misfit]:
+    pose = mechanism[sightings.heliostat].pose(sightings.counts)
+    bisectors = bisector(*ray_directions(sightings, pose.vertex))
+    for row in np.unique(sightings.heliostat):
+        mine = np.flatnonzero(sightings.heliostat == row)
+        if _span(pose.normal[mine]) < STILL and _span(bisectors[mine]) > TURNED:
             yield Misfit(
                 int(row),
                 FitOutcome.UNMOVED,
@@ -254,60 +257,60 @@ def _span(directions: FloatArray) -> float:
     return float(angle_between(directions, directions[:1]).max(initial=0.0))
 
 
-def _median_errors(mechanism: Mechanism, seen: Sightings, fitted: FieldFit) -> FloatArray:
-    beam = beam_errors(mechanism.with_parameters(fitted.parameters), seen).beam
-    found = np.zeros(len(mechanism))
+def _median_errors(mechanism: Mechanism, sightings: Sightings, fitted: FieldFit) -> FloatArray:
+    beam = beam_errors(mechanism.with_parameters(fitted.parameters), sightings).beam
+    errors = np.zeros(len(mechanism))
     for row in np.flatnonzero(fitted.count):
-        found[row] = np.median(beam[seen.heliostat == row])
-    return found
+        errors[row] = np.median(beam[sightings.heliostat == row])
+    return errors
 
 
 def _hopeless(
-    mechanism: Mechanism, one: Sightings, outcome: FitOutcome, strain: float, error: float
+    mechanism: Mechanism, mine: Sightings, outcome: FitOutcome, strain: float, error: float
 ) -> str | None:
-    """Return why the fit of a mirror cannot hold, though no mistake explains it; None if it can."""
+    """Return the reason why the fit of a mirror cannot hold without a mistake, None if it can."""
     still = [
         mechanism.joints[joint]
         for d, joint in enumerate(mechanism.driven)
-        if len(one) > 1 and np.ptp(one.counts[:, d]) == 0.0
+        if len(mine) > 1 and np.ptp(mine.counts[:, d]) == 0.0
     ]
     broken = outcome not in (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED)
     if broken or error > HOPELESS:
         if still:
             return f"the counts of {' and '.join(still)} did not change; check motor and log"
-        left = "" if broken else f", the best leave {1e3 * error:.0f} mrad of beam"
+        remainder = "" if broken else f", the best leave {1e3 * error:.0f} mrad of beam"
         return (
-            f"no plausible parameters explain its {amount(len(one), 'sighting')}{left}; check the "
-            "counts, the heliostat's name and its entry in the plant file"
+            f"no plausible parameters explain its {amount(len(mine), 'sighting')}{remainder}; "
+            "check the counts, the heliostat's name and its entry in the plant file"
         )
-    if len(one) < WITNESSES and strain > DOUBTFUL:
+    if len(mine) < WITNESSES and strain > DOUBTFUL:
         return (
-            f"{amount(len(one), 'sighting')} would need parameters {np.sqrt(strain):.0f} standard "
+            f"{amount(len(mine), 'sighting')} would need parameters {np.sqrt(strain):.0f} standard "
             f"deviations from the nominal ones; make at least {WITNESSES}"
         )
     return None
 
 
-def _mistake(mechanism: Mechanism, one: Sightings, row: int, names: tuple[str, ...]) -> str | None:
+def _mistake(mechanism: Mechanism, mine: Sightings, row: int, names: tuple[str, ...]) -> str | None:
     """Return the mistake that explains the sightings of a mirror, None if there is none."""
-    part = _some(one, MOST)
+    part = _some(mine, MOST)
     trials = [*_hypotheses(mechanism, part, row), *_scaled(mechanism, part, row)]
     machines = mechanism[np.array([trial.row for trial in trials])]
-    parts = [trial.seen.renumbered(np.full(len(part), k)) for k, trial in enumerate(trials)]
-    seen = join(parts)
+    parts = [trial.sightings.renumbered(np.full(len(part), k)) for k, trial in enumerate(trials)]
+    sightings = join(parts)
     priors = {
         name: np.where([name in t.factors for t in trials], LOOSE, mechanism.parameter(name).prior)
         for name in {name for trial in trials for name in trial.factors}
     }
-    fitted = fit(machines, seen, names, priors=priors, adapt_scale=False)
-    error, each = _median_errors(machines, seen, fitted), costs(fitted, machines)
+    fitted = fit(machines, sightings, names, priors=priors, adapt_scale=False)
+    error, trial_costs = _median_errors(machines, sightings, fitted), costs(fitted, machines)
     # The first trial is the sightings as they are given. A mistake explains them no worse: a zero
     # that is far off strains the priors too, but leaves smaller errors than another mirror does.
     least = 2.0 * float(np.median(part.sigma))
     enough = np.clip(np.nan_to_num(ALIKE * error[0], nan=np.inf), least, ELSEWHERE)
-    each = np.where(error <= enough, each, np.inf)
-    given, best = costs(fitted, machines)[0], int(np.argmin(each))
-    if best == 0 or not _is_better(each[best], given):
+    trial_costs = np.where(error <= enough, trial_costs, np.inf)
+    unchanged, best = costs(fitted, machines)[0], int(np.argmin(trial_costs))
+    if best == 0 or not _is_better(trial_costs[best], unchanged):
         return None
     ratios = [
         1.0 / (factor * (1.0 + fitted.parameters[name][best]))
@@ -315,7 +318,7 @@ def _mistake(mechanism: Mechanism, one: Sightings, row: int, names: tuple[str, .
     ]
     text = trials[best].text.format(" and ".join(dict.fromkeys(f"{r:.2f}" for r in ratios)))
     return (
-        f"{text}; read like that, its {amount(len(one), 'sighting')} fit to "
+        f"{text}; read like that, its {amount(len(mine), 'sighting')} fit to "
         f"{1e3 * error[best]:.2f} mrad of beam"
     )
 
@@ -330,7 +333,7 @@ class _Trial:
         A clause for people.
     row
         Row of the mechanism.
-    seen
+    sightings
         The sightings without the mistake.
     factors
         Factors of the counts by the parameters that refine them, whose prior is wide; ``text`` has
@@ -339,7 +342,7 @@ class _Trial:
 
     text: str
     row: int
-    seen: Sightings
+    sightings: Sightings
     factors: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -347,12 +350,12 @@ def _scaled(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]
     """Yield the factors of the counts that the rays ask of the nominal drives."""
     if len(mechanism.driven) != 2 or len(part) < FEW:
         return
-    one = mechanism[row]
-    source, way = ray_directions(part, one.pose(part.counts).vertex)
+    mirror = mechanism[row]
+    source, destination = ray_directions(part, mirror.pose(part.counts).vertex)
     far = part.destination_at_infinity[:, None]
-    vertex = one.pose(part.counts).vertex
-    aim = np.where(far, vertex + 1e6 * way, part.destination)
-    solved = track(one.armature, source, aim)
+    vertex = mirror.pose(part.counts).vertex
+    aim = np.where(far, vertex + 1e6 * destination, part.destination)
+    solved = track(mirror.armature, source, aim)
     joints = [mechanism.joints[joint] for joint in mechanism.driven]
     for branch in (0, 1):
         factors = [
@@ -380,11 +383,11 @@ def _scaled(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]
 def _factor(drive: Drive, counts: FloatArray, angles: FloatArray) -> float:
     """Return the factor that makes counts run as the angles ask; 1 if there is none."""
     order = np.argsort(counts, kind="stable")
-    wanted, given = drive.counts(np.unwrap(angles[order])), counts[order]
+    expected, recorded = drive.counts(np.unwrap(angles[order])), counts[order]
     half = len(order) // 2
-    steps = given[half:] - given[: len(given) - half]
+    steps = recorded[half:] - recorded[: len(recorded) - half]
     able = steps > 0.0
-    slopes = (wanted[half:] - wanted[: len(given) - half])[able] / steps[able]
+    slopes = (expected[half:] - expected[: len(recorded) - half])[able] / steps[able]
     slopes = slopes[np.isfinite(slopes) & (slopes > 0.0)]
     return float(np.median(slopes)) if len(slopes) else 1.0
 
@@ -447,9 +450,9 @@ def _likely(mechanism: Mechanism, part: Sightings, row: int) -> list[int]:
     some = _some(part, FEW)
     count = len(some)
     every = np.repeat(np.arange(len(mechanism)), count)
-    seen = some.take(np.tile(np.arange(count), len(mechanism)))
-    pose = mechanism[every].pose(seen.counts)
-    miss = angle_between(pose.normal, bisector(*ray_directions(seen, pose.vertex)))
+    sightings = some.take(np.tile(np.arange(count), len(mechanism)))
+    pose = mechanism[every].pose(sightings.counts)
+    miss = angle_between(pose.normal, bisector(*ray_directions(sightings, pose.vertex)))
     middle = np.median(miss.reshape(-1, count), axis=1)
     middle[row] = np.inf
     return [int(k) for k in np.argsort(middle)[:OTHERS] if np.isfinite(middle[k])]

@@ -318,7 +318,7 @@ def _visit_means(time: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def _without(member: _Member, drive: int, ratio: float) -> _Member:
-    """Let a wave that was found float with the constants."""
+    """Project a wave that was found out of the residuals, as the constants are."""
     basis, _ = np.linalg.qr(member.waves(drive, np.array([ratio]))[0])
     out = np.eye(len(basis)) - basis @ basis.T
     return replace(

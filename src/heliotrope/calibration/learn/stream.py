@@ -93,7 +93,7 @@ def layout_of(hyper: Hyperparameters) -> Layout:
 
 @dataclass(frozen=True)
 class Belief:
-    """What is believed of one mirror after its sightings so far.
+    """The belief about one mirror after its sightings so far.
 
     Attributes
     ----------

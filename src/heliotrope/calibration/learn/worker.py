@@ -1,7 +1,7 @@
 """Learns one group in a process of its own: ``python -m heliotrope.calibration.learn.worker``.
 
 A plant starts it at night and writes a `GroupTask` to its input, pickled; it answers with one JSON
-document and ends. It takes only what the other processes leave of the machine.
+document and ends. It uses only the computing time that other processes leave.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Plans measurements: the suns and targets that tell most about each heliostat.
+"""Plans measurements: the suns and targets that reveal most about each heliostat.
 
 `plan_sightings` chooses among the `candidate_sightings` of one heliostat, `plan_each` does so for
 several that share targets, `plan_campaign` schedules a whole field; `fleets_of` prepares the

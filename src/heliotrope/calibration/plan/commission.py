@@ -46,7 +46,7 @@ def _default_limits() -> SightingLimits:
 
 @dataclass(frozen=True)
 class CommissionTerms:
-    """What a visit costs and tells, and what the plan is for.
+    """Cost and yield of a visit, and the purpose of the plan.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class CommissionTerms:
     settle, shots, interval
         A visit of one mirror, s: until it stands still, and its photographs; 80 s together.
     look
-        Further look for a beam that is not on the target, s.
+        Time of a further search photograph when the beam is not on the target, s.
     sigma
         Standard deviation of a photograph's beam in each direction, rad.
     joint
@@ -340,7 +340,7 @@ class _Queue:
     rows: Rows
 
     def first(self, free: Mask, most: int) -> Rows:
-        """Return the best that are free, at most so many."""
+        """Return the best free heliostats, at most ``most``."""
         reach = max(4 * most, 256)
         while True:
             free_rows = self.rows[:reach][free[self.rows[:reach]]]
@@ -362,7 +362,7 @@ class _Choices:
     view: TargetView
     slant: FloatArray
     spread: FloatArray
-    seen: FloatArray
+    share_seen: FloatArray
     looks: FloatArray
     alone: _Queue
     lost: _Queue
@@ -447,7 +447,7 @@ class _Commissioning:
         self._until = end
 
     def _use(self, j: int, span: dict[str, float]) -> None:
-        """Account for the time of a target; that of the receiver is none of it."""
+        """Account for the time of a target, without that of the receiver."""
         if j < len(self.targets):
             for name, value in span.items():
                 self.seconds[name] += value
@@ -559,7 +559,7 @@ class _Commissioning:
         own = joint and not produces and self._own(choices, rows)
         if own:
             # The stack that verifies new parameters is a sighting, too.
-            missed, stacks = self._misses(choices.seen[rows]), 2.0
+            missed, stacks = self._misses(choices.share_seen[rows]), 2.0
         scale = np.sqrt(stacks) * self.sigma[rows] / self.terms.accuracy(joint, produces=produces)
         scale = np.where(missed, 0.0, scale)[:, None, None]
         known = _gain.updated(self.field.covariance[rows], choices.view.slope[rows] * scale)

@@ -242,7 +242,7 @@ def plan_each(
 def _free(
     candidates: CandidateSightings, taken: set[tuple[int, float]], latest: float
 ) -> npt.NDArray[np.bool_]:
-    """Which candidates end in the span and are not on a target that is taken then."""
+    """Return a mask of the candidates that end in the span, on a target that is free then."""
     pairs = zip(candidates.target, candidates.time, strict=True)
     return np.array(
         [t <= latest and (int(k), float(t)) not in taken for k, t in pairs], dtype=np.bool_

@@ -1,4 +1,4 @@
-"""What a visit of several mirrors to one target costs and tells, as a plant makes it.
+"""Cost and yield of a visit of several mirrors to one target, as a plant makes it.
 
 A later visit takes few codes, since beams that do not overlap share one. In a first visit nobody
 knows where a beam is: each mirror has a code of its own along one axis, and a second stack of

@@ -1,4 +1,4 @@
-"""Percentiles of the beam errors of a field, predicted from what is known of its mirrors.
+"""Percentiles of the beam errors of a field, predicted from the knowledge of its mirrors.
 
 The true squared error of a mirror, averaged over the suns of the year, is eᵀ F e with e ~ N(0, C):
 a sum of squares with mean tr(F C) and variance 2 tr((F C)²). A gamma distribution of this mean and

@@ -1,4 +1,4 @@
-"""Plans the sightings of one heliostat: the suns and targets that tell most about it.
+"""Plans the sightings of one heliostat: the suns and targets that reveal most about it.
 
 A camera-target sighting adds JᵀJ to the information on the parameters, with J the whitened
 derivative of normal minus bisector. The *D-optimal* choice maximises the determinant of the
@@ -359,7 +359,7 @@ class SightingPlan:
 
 
 def plan_sightings(
-    found: CandidateSightings,
+    candidates: CandidateSightings,
     count: int,
     information: npt.ArrayLike,
     form: npt.ArrayLike,
@@ -368,11 +368,11 @@ def plan_sightings(
     exchange: bool = True,
     gap: float = 0.0,
 ) -> SightingPlan:
-    """Return the sightings of one heliostat that together tell most about it.
+    """Return the sightings of one heliostat that together reveal most about it.
 
     Parameters
     ----------
-    found
+    candidates
         Candidates of the heliostat, (M,).
     count
         Number of sightings; fewer if there are not enough candidates.
@@ -402,26 +402,26 @@ def plan_sightings(
         raise InputError(f"criterion {criterion!r}: give d (determinant) or v (beam variance)")
     if count < 1:
         raise InputError(f"count {count}: give 1 or more sightings")
-    if not len(found):
+    if not len(candidates):
         raise InputError(
             "planning: no candidate; the sun, the stops or the limits allow no sighting at these "
             "times; widen the span"
         )
     matrix = as_float(information)
     scale = 1.0 / np.sqrt(np.diagonal(matrix))
-    slope = found.jacobian * scale
+    slope = candidates.jacobian * scale
     # Scaled, metres and radians weigh alike, and the prior is close to the unit matrix.
     known = matrix * scale[:, None] * scale
     weights = as_float(form) * scale[:, None] * scale
-    choice = _Choice(slope, found.time, known, weights, criterion, gap)
-    rows = choice.greedy(count, np.arange(len(found)))
+    choice = _Choice(slope, candidates.time, known, weights, criterion, gap)
+    rows = choice.greedy(count, np.arange(len(candidates)))
     if exchange:
         rows = choice.exchange(rows)
-    rows = sorted(rows, key=lambda r: (found.time[r], r))
+    rows = sorted(rows, key=lambda r: (candidates.time[r], r))
     best = choice.greedy(len(rows), np.array(rows), apart=False)
     gain, error, covariance = choice.walk(rows)
     return SightingPlan(
-        chosen=found.take(rows),
+        chosen=candidates.take(rows),
         rank=np.array([best.index(r) + 1 for r in rows], dtype=np.intp),
         gain=gain,
         before=float(np.sqrt(max(0.0, np.trace(weights @ np.linalg.inv(known))))),

@@ -1,4 +1,4 @@
-"""What a receiver visit costs and tells: mirrors measured where they shine."""
+"""Cost and yield of a receiver visit: mirrors measured where they shine."""
 
 from dataclasses import dataclass
 
@@ -80,27 +80,27 @@ class ReceiverTerms:
         known, again = self.settings.known, 2.0 * self.settings.visit**2
         return float(np.sqrt(max(0.0, min((_SURE * known) ** 2, known**2 - again))))
 
-    def at_once(self, lit: int) -> int:
+    def at_once(self, shining: int) -> int:
         """Return how many mirrors may move at once of those that shine on the receiver."""
         cost = _COST * self.settings.movement**2
-        return min(self.settings.most, int(self.settings.power * lit / cost))
+        return min(self.settings.most, int(self.settings.power * shining / cost))
 
     def photographs(self, mirrors: int) -> int:
         """Return the photographs of a visit: each mirror has a code of its own for each axis."""
         return max(_FEWEST, 1 << (2 * mirrors).bit_length())
 
-    def span(self, mirrors: int, lit: int) -> float:
+    def span(self, mirrors: int, shining: int) -> float:
         """Return the time of a visit, s, until all have the parameters that it gave.
 
         Parameters
         ----------
-        mirrors, lit
+        mirrors, shining
             Mirrors that take part, and those that shine on the receiver: as the plant does it, a
             share of them is away for new parameters at a time, and at least one.
         """
         settings = self.settings
         step = settings.settle + settings.exposures * _PHOTOGRAPH
-        turns = -(-mirrors // max(1, int(settings.power * lit)))
+        turns = -(-mirrors // max(1, int(settings.power * shining)))
         return self.pace * (_BESIDE + step * self.photographs(mirrors) + _AWAY * turns)
 
     def shining(self, position: FloatArray, aim: FloatArray) -> npt.NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""What is known of all heliostats of a plan, and what a target would show of them at one sun.
+"""The knowledge of all heliostats of a plan, and what a target would reveal of them at one sun.
 
 Heliostats are numbered through all fleets. Parameters are scaled by their present knowledge, so
 that metres and radians weigh alike, and padded to the largest model.

@@ -478,7 +478,7 @@ def _moved(
     location: FloatArray,
     source: str | Path,
 ) -> tuple[FloatArray, dict[str, tuple[str, ...]]]:
-    """Return locations (N, 3) moved as was learnt, and what has no place beside them, by name."""
+    """Return the learned locations (N, 3), and the parameters lost in that form, by name."""
     rows, moved = {name: i for i, name in enumerate(names)}, location.copy()
     lost: dict[str, tuple[str, ...]] = {}
     for name in heliostats:

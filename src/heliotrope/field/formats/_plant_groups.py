@@ -40,7 +40,6 @@ _RAW = {
     "kind": slot.KIND,
     "sense": slot.SENSE,
 }
-_XYZ = "xyz"
 _POSITION = ("east_m", "north_m", "up_m")
 
 

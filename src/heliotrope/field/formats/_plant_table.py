@@ -86,7 +86,7 @@ def read_table(path: Path) -> HeliostatColumns:
 
 
 def read_columns(path: Path) -> Rows:
-    """Return the columns of the table of heliostats as they stand in the file.
+    """Return the columns of the table of heliostats, unchanged.
 
     Raises
     ------

@@ -155,7 +155,7 @@ def fetch_heliostats(
     client: "httpx.Client | None" = None,
     settings: FetchSettings | None = None,
 ) -> Fetched:
-    """Fetch what the database has of one or several heliostats.
+    """Fetch the database's files of one or several heliostats.
 
     Parameters
     ----------

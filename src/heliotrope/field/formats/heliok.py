@@ -1,6 +1,6 @@
 """HelioK XML: heliostats with arbitrary axes, nested nodes and facets (Grigoriev et al. 2021).
 
-`read` gives the file as a tree of elements, with the attributes as they stand in it. The
+`read` gives the file as a tree of elements, with its attributes unchanged. The
 functions below read its meaning::
 
     HelioK   version, unitLength, unitAngle

@@ -244,7 +244,7 @@ def _target(name: str, node: JsonNode, points: dict[str, FloatArray]) -> Target:
 
 
 def with_marks(targets: Sequence[Target]) -> tuple[Target, ...]:
-    """Return targets with the marks that stand at their measured points at Jülich.
+    """Return targets with the marks at their measured points at Jülich.
 
     Ls stand at free corners, Ts at the middles and where two targets meet; the points are
     on their outer edges. The files do not say so; it was measured in published photographs,

@@ -257,7 +257,7 @@ class _Files:
         return tuple(warnings)
 
     def _column(self, who: str, name: str) -> tuple[str, float]:
-        """Return the column that a name means, and its unit in that of the column."""
+        """Return the column of a name, and the factor of its unit."""
         group, _ = self.plant.find(who)
         known = dict.fromkeys((*map(str, self.cells.columns), *_TEXTS, *_parameters(group)))
         known.pop("name")
@@ -338,7 +338,7 @@ def _parameters(group: Heliostats) -> dict[str, tuple[float, str]]:
 
 
 def _readings(name: str) -> Iterator[tuple[str, float]]:
-    """Yield a name as it stands, and with its smaller unit replaced by that of the file."""
+    """Yield a name unchanged, and with its smaller unit replaced by the unit of the file."""
     yield name, 1.0
     for unit, smaller in _SMALLER.items():
         for short, size in smaller.items():

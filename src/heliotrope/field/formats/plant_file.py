@@ -367,7 +367,7 @@ def _warnings(plant: Plant) -> list[str]:
 
 
 def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
-    """Return what is odd about where a surface stands and looks."""
+    """Return what is unusual about a surface's position and orientation."""
     what = f"{'target' if isinstance(surface, Target) else 'receiver'} {surface.name}"
     texts, lines = [], plant.position - surface.center
     behind = lines @ surface.normal <= 0.0
@@ -399,7 +399,7 @@ def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
 
 
 def _coinciding(surfaces: Sequence[Target | Receiver]) -> list[str]:
-    """Return which surfaces have one centre."""
+    """Return a line on the surfaces that share a centre."""
     return [
         f"{one.name} and {other.name} have one centre; correct one, or leave it out"
         for one, other in itertools.combinations(surfaces, 2)

@@ -223,7 +223,7 @@ def _measured(
     stack: Stack,
     axes: npt.NDArray[np.intp],
 ) -> Fit:
-    """Return a fit with its covariance, its place corrected by the moments of what it leaves.
+    """Return a fit with its covariance, its place corrected by the moments of the residual.
 
     With x from the fitted place, ∫ x² Gₓ = ∫ 2 x y G_y = 2 p x̄ for any shape; 4 : 3 is the best
     weight of the two in a round window with even noise. One picture alone gives either. The

@@ -1,4 +1,4 @@
-"""What a stack proves about each mirror."""
+"""The verdict of a stack about each mirror."""
 
 from collections.abc import Sequence
 

@@ -80,7 +80,7 @@ def still_light(
 
 
 def _powers(terms: list[FloatArray], mean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return powers of 0 or more by least squares, and what they leave.
+    """Return powers of 0 or more by least squares, and the residual.
 
     A beam of which the surface shows next to nothing has no power: any power would explain it.
     """

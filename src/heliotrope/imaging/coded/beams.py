@@ -7,7 +7,7 @@ from heliotrope.geometry import FloatArray
 
 
 class Verdict(Enum):
-    """What a stack proves about a mirror."""
+    """The verdict of a stack about a mirror."""
 
     PROVEN = "follows its own code at its place"
     STUCK = "its light does not move"

@@ -1,4 +1,4 @@
-"""What every source of frames has in common, and frames made by a function."""
+"""The common base of all sources of frames, and a source of frames made by a function."""
 
 import re
 import threading

@@ -113,7 +113,7 @@ def border(paint: Mask) -> Mask:
 
 
 def prior(level: float) -> FloatArray:
-    """Return the prior precision of an edge's six numbers on a face of a brightness."""
+    """Return the prior precision of an edge's six parameters, by the brightness of the face."""
     height = 0.5 * level
     deviation = np.array([height, 0.1 * level, 0.1 * level, 0.1 * height, height, height])
     return np.asarray(1.0 / np.maximum(deviation, 1e-4) ** 2)

@@ -182,7 +182,7 @@ class Lightened:
     small, closed
         The frame, and its closing, (h, w).
     reduction
-        Factor by which the frame was reduced.
+        Factor of the frame's reduction.
     """
 
     small: Image
@@ -201,7 +201,7 @@ def lighten(grey: Image, reduction: int) -> Lightened:
     grey
         The frame.
     reduction
-        Factor by which the frame is reduced.
+        Factor of the frame's reduction.
     """
     import cv2
 

@@ -75,7 +75,7 @@ def chain_pose(
     n,
     m,
 ):
-    """Place a chain whose driven joints stand at ``joint_angles`` (D,).
+    """Place a chain whose driven joints are at ``joint_angles`` (D,).
 
     Fills frames (J + 1, 3, 3) (the orientation before each joint, and of the
     mirror), screw_axes (J, 3) and screw_points (J, 3) in ENU, normal n (3,) and

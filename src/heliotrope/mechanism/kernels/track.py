@@ -86,7 +86,7 @@ def is_single(g):
 
 @njit(**INLINED)
 def constants(g, u):
-    """What the solution for mirror vector ``u`` keeps from step to step.
+    """Constants of the solution for mirror vector ``u``, the same in all steps.
 
     With z = α a + β b + γ c and c = a × b, sine and cosine of θ₂ are linear in α and γ:
     (a·b, u·b, 1/|c|², sine by α and γ, cosine by α and γ).

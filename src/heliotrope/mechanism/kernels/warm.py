@@ -33,7 +33,7 @@ def _put(table, row, lane, vector):
 
 @njit(**INLINED)
 def _gather(table, lane, g, s, p):
-    """Fill one lane with what the step needs; the vertex starts at zero angles."""
+    """Fill one lane with the inputs of the step; the vertex starts at zero angles."""
     a, b = axis_1(g), axis_2(g)
     c = cross(a, b)
     o = (g[3], g[4], g[5])

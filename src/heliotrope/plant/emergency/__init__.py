@@ -1,7 +1,7 @@
 """Emergencies: the plant's rows of the safety table, the order that they demand, and its proof.
 
-`Sentinel` obeys the table and repeats and proves orders; all that begins or ends an emergency
-stands in its file. `TableWatch` evaluates the rows, and `EmergencyOrder` is one order to the whole
+`Sentinel` obeys the table and repeats and proves orders; its file holds all that begins or ends
+an emergency. `TableWatch` evaluates the rows, and `EmergencyOrder` is one order to the whole
 field with its proof.
 """
 

@@ -3,8 +3,9 @@
 An order that a person gives again merges with the one that stands: nothing is recorded or sent for
 it, so a program that gives it hundreds of times a second fills neither the store nor the list of
 events. A person whose order is withdrawn while they (or a program with their token) repeat it, or
-five times by others within ten minutes, pauses before the next one is taken; nobody else does. The first order of a
-person is never refused, nor is the first one after another person has withdrawn theirs.
+five times by others within ten minutes, pauses before the next one is taken; nobody else does. The
+first order of a person is never refused, nor is the first one after another person has withdrawn
+theirs.
 """
 
 import math

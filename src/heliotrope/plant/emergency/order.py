@@ -62,15 +62,15 @@ class EmergencyOrder:
         self._proof = Proof.of(act.name, ticket.heliostats, at, flux_measured=flux_measured)
         # A proof is a value, so reports of a whole field are added to it together.
         self.unknown: dict[str, str] = {}
-        self._told: dict[str, float] = {}
-        self._ready: dict[str, float] = {}
+        self._acknowledged: dict[str, float] = {}
+        self._done: dict[str, float] = {}
 
     @property
     def proof(self) -> Proof:
         """The proof so far."""
-        if self._told or self._ready:
-            self._proof = self._proof.with_news(acknowledged=self._told, done=self._ready)
-            self._told, self._ready = {}, {}
+        if self._acknowledged or self._done:
+            self._proof = self._proof.with_news(acknowledged=self._acknowledged, done=self._done)
+            self._acknowledged, self._done = {}, {}
         return self._proof
 
     def take_flux(self, share: float, at: float) -> None:
@@ -80,19 +80,19 @@ class EmergencyOrder:
     def is_acknowledged(self, heliostat: str) -> bool:
         """Whether a heliostat has acknowledged the order."""
         return (
-            heliostat in self._told
-            or heliostat in self._ready
+            heliostat in self._acknowledged
+            or heliostat in self._done
             or (heliostat in self._proof.acknowledged)
         )
 
     def is_done(self, heliostat: str) -> bool:
         """Whether a heliostat has carried out the order."""
-        return heliostat in self._ready or heliostat in self._proof.done
+        return heliostat in self._done or heliostat in self._proof.done
 
     def take_back(
         self, names: tuple[str, ...], rows: npt.NDArray[Any], heard: npt.NDArray[np.float64]
     ) -> tuple[str, ...]:
-        """Return which of K heliostats have carried out the order and have come back since.
+        """Return those of K heliostats that carried out the order and have come back since.
 
         They are no longer done. A row (`NODE`) from before that says nothing.
         """
@@ -107,23 +107,23 @@ class EmergencyOrder:
     def report(self, now: float, shown: Mapping[str, str] = MappingProxyType({})) -> ProofReport:
         """Return how far the order has been carried out.
 
-        ``shown`` is what has shown today that mirrors follow their drives, by heliostat.
+        ``shown`` is today's evidence that mirrors follow their drives, by heliostat.
         """
         report = replace(self.proof.report(now), unknown=tuple(self.unknown.values()))
         return report.with_evidence(self.proof.done, shown)
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
-        """Return which of some heliostats have not acknowledged the order."""
+        """Return those of some heliostats that have not acknowledged the order."""
         return tuple(name for name in heliostats if not self.is_acknowledged(name))
 
     def take_stage(self, heliostats: tuple[str, ...], stage: Stage, now: float) -> None:
         """Take a cluster's report on the order."""
         if stage is Stage.ACKNOWLEDGED:
             for name in heliostats:
-                self._told.setdefault(name, now)
+                self._acknowledged.setdefault(name, now)
         elif stage is Stage.DONE:
             for name in heliostats:
-                self._ready.setdefault(name, now)
+                self._done.setdefault(name, now)
 
     def take_rows(
         self,
@@ -133,21 +133,21 @@ class EmergencyOrder:
         counted: npt.NDArray[np.float64],
         drives: Drive,
         now: float,
-        strange: Mask,
-        lit: Mask,
+        mismatched: Mask,
+        shining: Mask,
     ) -> None:
         """Take the state of heliostats (K,): rows of `NODE`, when they were true, and drives.
 
         Step counts (``counted``) from before the order prove nothing: they do not show the beam.
 
-        ``strange`` ones are not what their address says: their counts may be another mirror's, so
-        nothing that they report proves anything. Where a beam is still on a receiver (``lit``),
-        nothing is done.
+        ``mismatched`` ones are not what their address says: their counts may be another mirror's,
+        so nothing that they report proves anything. Where a beam is still on a receiver
+        (``shining``), nothing is done.
         """
         settled = heard >= self.at + LEAVING
         stowed = carried_out(Act.STOW, rows, drives, settled)
         off = carried_out(self.act, rows, drives, settled)
-        fulfilled = (stowed | off) & ~strange & ~lit
+        fulfilled = (stowed | off) & ~mismatched & ~shining
         fulfilled &= (heard >= self.at) & (counted >= self.at)
         ready = tuple(names[i] for i in np.flatnonzero(fulfilled))
         if ready:
@@ -161,16 +161,16 @@ def switched_off(flags: npt.NDArray[Any]) -> Mask:
 
 
 def at_stow(rows: npt.NDArray[Any]) -> Mask:
-    """Return which rows (K,) of `NODE` show a heliostat at stow that does not go on from there.
+    """Return a mask of the rows (K,) of `NODE` whose heliostat rests at stow.
 
-    One that is locked there, or has a fault, is; one that is IDLE there may go on to track.
+    One that is locked there, or has a fault, does; one that is IDLE there may go on to track.
     """
-    there = (rows["state"] == states.STOWED) | (rows["flags"] & meanings.AT_STOW != 0)
-    return np.asarray(there & ~np.isin(rows["state"], states.BEAM_OUT))
+    resting = (rows["state"] == states.STOWED) | (rows["flags"] & meanings.AT_STOW != 0)
+    return np.asarray(resting & ~np.isin(rows["state"], states.BEAM_OUT))
 
 
 def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask:
-    """Return which rows (K,) of `NODE` show that DEFOCUS or STOW has been carried out.
+    """Return a mask of the rows (K,) of `NODE` that show DEFOCUS or STOW carried out.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
         return np.asarray(stowed)
     counts = np.stack([rows["primary"], rows["secondary"]], axis=-1).astype(np.float64)
     goals = np.stack([rows["primary_goal"], rows["secondary_goal"]], axis=-1).astype(np.float64)
-    left = np.abs((goals - counts) * drives.radians_per_count(counts)).max(axis=-1)
+    remaining = np.abs((goals - counts) * drives.radians_per_count(counts)).max(axis=-1)
     # On the way to stow the goal is far away, although the beam has left.
     leaving = rows["state"] == states.STOWING
-    return np.asarray(stowed | (off & known & np.where(leaving, settled, left < NEAR)))
+    return np.asarray(stowed | (off & known & np.where(leaving, settled, remaining < NEAR)))

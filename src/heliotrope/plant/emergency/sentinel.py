@@ -97,15 +97,15 @@ class Sentinel(Part):
         clock, field = orders.clock, watch.proofs.field
         self.order: EmergencyOrder | None = None
         self.on = False
-        self.night: str = ""
+        self.night: str | None = None
         self._record, self._kept_at = record, -math.inf
         self._kept = self._recalled = Standing() if record is None else _recall(record)
         self._callers = Callers(self._recalled.calls)
         #: Heliostats that an emergency left unproven, and when each was proven, monotonic s.
-        left = set() if self._recalled.act else set(self._recalled.unproven) & set(field.names)
-        self._unproven = dict.fromkeys(sorted(left), math.inf)
+        unproven = set() if self._recalled.act else set(self._recalled.unproven) & set(field.names)
+        self._unproven = dict.fromkeys(sorted(unproven), math.inf)
         #: The order of the program before that these did not prove; reports from now on prove it.
-        self._left = _left_order(self._recalled, tuple(self._unproven), clock)
+        self._before = _left_order(self._recalled, tuple(self._unproven), clock)
         known = {"", *field.names, *field.clusters}
         table.recall(row for row in self._recalled.rows if row[1] in known)
         self._clock, self.table, self._field = clock, table, field
@@ -139,18 +139,18 @@ class Sentinel(Part):
         return self.table.evaluate(proof, self._unproven, called=bool(self.calls), now=now)
 
     def _obey_field(self, now: float) -> None:
-        wanted, caused = self.table.demanded(), self.table.caused()
+        demanded, caused = self.table.demanded(), self.table.caused()
         order = self.order
         # A consequence of an emergency may make it worse, but begins none: it would never end.
-        if wanted is not None and wanted >= Act.DEFOCUS and (caused or self.on):
-            if not self.on or order is None or wanted > order.act:
-                self._begin_again(wanted)
+        if demanded is not None and demanded >= Act.DEFOCUS and (caused or self.on):
+            if not self.on or order is None or demanded > order.act:
+                self._begin_again(demanded)
             elif now - self._repeated_at >= self._repeat:
                 self._repeat_order(self._field.clusters)
         if not caused and self.on:
             self.on = False
             self._unproven = dict.fromkeys(self._not_done(), math.inf)
-        if wanted is not None and wanted >= Act.HOLD:
+        if demanded is not None and demanded >= Act.HOLD:
             self._joining.drop(self.table.reasons(Act.HOLD))
 
     def _obey_night(self) -> None:
@@ -182,11 +182,11 @@ class Sentinel(Part):
         A heliostat that has just been sent off has the time to show it, unless DEFOCUS has turned
         it already: its beam stays where it may not be until it is stowed.
         """
-        wanted = {**self.table.off(), **self._identities.off(now)}
-        self._tries = {name: tried for name, tried in self._tries.items() if name in wanted}
+        ordered_off = {**self.table.off(), **self._identities.off(now)}
+        self._tries = {name: tried for name, tried in self._tries.items() if name in ordered_off}
         just_sent = self._watch.proofs.ledger.sent_since(messages.SAFE, now - OFF_SHOWS)
         sent: dict[Act, dict[str, str]] = {}
-        for name, (act, text) in wanted.items():
+        for name, (act, text) in ordered_off.items():
             tries, due = self._tries.get(name, (0, -math.inf))
             waits = just_sent[self._field.index[name]] and not self._watch.turned(name)
             if now < due or waits:
@@ -204,7 +204,7 @@ class Sentinel(Part):
     # -- orders ----------------------------------------------------------------------------
 
     def _begin_again(self, act: Act) -> None:
-        """Order what the table demands, or go on with the emergency of the program before."""
+        """Order the act that the table demands, or continue the previous program's emergency."""
         before, self._recalled = self._recalled, Standing()
         if before.act:
             self._begin(max(act, Act[before.act]), _AGAIN, before.continued, before.giver)
@@ -216,7 +216,7 @@ class Sentinel(Part):
     ) -> EmergencyOrder:
         """Order DEFOCUS or STOW of the whole field; ``giver`` is a name and a role in the record.
 
-        ``who`` gave the order that this one continues, "" if it continues none.
+        ``who`` gave the order that this one continues, if it continues one.
         """
         now, names = self._clock.monotonic(), self._field.names
         ticket = self._orders.accept((*giver, act.name), (), names, reason, late=True)
@@ -231,8 +231,8 @@ class Sentinel(Part):
 
     @property
     def _proving(self) -> EmergencyOrder | None:
-        """The order that reports prove now: the last one, or what the program before has left."""
-        return self.order or self._left
+        """The order that reports prove now: the last one, or the one of the previous program."""
+        return self.order or self._before
 
     @property
     def calls(self) -> tuple[Call, ...]:
@@ -240,16 +240,16 @@ class Sentinel(Part):
         return self._callers.calls
 
     def causes(self) -> dict[str, str]:
-        """Return why the emergency holds, by the persons whose orders stand and the safety table.
+        """Return the reasons for the emergency, by person with a standing order and safety table.
 
         It is empty where none holds.
         """
-        found = {call.who: call.reason for call in self.calls}
-        withdrawn = "" if found else self.table.withdrawn()
+        causes = {call.who: call.reason for call in self.calls}
+        withdrawn = "" if causes else self.table.withdrawn()
         rows = self.table.reasons(Act.DEFOCUS, but=ORDERED)
         if text := "; ".join(filter(None, (withdrawn, rows))):
-            found[_TABLE[0]] = text
-        return found
+            causes[_TABLE[0]] = text
+        return causes
 
     def ends_by(self, condition: str) -> bool:
         """Return whether nothing but one row of the table, whose cause has gone, demands it."""
@@ -312,8 +312,10 @@ class Sentinel(Part):
         order = self.order
         return () if order is None else tuple(sorted(order.proof.nodes - order.proof.done.keys()))
 
-    def acknowledge(self, condition: str, who: str, role: AcknowledgeRole, subject: str) -> str:
-        """Acknowledge a row of the table; return why it is refused, "" if it is not."""
+    def acknowledge(
+        self, condition: str, who: str, role: AcknowledgeRole, subject: str
+    ) -> str | None:
+        """Acknowledge a row of the table; return the reason of a refusal, None if accepted."""
         refusal = self.table.acknowledge(condition, who, role, subject)
         if not refusal and condition == UNPROVEN:
             self._unproven.pop(subject, None)
@@ -323,9 +325,9 @@ class Sentinel(Part):
         order = self.order if self.on else None
         rows = self.table.standing()
         if order is None:
-            left = tuple(sorted(name for name, at in self._unproven.items() if math.isinf(at)))
-            left_by = self._proving.act.name if left and self._proving is not None else ""
-            return Standing(calls=self.calls, rows=rows, unproven=left, left_by=left_by)
+            unproven = tuple(sorted(name for name, at in self._unproven.items() if math.isinf(at)))
+            left_by = self._proving.act.name if unproven and self._proving is not None else ""
+            return Standing(calls=self.calls, rows=rows, unproven=unproven, left_by=left_by)
         unproven = self._not_done()
         return Standing(order.act.name, order.who, order.reason, self.calls, rows, unproven)
 
@@ -411,7 +413,7 @@ class Sentinel(Part):
         rows = [self._field.index[n] for n in names if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
-            lit = self._watch.stray.lit(index)
+            shining = self._watch.stray.on_receiver(index)
             order.take_rows(
                 tuple(self._field.names[r] for r in rows),
                 self._field.rows[index],
@@ -420,9 +422,9 @@ class Sentinel(Part):
                 Drive(self._watch.proofs.paths.check.drives.table[index]),
                 now,
                 np.array([bool(self._doubted(self._field.names[r])) for r in rows]),
-                lit,
+                shining,
             )
-        for row, shines in zip(rows, lit if rows else (), strict=True):
+        for row, shines in zip(rows, shining if rows else (), strict=True):
             name = self._field.names[row]
             if int(self._field.rows["flags"][row]) & meanings.COUNTS_UNKNOWN:
                 order.unknown[name] = self._last_of(row, now)
@@ -447,10 +449,10 @@ class Sentinel(Part):
             if order.is_done(name):
                 self._unproven[name] = min(self._unproven[name], now)
 
-    def _doubted(self, heliostat: str) -> str:
-        """Return why nothing that a heliostat reports proves where its beam is, "" if it may."""
+    def _doubted(self, heliostat: str) -> str | None:
+        """Return the reason why a heliostat's reports prove nothing of its beam, if any."""
         untrusted = self._identities.untrusted(heliostat)
-        return untrusted or self._drive_checks.stalled.get(heliostat, "")
+        return untrusted or self._drive_checks.stalled.get(heliostat)
 
     def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
         """Send heliostats off again that have come back while the emergency holds."""
@@ -472,12 +474,12 @@ class Sentinel(Part):
         beam = f" with its beam at ({', '.join(f'{x:.1f}' for x in place)}) m" if out else ""
         return text + f"{now - field.posed_at[row]:.0f} s ago it was {states.STATES[state]}{beam}"
 
-    def refusal(self, clusters: Iterable[str]) -> str:
-        """Return why no new motion may begin in some clusters, "" if it may."""
+    def refusal(self, clusters: Iterable[str]) -> str | None:
+        """Return the reason why no new motion may begin in some clusters, None if it may."""
         if self.on and self.order is not None:
             return f"an emergency holds ({self.order.act.name}; {_said(self.causes())})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
-        return next((text for text in texts if text), "")
+        return next((text for text in texts if text), None)
 
 
 def _said(causes: Mapping[str, str]) -> str:

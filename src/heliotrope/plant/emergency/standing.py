@@ -16,11 +16,11 @@ class EmergencyRecord(Protocol):
     """A store of one document about the emergency that stands."""
 
     def emergency(self) -> str:
-        """Return the document, "" if none is kept."""
+        """Return the document, empty without one."""
         ...
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document; "" if no emergency stands any more.
+        """Replace the document; an empty one says that no emergency stands.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Standing:
-    """What a plant's program must know of an emergency that began before it.
+    """The record of an emergency for the next program of the plant.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Standing:
 
     @property
     def document(self) -> str:
-        """The document that the store keeps, "" if nothing stands."""
+        """The document that the store keeps, empty if nothing stands."""
         return "" if self == Standing() else json.dumps(asdict(self))
 
     @property
@@ -107,22 +107,22 @@ class Standing:
 
 
 def read_standing(document: str) -> Standing:
-    """Return what a document says; a person's DEFOCUS if it cannot be read: the safe side."""
+    """Return the contents of a document; a person's DEFOCUS, the safe side, if it is unreadable."""
     if not document:
         return Standing()
     try:
-        found = json.loads(document)
-        rows = tuple((str(row), str(subject)) for row, subject in found["rows"])
-        unproven = _names(found["unproven"])
-        act, who, reason = (str(found[key]) for key in ("act", "who", "reason"))
+        fields = json.loads(document)
+        rows = tuple((str(row), str(subject)) for row, subject in fields["rows"])
+        unproven = _names(fields["unproven"])
+        act, who, reason = (str(fields[key]) for key in ("act", "who", "reason"))
         # A record of an older edition does not say which order: STOW is harder to prove.
-        left_by = str(found.get("left_by", "STOW" if unproven and not act else ""))
+        left_by = str(fields.get("left_by", "STOW" if unproven and not act else ""))
         for name in filter(None, (act, left_by)):
             if Act[name] not in (Act.DEFOCUS, Act.STOW):
                 raise ValueError(name)
         calls = tuple(
             Call(str(c["who"]), str(c["reason"]), str(c["act"]), float(c["at"]))
-            for c in found["calls"]
+            for c in fields["calls"]
         )
         return Standing(act, who, reason, calls, rows, unproven, left_by)
     except (ValueError, KeyError, TypeError):
@@ -130,5 +130,5 @@ def read_standing(document: str) -> Standing:
         return Standing(call.act, call.who, call.reason, (call,))
 
 
-def _names(found: Sequence[object]) -> tuple[str, ...]:
-    return tuple(str(name) for name in found)
+def _names(names: Sequence[object]) -> tuple[str, ...]:
+    return tuple(str(name) for name in names)

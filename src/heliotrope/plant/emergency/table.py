@@ -121,7 +121,7 @@ class PlantReadings:
         if now - self._sun_at >= SUN_PERIOD:
             self._sun_at = now
             self._elevation = math.asin(float(self._sun()[2]))
-        found = {
+        readings = {
             **proof_readings(proof, now),
             ("emergency_order", ""): Reading(float(called), now),
             ("authority_silence", ""): Reading(self._authority.silent_for, now),
@@ -135,8 +135,8 @@ class PlantReadings:
         }
         for name, at in self._field.status_at.items():
             if math.isfinite(at):
-                found["cluster_silence", name] = Reading(0.0, at)
-        return found
+                readings["cluster_silence", name] = Reading(0.0, at)
+        return readings
 
 
 class TableWatch:
@@ -200,7 +200,7 @@ class TableWatch:
         self._own = readings
         self._put: dict[tuple[str, str], Reading] = {}
         self._newest: dict[str, Reading] = {}
-        self._told: dict[tuple[str, str], Alarm] = {}
+        self._raised: dict[tuple[str, str], Alarm] = {}
 
     @property
     def flux_measured(self) -> bool:
@@ -247,23 +247,25 @@ class TableWatch:
         For ``proof``, ``unproven`` and ``called`` see `PlantReadings.take`.
         """
         own = self._own.take(proof, unproven, called=called, now=now)
-        readings = self._put | {key: each for key, each in own.items() if key[0] in self._fed}
+        readings = self._put | {
+            key: own_reading for key, own_reading in own.items() if key[0] in self._fed
+        }
         for row in self._single:
             subjects = [name for reading, name in readings if reading == row.reading and name]
             self._state = narrowed(self._state, row.name, subjects)
         self._state, self.actions = evaluate(readings, self._state, now)
-        found: dict[tuple[str, str], Alarm] = {}
+        raised: dict[tuple[str, str], Alarm] = {}
         news = []
         for action in self.actions:
             key = (action.condition, action.subject)
             alarm = Alarm(*key, action.severity, action.line)
-            if key not in self._told or action.new:
+            if key not in self._raised or action.new:
                 news.append(alarm)
-            found[key] = alarm
-        for key, old in self._told.items():
-            if key not in found:
+            raised[key] = alarm
+        for key, old in self._raised.items():
+            if key not in raised:
                 news.append(Alarm(*key, old.severity, f"{' '.join(key).strip()}: over", False))
-        self._told = found
+        self._raised = raised
         return news
 
     def recall(self, rows: Iterable[tuple[str, str]]) -> None:
@@ -283,8 +285,10 @@ class TableWatch:
         }
         return tuple(key for key in self._state.tripped() if key[0] in latched or key in off)
 
-    def acknowledge(self, condition: str, who: str, role: AcknowledgeRole, subject: str) -> str:
-        """Acknowledge a row; return why it is refused, "" if it is not."""
+    def acknowledge(
+        self, condition: str, who: str, role: AcknowledgeRole, subject: str
+    ) -> str | None:
+        """Acknowledge a row; return the reason of a refusal, None if accepted."""
         self._state, refusal = acknowledge(self._state, condition, who, role, subject)
         if not refusal:
             key = (condition, subject)
@@ -304,12 +308,12 @@ class TableWatch:
             if a.scope is scope and a.subject == cluster and a.condition != NIGHT
         )
 
-    def night(self) -> str:
-        """Return why the field rests at stow although nothing is wrong, "" if it need not."""
-        return next((a.text for a in self.actions if a.condition == NIGHT), "")
+    def night(self) -> str | None:
+        """Return the reason why the field rests at stow though nothing is wrong, None by day."""
+        return next((a.text for a in self.actions if a.condition == NIGHT), None)
 
     def off(self) -> dict[str, tuple[Act, str]]:
-        """Return the heliostats that must leave, by name: by which act, and why."""
+        """Return the heliostats that must leave, by name, each with its act and the reason."""
         return {
             a.subject: (a.act, a.text)
             for a in reversed(self.actions)
@@ -344,7 +348,7 @@ class TableWatch:
         return "; ".join([a.text for a in demands if a.act >= least and a.condition != but][:3])
 
     def withdrawn(self) -> str:
-        """Return how an emergency ends that persons have ordered, "" where none of theirs holds.
+        """Return how an emergency ordered by persons ends, empty if there is none.
 
         It is for an emergency of which every person has withdrawn their order.
         """

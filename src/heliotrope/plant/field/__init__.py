@@ -1,4 +1,4 @@
-"""What the plant knows of its field: reports, orders in force, locks, beliefs, and what it doubts.
+"""The plant's knowledge of its field: reports, orders in force, locks, beliefs, and doubts.
 
 `FieldState` holds the reports of all heliostats as arrays, `Ledger` what each was sent last,
 `Assigned` the aims and standby points that people and automatic control gave, and `Witnesses`

@@ -1,4 +1,4 @@
-"""The plant's own view of time, site and pointing, compared with what is reported.
+"""The plant's own view of time, site and pointing, compared with the reports.
 
 A cluster with a wrong clock or site sends its local controllers a wrong sun, and each of them then
 follows it, in good order, beside its aim or its standby point. So the plant compares the time and
@@ -35,8 +35,8 @@ from heliotrope.plant.field.state import FieldState, Mask
 from heliotrope.safety import Reading
 from heliotrope.sun import Site, fast_vector
 
-#: Pause between two looks at the pointing, s.
-LOOK_PERIOD = 2.0
+#: Pause between two checks of the pointing, s.
+CHECK_PERIOD = 2.0
 #: Errors from here on (rad) are handed to the safety table.
 NOTED = 1e-3
 #: Most heliostats that are named; with more, the field is the subject.
@@ -77,8 +77,8 @@ class _Points:
         self.points, self._last = points, points.copy()
         self.before = before.copy()
 
-    def look(self) -> Mask:
-        """Return which points have changed since the last look, (N,)."""
+    def check(self) -> Mask:
+        """Return a mask of the points that have changed since the last check, (N,)."""
         new, last = self.points, self._last
         changed = differ(new, last)
         put_before(self.before, np.flatnonzero(changed), last[changed])
@@ -96,7 +96,7 @@ class _Points:
 
 
 class Agreement(Part):
-    """Comparison of what clusters and heliostats report with what the plant knows itself.
+    """Comparison of the reports of clusters and heliostats with the plant's own knowledge.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class Agreement(Part):
         self._lag = np.full(count, np.inf)
         #: Whether the axes stand beside their goals, by counts that came at a time, monotonic s.
         self._stands, self._counted = np.zeros(count, dtype=bool), np.full(count, -np.inf)
-        self._wrong: dict[str, float] = {}
+        self._named_errors: dict[str, float] = {}
         self._at = -np.inf
 
     def believe(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
@@ -160,7 +160,7 @@ class Agreement(Part):
         """Note how far a command that has been sent lets beams go."""
         del now, again
         if name == "SEARCH":
-            rows = np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+            rows = np.array([self._field.index[name] for name in heliostats], dtype=np.intp)
             # One that searches already goes on with its spiral if it refuses the new one.
             searches = self._field.rows["state"][rows] == states.SEARCHING
             self._radius[rows] = np.fmax(values[1], np.where(searches, self._radius[rows], np.nan))
@@ -175,22 +175,24 @@ class Agreement(Part):
             self._sun_off[cluster] = _sun_off(status.site, self._site, utc_s)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
-        """Return the differences of clusters and of heliostats; what is not named agrees.
+        """Return the differences of clusters and of heliostats; all others agree.
 
         A cluster that has fallen silent keeps its last difference: its silence has its own row.
         """
-        if now - self._at >= LOOK_PERIOD:
-            self._look(now)
+        if now - self._at >= CHECK_PERIOD:
+            self._check(now)
             self._at = now
-        found = {("pointing_error", name): Reading(x, now) for name, x in self._wrong.items()}
-        found["pointing_error", ""] = Reading(0.0, now)
-        found["pointing_errors", ""] = Reading(float(len(self._wrong)), now)
+        differences = {
+            ("pointing_error", name): Reading(x, now) for name, x in self._named_errors.items()
+        }
+        differences["pointing_error", ""] = Reading(0.0, now)
+        differences["pointing_errors", ""] = Reading(float(len(self._named_errors)), now)
         for name in self._field.clusters:
-            found["cluster_time_off", name] = Reading(self._time_off[name], now)
-            found["cluster_sun_off", name] = Reading(self._sun_off[name], now)
-        return found
+            differences["cluster_time_off", name] = Reading(self._time_off[name], now)
+            differences["cluster_sun_off", name] = Reading(self._sun_off[name], now)
+        return differences
 
-    def _look(self, now: float) -> None:
+    def _check(self, now: float) -> None:
         field = self._field
         for row, (crc, armature, drives) in list(self._pending.items()):
             stored = int(field.rows["armature_crc"][row]) == crc
@@ -199,7 +201,7 @@ class Agreement(Part):
                 del self._pending[row]
         begins = self._sort(now)
         self._aims.before[:, field.live(now) & ~self._on_aim] = np.nan
-        aims, standbys = self._aims.look(), self._standbys.look()
+        aims, standbys = self._aims.check(), self._standbys.check()
         begins |= np.where(self._on_aim, aims, standbys)
         self._since[begins] = now
         self._lag[begins], self._stands[begins] = np.inf, False
@@ -215,7 +217,7 @@ class Agreement(Part):
         error[searches] -= self._radius[searches]
         bad = np.flatnonzero(error >= NOTED)
         worst = bad[np.argsort(-error[bad], kind="stable")][:MOST_NAMED]
-        self._wrong = {field.names[row]: float(error[row]) for row in worst}
+        self._named_errors = {field.names[row]: float(error[row]) for row in worst}
 
     def _sort(self, now: float) -> Mask:
         """Find which beams are sent to which points; return those for which that has changed."""
@@ -241,18 +243,18 @@ class Agreement(Part):
         sun = self._sun_at(now - field.counted_at[rows])
         drives = Drive(self._drives[rows])
         ends = np.asarray(drives.angles(field.goals(rows)))
-        here = np.asarray(drives.angles(field.counts(rows)))
+        present = np.asarray(drives.angles(field.counts(rows)))
         error = self._beside(rows, sent, ends, sun)
-        lag = np.abs(ends - here).max(axis=-1)
+        lag = np.abs(ends - present).max(axis=-1)
         # Axes that come no nearer to their goals stand where they are.
-        # In large fields counts are older than a look: the same counts say nothing new.
+        # In large fields counts are older than a check: the same counts say nothing new.
         newer = field.counted_at[rows] > self._counted[rows]
         still = (lag > NOTED) & (lag > self._lag[rows] - _CLOSING)
         stands = np.where(newer, still, self._stands[rows])
         self._lag[rows], self._stands[rows] = lag, stands
         self._counted[rows] = field.counted_at[rows]
         if stands.any():
-            beside = self._beside(rows[stands], sent, here[stands], sun[stands])
+            beside = self._beside(rows[stands], sent, present[stands], sun[stands])
             error[stands] = np.maximum(error[stands], beside)
         return error
 
@@ -283,7 +285,7 @@ def _sun_off(values: Sequence[float], site: Site, utc_s: float) -> float:
     try:
         latitude, longitude, height, pressure, temperature = values
         other = Site(latitude, longitude, height, None if pressure < 0.0 else pressure, temperature)
-        suns = np.stack([fast_vector(utc_s, each) for each in (other, site)])
+        suns = np.stack([fast_vector(utc_s, place) for place in (other, site)])
     except (InputError, ValueError):
         return np.pi
     return float(_angle(suns[:1], suns[1:])[0])

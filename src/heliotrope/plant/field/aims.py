@@ -56,9 +56,9 @@ def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
         raise InputError(f"aim points: {len(targets)} of them; give at least one, finite, in ENU m")
     away = places - targets.mean(axis=0)
     order = np.lexsort((np.linalg.norm(away, axis=-1), np.arctan2(away[:, 0], away[:, 1])))
-    found = np.empty((len(places), 3))
-    found[order] = targets[np.arange(len(places)) % len(targets)]
-    return found
+    aims = np.empty((len(places), 3))
+    aims[order] = targets[np.arange(len(places)) % len(targets)]
+    return aims
 
 
 def default_aims(
@@ -83,14 +83,14 @@ def default_aims(
     if points is not None:
         return dict(zip(names, spread(vertices, points), strict=True))
     centre = design.receivers[0].center if design.receivers else np.full(3, np.nan)
-    found = {}
+    aims = {}
     for name in names:
         group, row = design.find(name)
         own = centre if group.aim is None else group.aim[row]
-        found[name] = own = own if np.isfinite(own).all() else centre
+        aims[name] = own = own if np.isfinite(own).all() else centre
         if not np.isfinite(own).all():
             raise InputError(f"heliostat {name}: no aim and no receiver; give aim points")
-    return found
+    return aims
 
 
 class BeamCheck:
@@ -226,7 +226,7 @@ class BeamCheck:
         start: FloatArray,
         stopped: bool,
     ) -> dict[str, str]:
-        """Return why heliostats may not aim at points, by name; empty if they all may.
+        """Return the heliostats that may not aim at points, and the reasons.
 
         Parameters
         ----------
@@ -243,24 +243,24 @@ class BeamCheck:
             Whether a surface at the aim (receiver, target) stops the beam. A beam at a standby
             point goes on beyond it.
         """
-        found: dict[str, str] = {}
+        reasons: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
         status = solved.chosen(solved.status)
         for i in np.flatnonzero(status != TrackingStatus.OK):
-            found[self.names[rows[i]]] = (
+            reasons[self.names[rows[i]]] = (
                 f"the aim {point_text(aims[i])} m: {TrackingStatus(int(status[i])).text}"
             )
         if not self.volumes:
-            return found
+            return reasons
         vertex = solved.chosen(solved.vertex)
         part = _rows_of(self.mirrors, rows)
         reach = np.linalg.norm(aims - vertex, axis=-1) if stopped else np.full(len(rows), FAR)
         rest = find_entries(beams(vertex, aims, part, reach=reach), self.volumes)
-        self._tell(found, rows, rest.entered, rest.first, "at the aim")
+        self._tell(reasons, rows, rest.entered, rest.first, "at the aim")
         swept = np.flatnonzero(np.isfinite(start).all(axis=-1) & (status == TrackingStatus.OK))
         if swept.size and sun[2] > 0.0:
-            self._sweep(found, rows[swept], start[swept], aims[swept], sun)
-        return found
+            self._sweep(reasons, rows[swept], start[swept], aims[swept], sun)
+        return reasons
 
     def glare(
         self,
@@ -269,7 +269,7 @@ class BeamCheck:
         possible: Sequence[tuple[npt.NDArray[np.intp], FloatArray]],
         sun: FloatArray,
     ) -> dict[str, str]:
-        """Return the heliostats whose resting beams would shine into an eye too brightly, and why.
+        """Return the heliostats whose resting beams would dazzle an eye, and the reasons.
 
         All resting beams together must stay below `MOST_SUNS` there; a heliostat is named if it
         shines into an eye where they do not.
@@ -287,25 +287,25 @@ class BeamCheck:
         if not len(self.eyes) or not len(rows):
             return {}
         some = [(rows, points), *possible]
-        known, places = (np.concatenate([each[i] for each in some]) for i in (0, 1))
+        known, places = (np.concatenate([standbys[i] for standbys in some]) for i in (0, 1))
         solved = self.poses(known, places, sun)
         part = _rows_of(self.mirrors, known)
         rest = beams(solved.chosen(solved.vertex), places, part, reach=np.full(len(known), FAR))
-        seen = crossing(rest, self.eyes, dni=1.0).concentration * part.reflectivity
+        concentration = crossing(rest, self.eyes, dni=1.0).concentration * part.reflectivity
         most = np.zeros((len(self.names), len(self.eyes)))
-        np.maximum.at(most, known, np.nan_to_num(seen).T)
+        np.maximum.at(most, known, np.nan_to_num(concentration).T)
         total = most.sum(axis=0)
-        found: dict[str, str] = {}
+        reasons: dict[str, str] = {}
         for eye in np.flatnonzero(~(total <= MOST_SUNS)):
-            lit = seen[eye, : len(rows)] > 0.0
-            for row in np.unique(rows[lit]):
-                found.setdefault(
+            shining = concentration[eye, : len(rows)] > 0.0
+            for row in np.unique(rows[shining]):
+                reasons.setdefault(
                     self.names[row],
                     f"at rest its beam shines on the place {point_text(self.eyes[eye])} m, where "
                     f"the light of all beams together is {total[eye]:.2f} suns (limit "
                     f"{MOST_SUNS:g}); choose another standby point",
                 )
-        return found
+        return reasons
 
     def on_the_way(
         self,
@@ -315,7 +315,7 @@ class BeamCheck:
         sun: FloatArray,
         motion: Callable[[npt.NDArray[np.intp], FloatArray, FloatArray], FloatArray],
     ) -> dict[str, str]:
-        """Return the heliostats whose beams would enter a volume on the way to their aims, and why.
+        """Return the heliostats whose beams would enter a volume on their paths, and the reasons.
 
         Parameters
         ----------
@@ -328,34 +328,34 @@ class BeamCheck:
         motion
             Returns the angles that the axes pass between counts; see `Paths.motion`.
         """
-        found: dict[str, str] = {}
+        reasons: dict[str, str] = {}
         solved = self.poses(rows, aims, sun, counts)
         status = solved.chosen(solved.status)
         for i in np.flatnonzero(status != TrackingStatus.OK):
-            found[self.names[rows[i]]] = (
+            reasons[self.names[rows[i]]] = (
                 f"the aim {point_text(aims[i])} m: {TrackingStatus(int(status[i])).text}"
             )
         good = status == TrackingStatus.OK
         if good.any():
             path = motion(rows[good], counts[good], solved.best_counts[good])
-            found |= self.moving(rows[good], path, sun)
-        return found
+            reasons |= self.moving(rows[good], path, sun)
+        return reasons
 
     def around(
         self, rows: npt.NDArray[np.intp], aims: FloatArray, radius: float, sun: FloatArray
     ) -> dict[str, str]:
-        """Return the heliostats whose beams would enter a volume near their aims (K, 3), and why.
+        """Return the heliostats whose beams would enter a volume near their aims (K, 3), and where.
 
         Parameters
         ----------
         rows, aims, sun
             As in `problems`.
         radius
-            Angle by which the beams leave their aims, rad. Nothing stops them there.
+            Largest angle between beams and their aims, rad. Nothing stops the beams there.
         """
-        found: dict[str, str] = {}
+        reasons: dict[str, str] = {}
         if not (self.volumes and sun[2] > 0.0):
-            return found
+            return reasons
         solved = self.poses(rows, aims, sun)
         vertices = solved.chosen(solved.vertex)
         for k in np.flatnonzero(solved.chosen(solved.status) == TrackingStatus.OK):
@@ -372,8 +372,8 @@ class BeamCheck:
             )
             hit = np.flatnonzero(rest.entered.any(axis=-1))[:1]
             same = np.repeat(rows[k : k + 1], len(hit))
-            self._tell(found, same, rest.entered[hit], rest.first[hit], "while it searches")
-        return found
+            self._tell(reasons, same, rest.entered[hit], rest.first[hit], "while it searches")
+        return reasons
 
     def moving(
         self,
@@ -395,10 +395,10 @@ class BeamCheck:
         when
             Where that is, in words.
         """
-        found: dict[str, str] = {}
+        reasons: dict[str, str] = {}
         if len(rows) and self.volumes and sun[..., 2].max() > 0.0:
-            self._check_motion(found, rows, path, sun, when)
-        return found
+            self._check_motion(reasons, rows, path, sun, when)
+        return reasons
 
     def crossing(
         self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray, when: str
@@ -417,7 +417,7 @@ class BeamCheck:
     def lights(
         self, rows: npt.NDArray[np.intp], angles: FloatArray, sun: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return which beams are on a receiver, (K,), with the axes at angles (K, 2).
+        """Return a mask of the beams on a receiver, (K,), with the axes at angles (K, 2).
 
         For ``sun`` see `problems`; it is the middle of a beam that counts.
         """
@@ -427,7 +427,7 @@ class BeamCheck:
     def _on_receivers(
         self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return whose middles of beams cross each of R receivers on a path, (K, R)."""
+        """Return masks of the beams whose middles cross R receivers on a path, (K, R)."""
         if not (len(rows) and self.solids and sun[..., 2].max() > 0.0):
             return np.zeros((len(rows), len(self.solids)), dtype=np.bool_)
         armature = Armature(self.armature.table[rows])
@@ -502,7 +502,7 @@ class BeamCheck:
 
     def _sweep(
         self,
-        found: dict[str, str],
+        reasons: dict[str, str],
         rows: npt.NDArray[np.intp],
         start: FloatArray,
         aims: FloatArray,
@@ -515,11 +515,11 @@ class BeamCheck:
         good = before.chosen(before.status) == TrackingStatus.OK
         path = np.stack([before.best_angles, after.best_angles], axis=-2)
         if good.any():
-            self._check_motion(found, rows[good], path[good], sun)
+            self._check_motion(reasons, rows[good], path[good], sun)
 
     def _check_motion(
         self,
-        found: dict[str, str],
+        reasons: dict[str, str],
         rows: npt.NDArray[np.intp],
         path: FloatArray,
         sun: FloatArray,
@@ -527,11 +527,11 @@ class BeamCheck:
     ) -> None:
         armature, mirrors = Armature(self.armature.table[rows]), _rows_of(self.mirrors, rows)
         motion = sweep(armature, path, sun, mirrors, self.volumes, reach=FAR)
-        self._tell(found, rows, motion.entered, motion.distance, when)
+        self._tell(reasons, rows, motion.entered, motion.distance, when)
 
     def _tell(
         self,
-        found: dict[str, str],
+        reasons: dict[str, str],
         rows: npt.NDArray[np.intp],
         entered: npt.NDArray[np.bool_],
         distance: FloatArray,
@@ -539,7 +539,7 @@ class BeamCheck:
     ) -> None:
         for i in np.flatnonzero(entered.any(axis=-1)):
             v = int(np.flatnonzero(entered[i])[0])
-            found.setdefault(
+            reasons.setdefault(
                 self.names[rows[i]],
                 f"the beam enters {self.volumes[v].name} {distance[i, v]:.0f} m from the mirror "
                 f"{when}; choose another point",
@@ -552,11 +552,11 @@ def _rows_of(mirrors: MirrorOptics, rows: npt.NDArray[np.intp] | list[int]) -> M
 
 def _disc(eye: FloatArray, aim: FloatArray, radius: float, apart: float) -> FloatArray:
     """Return points (P, 3) of the disc that a cone of half angle ``radius`` makes at the aim."""
-    way = aim - eye
-    distance = float(np.linalg.norm(way))
-    right = np.cross(way, (0.0, 0.0, 1.0)) if way[:2].any() else np.array([1.0, 0.0, 0.0])
+    ray = aim - eye
+    distance = float(np.linalg.norm(ray))
+    right = np.cross(ray, (0.0, 0.0, 1.0)) if ray[:2].any() else np.array([1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
-    up = np.cross(right, way) / distance
+    up = np.cross(right, ray) / distance
     wide = distance * float(np.tan(min(radius, 0.5)))
     points = [aim]
     for ring in np.linspace(0.0, wide, int(np.ceil(wide / apart)) + 1)[1:]:

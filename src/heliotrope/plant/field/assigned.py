@@ -206,7 +206,7 @@ class Points:
             self._taken[kind][name] = tuple(place), marks.get(name)
 
     def unknown(self, kind: str, rows: slice = slice(None)) -> npt.NDArray[np.bool_]:
-        """Return which local controllers, all (N,) or some (K,), may have any point.
+        """Return a mask of the local controllers, all (N,) or some (K,), that may have any point.
 
         The assigned one was not taken, and none before it is known: it was the first, or the store
         is a restored backup.
@@ -219,12 +219,12 @@ class Points:
         First the assigned points, of those that have one; then the points before, of those that may
         still have them.
         """
-        found = []
+        choices = []
         for points in (self._arrays[kind], *self.earlier[kind]):
             known = rows[np.isfinite(points[rows]).all(axis=-1)]
             if known.size:
-                found.append((known, points[known]))
-        return found
+                choices.append((known, points[known]))
+        return choices
 
     def storing(
         self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray, held: Held = NOTHING
@@ -247,8 +247,8 @@ class Points:
         def keep(
             chains: Mapping[str, Sequence[tuple[float, ...] | None]], more: Held = NOTHING
         ) -> None:
-            each = {k: {n: c[i] for n, c in chains.items()} for i, k in enumerate(kinds)}
-            self._keep({**more, **each})
+            changes = {k: {n: c[i] for n, c in chains.items()} for i, k in enumerate(kinds)}
+            self._keep({**more, **changes})
 
         def store() -> None:
             old.update({n: [self._stored[k].get(n) for k in kinds] for n in new})
@@ -279,8 +279,8 @@ class Points:
                     for n, (point, mark) in places.items()
                     if known.get(n) == point and marks.get(n) is mark
                 ]
-                for each in EARLIER[kind]:
-                    changes[each] = {n: None for n in names if n in self._stored[each]}
+                for earlier in EARLIER[kind]:
+                    changes[earlier] = {n: None for n in names if n in self._stored[earlier]}
             if any(changes.values()):
                 self._keep(changes)
 
@@ -289,7 +289,7 @@ class Points:
     def holding(self, held: Held) -> tuple[Work, Work]:
         """Return work of a disk that stores what visits hold, and its reverse.
 
-        None stands for what a visit holds no longer. Only what differs is written. Both raise
+        None means that a visit holds it no longer. Only what differs is written. Both raise
         `AssignedError` if it cannot be stored.
         """
         old: dict[str, dict[str, tuple[float, ...] | None]] = {}
@@ -312,13 +312,13 @@ class Points:
 
         ``held`` are the heliostats of which they hold something, by kind; ``now`` is monotonic s.
         """
-        gone = {(k, n) for k, names in held.items() for n in self._stored[k].keys() - set(names)}
-        self._idle = {each: self._idle.get(each, now) for each in gone}
-        due = [each for each, since in self._idle.items() if now - since >= _TAKEN_WITHIN]
+        free = {(k, n) for k, names in held.items() for n in self._stored[k].keys() - set(names)}
+        self._idle = {key: self._idle.get(key, now) for key in free}
+        due = [key for key, since in self._idle.items() if now - since >= _TAKEN_WITHIN]
         if not due:
             return None
-        for each in due:
-            del self._idle[each]
+        for key in due:
+            del self._idle[key]
         return self.holding({k: {n: None for kind, n in due if kind == k} for k in held})[0]
 
     def _keep(self, changes: Held) -> None:
@@ -333,7 +333,7 @@ class Points:
 
 
 def differ(a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which points (K, 3) differ, (K,); NaN is like NaN."""
+    """Return a mask of the points (K, 3) that differ, (K,); NaN is like NaN."""
     return np.asarray(~np.all((a == b) | (np.isnan(a) & np.isnan(b)), axis=-1))
 
 
@@ -380,16 +380,16 @@ def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
     """
     if not points:
         raise InputError(f"{kind}: no points; give one for each heliostat")
-    each = [as_vectors(point, f"{name}: point") for name, point in points.items()]
-    found = as_vectors(np.stack(each), "points")
-    if np.abs(found).max() > FAR:
-        raise InputError(f"{kind}: a point {np.abs(found).max():g} m away; at most {FAR:g} m")
-    return found
+    vectors = [as_vectors(point, f"{name}: point") for name, point in points.items()]
+    stacked = as_vectors(np.stack(vectors), "points")
+    if np.abs(stacked).max() > FAR:
+        raise InputError(f"{kind}: a point {np.abs(stacked).max():g} m away; at most {FAR:g} m")
+    return stacked
 
 
 def grouped(names: Sequence[str], points: FloatArray) -> dict[tuple[float, ...], list[str]]:
     """Return the heliostats of each point (K, 3), which share one command."""
-    found: dict[tuple[float, ...], list[str]] = {}
+    groups: dict[tuple[float, ...], list[str]] = {}
     for name, point in zip(names, points, strict=True):
-        found.setdefault(tuple(float(x) for x in point), []).append(name)
-    return found
+        groups.setdefault(tuple(float(x) for x in point), []).append(name)
+    return groups

@@ -26,7 +26,7 @@ Subscriber = Callable[[HeliostatCalibration], None]
 
 
 @dataclass(frozen=True)
-class Seen:
+class KnownSightings:
     """The M known sightings of one heliostat, in order of time.
 
     Attributes
@@ -69,7 +69,7 @@ class Beliefs:
     def __init__(self, design: Plant) -> None:
         self.design, self.flights = design, Flights()
         self._records: dict[str, HeliostatCalibration] = {}
-        self._seen: dict[str, Seen] = {}
+        self._known: dict[str, KnownSightings] = {}
         self._subscribers: list[Subscriber] = []
         self._number: Numbering = _unkept
         self._drifting: list[Subscriber] = []
@@ -89,7 +89,7 @@ class Beliefs:
         self._drifting.append(subscriber)
 
     def number_with(self, numbering: Numbering) -> None:
-        """Let a store keep and number new sightings."""
+        """Connect the store that keeps and numbers new sightings."""
         self._number = numbering
 
     # -- looking -------------------------------------------------------------------------------
@@ -120,17 +120,17 @@ class Beliefs:
         return self._growth[heliostat]
 
     def hyper(self, heliostat: str) -> Hyperparameters | None:
-        """Return what was learnt of the heliostat's group; None while the defaults are in force."""
+        """Return the hyperparameters of the heliostat's group; None while the defaults hold."""
         return self._hyper.get(heliostat)
 
-    def seen(self, heliostat: str) -> Seen | None:
+    def known(self, heliostat: str) -> KnownSightings | None:
         """Return the known sightings; None if there are none."""
-        return self._seen.get(heliostat)
+        return self._known.get(heliostat)
 
     def count(self, heliostat: str) -> int:
         """Return the number of known sightings of a heliostat, by photograph and from the air."""
-        seen = self._seen.get(heliostat)
-        return (0 if seen is None else len(seen)) + self.flights.count(heliostat)
+        known = self._known.get(heliostat)
+        return (0 if known is None else len(known)) + self.flights.count(heliostat)
 
     def __len__(self) -> int:
         return len(self._records)
@@ -141,22 +141,24 @@ class Beliefs:
 
     # -- taking --------------------------------------------------------------------------------
 
-    def note(self, heliostat: str, target: str, new: Sightings) -> Seen:
+    def note(self, heliostat: str, target: str, new: Sightings) -> KnownSightings:
         """Add sightings of a heliostat (row 0) on a target; return all that are known now.
 
         Sightings that the store could not keep before are offered to it again.
         """
         missed = beam_errors(self.present(heliostat), new).beam
-        added = Seen(new, np.zeros(len(new), np.int64), (target,) * len(new), missed)
-        known = _joined(self._seen.get(heliostat), added)
+        added = KnownSightings(new, np.zeros(len(new), np.int64), (target,) * len(new), missed)
+        known = _joined(self._known.get(heliostat), added)
         identities = known.identities.copy()
         for name in dict.fromkeys(known.targets):
-            there = np.array([each == name for each in known.targets], dtype=np.bool_)
-            rows = np.flatnonzero((identities == 0) & there)
+            mine = np.array([target == name for target in known.targets], dtype=np.bool_)
+            rows = np.flatnonzero((identities == 0) & mine)
             if len(rows):
                 identities[rows] = self._number(heliostat, name, known.sightings.take(rows))
-        self._seen[heliostat] = Seen(known.sightings, identities, known.targets, known.missed)
-        return self._seen[heliostat]
+        self._known[heliostat] = KnownSightings(
+            known.sightings, identities, known.targets, known.missed
+        )
+        return self._known[heliostat]
 
     def take(self, record: HeliostatCalibration) -> HeliostatCalibration:
         """Make a calibration the current one, pass it to all subscribers, and return it.
@@ -195,14 +197,16 @@ class Beliefs:
         """Restore a calibration and its sightings from before a restart."""
         if len(sightings):
             unknown = np.full(len(sightings), np.nan)
-            self._seen[record.heliostat] = Seen(sightings, identities, tuple(targets), unknown)
+            self._known[record.heliostat] = KnownSightings(
+                sightings, identities, tuple(targets), unknown
+            )
         self.take(record)
 
 
-def _joined(known: Seen | None, added: Seen) -> Seen:
+def _joined(known: KnownSightings | None, added: KnownSightings) -> KnownSightings:
     if known is None:
         return added
-    return Seen(
+    return KnownSightings(
         join([known.sightings, added.sightings]),
         np.concatenate([known.identities, added.identities]),
         (*known.targets, *added.targets),

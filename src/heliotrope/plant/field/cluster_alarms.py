@@ -1,4 +1,4 @@
-"""The alarms that clusters have told of, compared with those that they list in their statuses."""
+"""The alarms that clusters have reported, compared with those that they list in their statuses."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,9 +11,9 @@ _Key = tuple[str, str]
 
 
 class ClusterAlarms(Part):
-    """Alarms of clusters, each told once though it is repeated, and ended though its end was lost.
+    """Alarms of clusters, each reported once if repeated, and ended even if its end was lost.
 
-    A message may be lost with its connection, or come when the plant's program stands still. So a
+    A message may be lost with its connection, or come while the plant's program is frozen. So a
     cluster repeats its alarms, and lists them; see `ClusterStatus`.
 
     Parameters
@@ -28,14 +28,14 @@ class ClusterAlarms(Part):
 
     def on_alarm(self, cluster: str, alarm: Alarm) -> None:
         """Report an alarm of a cluster if it is news."""
-        for each in self.take(cluster, alarm):
-            self._tell(each)
+        for news in self.take(cluster, alarm):
+            self._tell(news)
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
         """Report the ends of those alarms that a cluster no longer lists."""
         del now
-        for each in self.compare(cluster, status):
-            self._tell(each)
+        for news in self.compare(cluster, status):
+            self._tell(news)
 
     def take(self, cluster: str, alarm: Alarm) -> list[Alarm]:
         """Take an alarm of a cluster; return it if it is news."""
@@ -60,4 +60,4 @@ class ClusterAlarms(Part):
         listed = {(condition, subject or cluster) for condition, _, subject in pairs}
         active = self._active.get(cluster, {})
         ended = [active.pop(key) for key in tuple(active) if key not in listed]
-        return [replace(each, text=f"{each.condition}: over", active=False) for each in ended]
+        return [replace(alarm, text=f"{alarm.condition}: over", active=False) for alarm in ended]

@@ -36,7 +36,7 @@ class ClusterSettings(Part):
         self._counts: Counter[str] = Counter()
         #: When a cluster was first found to differ, monotonic s; alarms raised, by cluster.
         self._since: dict[str, float] = {}
-        self._told: dict[str, Alarm] = {}
+        self._raised: dict[str, Alarm] = {}
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
         """Take a cluster's status that has arrived at a monotonic time, s."""
@@ -44,12 +44,12 @@ class ClusterSettings(Part):
         others = self._differing(cluster)
         if not others:
             self._since.pop(cluster, None)
-            if self._told.pop(cluster, None) is not None:
+            if self._raised.pop(cluster, None) is not None:
                 self._tell(alarms.SETTINGS_DIFFER.ended(cluster))
         elif now - self._since.setdefault(cluster, now) >= PATIENCE:
             alarm = alarms.SETTINGS_DIFFER.raised(cluster, others=others)
-            if self._told.get(cluster) != alarm:
-                self._told[cluster] = alarm
+            if self._raised.get(cluster) != alarm:
+                self._raised[cluster] = alarm
                 self._tell(alarm)
 
     def _learn(self, cluster: str, checksum: str) -> None:
@@ -61,15 +61,15 @@ class ClusterSettings(Part):
         if checksum:
             self._known[cluster] = checksum
 
-    def _differing(self, cluster: str) -> str:
-        """Return in words from what a cluster differs; "" if it need not be named."""
+    def _differing(self, cluster: str) -> str | None:
+        """Return the clusters from which a cluster differs, in words; None if it agrees."""
         checksum = self._known.get(cluster, "")
         if self._expected:
-            return EXPECTED if checksum not in ("", self._expected) else ""
+            return EXPECTED if checksum not in ("", self._expected) else None
         own, total = self._counts[checksum], len(self._known)
         others, differ = total - 1, total - own
         if not own or 2 * differ <= others:
-            return ""
+            return None
         if others == 1:
             return next(name for name in self._known if name != cluster)
         if len(self._counts) == 2 and own == 1:

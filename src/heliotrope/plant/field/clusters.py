@@ -27,7 +27,7 @@ QUESTION_LIFE, ANSWER_PATIENCE = 5.0, 60.0
 class _Post:
     message: Message | Callable[[], Message | None]
     expires: float | None
-    told: Callable[[SendOutcome], None] | None
+    report: Callable[[SendOutcome], None] | None
 
 
 class ClusterEnd:
@@ -56,7 +56,7 @@ class ClusterEnd:
         self,
         message: Message | Callable[[], Message | None],
         lifetime: float | None,
-        told: Callable[[SendOutcome], None] | None = None,
+        report: Callable[[SendOutcome], None] | None = None,
         *,
         urgent: bool = False,
     ) -> None:
@@ -66,11 +66,11 @@ class ClusterEnd:
         """
         expires = None if lifetime is None else self._clock.monotonic() + lifetime
         box = self._urgent if urgent else self._normal
-        box.append(_Post(message, expires, told))
+        box.append(_Post(message, expires, report))
         self._news[not urgent].set()
 
     async def deliver(self, *, urgent: bool) -> None:
-        """Send what is posted, until the link is closed."""
+        """Send the posted messages, until the link is closed."""
         box, news = (self._urgent if urgent else self._normal), self._news[not urgent]
         while not self.link.closed:
             while box:
@@ -84,8 +84,8 @@ class ClusterEnd:
                     )
                 except LinkClosedError:
                     outcome = SendOutcome.DISCONNECTED
-                if post.told is not None:
-                    post.told(outcome)
+                if post.report is not None:
+                    post.report(outcome)
             news.clear()
             await news.wait()
 
@@ -153,10 +153,10 @@ class Clusters:
 
     def parts(self, heliostats: Iterable[str]) -> list[tuple[ClusterEnd, tuple[str, ...]]]:
         """Return heliostats by their clusters."""
-        found: dict[str, list[str]] = {}
+        members: dict[str, list[str]] = {}
         for name in heliostats:
-            found.setdefault(self._home[name].name, []).append(name)
-        return [(self.ends[cluster], tuple(names)) for cluster, names in found.items()]
+            members.setdefault(self._home[name].name, []).append(name)
+        return [(self.ends[cluster], tuple(names)) for cluster, names in members.items()]
 
     def connected(self, heliostats: Iterable[str]) -> list[str]:
         """Return the heliostats whose clusters are connected."""

@@ -1,12 +1,12 @@
 """Heliostats whose step counts or parameters are in doubt, and what confirms that they are right.
 
 A power cut in motion may leave the step counts of a local controller wrong by up to 1,000 steps,
-which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then stand beside its place without
-any other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target
-or a person has confirmed its place. A confirmation holds for one boot: it says nothing of the next
-cut. One that stores new parameters which a calibration has yet to verify stays off in the same way,
-one whose parameters a flight of a drone contradicts, one whose drives stall, and all while no
-witness confirms the sun.
+which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then be off its place without any other
+sign. Such a heliostat is named, and kept off the receiver until a photograph on a target or a
+person has confirmed its place. A confirmation holds for one boot: it says nothing of the next cut.
+One that stores new parameters which a calibration has yet to verify stays off in the same way, one
+whose parameters a flight of a drone contradicts, one whose drives stall, and all while no witness
+confirms the sun.
 """
 
 import contextlib
@@ -36,7 +36,8 @@ class DoubtfulPositions(Part):
     tell
         Called with each alarm.
     unwitnessed
-        Returns why no heliostat may join a receiver, "" if heliostats may; see `witnesses`.
+        Returns the reason why no heliostat may join a receiver, None if heliostats may; see
+        `witnesses`.
     stalled
         Heliostats whose drives stall; see `drive_checks`.
 
@@ -51,18 +52,20 @@ class DoubtfulPositions(Part):
         field: FieldState,
         design: Plant,
         tell: Callable[[Alarm], None],
-        unwitnessed: Callable[[], str],
+        unwitnessed: Callable[[], str | None],
         stalled: Collection[str],
     ) -> None:
         self._unwitnessed, self._stalled = unwitnessed, stalled
         self._field, self._tell = field, tell
-        self._receivers = np.array([each.center for each in design.receivers]).reshape(-1, 3)
-        self._targets = np.array([each.center for each in design.targets]).reshape(-1, 3)
-        self._reach = np.array([np.hypot(each.width, each.height) for each in design.targets])
+        self._receivers = np.array([surface.center for surface in design.receivers]).reshape(-1, 3)
+        self._targets = np.array([surface.center for surface in design.targets]).reshape(-1, 3)
+        self._reach = np.array(
+            [np.hypot(surface.width, surface.height) for surface in design.targets]
+        )
         #: Rows whose new parameters are being verified.
         self._unverified: set[int] = set()
         #: Rows that a flight sees far from where their parameters say.
-        self._astray: frozenset[int] = frozenset()
+        self._off_place: frozenset[int] = frozenset()
         #: Boots of each local controller when its place was confirmed, -1 before.
         self._confirmed = np.full(len(field), -1, dtype=np.int64)
         self.standing: Mask = np.zeros(len(field), dtype=np.bool_)
@@ -100,19 +103,19 @@ class DoubtfulPositions(Part):
         """Return the heliostats whose new parameters are being verified."""
         return tuple(name for name in heliostats if self._field.place(name) in self._unverified)
 
-    def astray(self, heliostats: Iterable[str]) -> None:
+    def keep_off(self, heliostats: Iterable[str]) -> None:
         """Keep heliostats off the receiver that a flight sees far from where they should be.
 
         The others that were named before may join it again.
         """
-        self._astray = frozenset(self._field.place(name) for name in heliostats)
+        self._off_place = frozenset(self._field.place(name) for name in heliostats)
 
     def _judge(self, rows: list[int]) -> None:
-        found = self._field.rows[rows]
+        nodes = self._field.rows[rows]
         # Counts that are not known at all are a fault of their own, which only ZERO ends.
-        doubtful = found["flags"] & meanings.COUNTS_DOUBTFUL != 0
-        doubtful &= found["flags"] & meanings.COUNTS_UNKNOWN == 0
-        doubtful &= found["boots"] != self._confirmed[rows]
+        doubtful = nodes["flags"] & meanings.COUNTS_DOUBTFUL != 0
+        doubtful &= nodes["flags"] & meanings.COUNTS_UNKNOWN == 0
+        doubtful &= nodes["boots"] != self._confirmed[rows]
         changed = np.flatnonzero(doubtful != self.standing[rows])
         self.standing[rows] = doubtful
         for i in changed:
@@ -120,25 +123,27 @@ class DoubtfulPositions(Part):
             self._tell(kind.raised(name) if doubtful[i] else kind.ended(name))
 
     def reasons(self, names: Sequence[str], points: FloatArray) -> list[str | None]:
-        """Return why each of some heliostats (K) may not join its point (K, 3), None if it may."""
+        """Return the reasons why heliostats (K) may not join their points (K, 3), or None."""
         rows = [self._field.place(name) for name in names]
-        unverified, astray = (np.isin(rows, list(s)) for s in (self._unverified, self._astray))
+        unverified, off_place = (
+            np.isin(rows, list(s)) for s in (self._unverified, self._off_place)
+        )
         blocked = self._unwitnessed()
         stalled = np.array([name in self._stalled for name in names], dtype=np.bool_)
-        doubted = self.standing[rows] | unverified | astray | stalled | bool(blocked)
+        doubted = self.standing[rows] | unverified | off_place | stalled | bool(blocked)
         if not doubted.any():
             return [None] * len(names)
-        found = np.full(len(names), blocked or None, dtype=np.object_)
-        found[self.standing[rows]] = refusals.COUNTS_DOUBTFUL.text
-        found[astray] = refusals.SEEN_ASTRAY.text
-        found[stalled] = refusals.DRIVE_STALLED.text
-        found[unverified] = refusals.NOT_VERIFIED.text
-        found[self._on_target(points)] = None
-        reasons: list[str | None] = found.tolist()
+        texts = np.full(len(names), blocked, dtype=np.object_)
+        texts[self.standing[rows]] = refusals.COUNTS_DOUBTFUL.text
+        texts[off_place] = refusals.SEEN_ASTRAY.text
+        texts[stalled] = refusals.DRIVE_STALLED.text
+        texts[unverified] = refusals.NOT_VERIFIED.text
+        texts[self._on_target(points)] = None
+        reasons: list[str | None] = texts.tolist()
         return reasons
 
     def _on_target(self, points: FloatArray) -> Mask:
-        """Return which points (K, 3) are at a target, and nearer to it than to a receiver."""
+        """Return a mask of the points (K, 3) at a target, and nearer to it than to a receiver."""
         apart, away = (
             np.linalg.norm(points[:, None] - centers, axis=-1)
             for centers in (self._targets, self._receivers)

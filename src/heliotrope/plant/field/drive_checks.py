@@ -1,4 +1,4 @@
-"""Whether drives turn their mirrors: what a measurement has shown today, and which drives stall.
+"""Whether drives turn their mirrors: today's evidence by measurements, and the drives that stall.
 
 Step counts are the steps that a board has sent to its motors. Ice, a loose coupling or a driver
 without current leave the mirror where it is, and the counts go on. A diagnosis of movement with a
@@ -33,7 +33,7 @@ _POLL = 0.5
 
 
 class DriveChecks(Part):
-    """What is known of the drives beside their step counts.
+    """The knowledge of the drives beyond their step counts.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class DriveChecks(Part):
         self._faulty: set[str] = set()
         self._silent: set[str] = set()
 
-    async def told(self, heliostats: Iterable[str], timeout: float) -> None:
+    async def checked(self, heliostats: Iterable[str], timeout: float) -> None:
         """Wait until heliostats are no longer due, ``timeout`` s at most."""
         until = self._clock.monotonic() + timeout
         while self.due.intersection(heliostats) and self._clock.monotonic() < until:
@@ -116,7 +116,7 @@ class DriveChecks(Part):
             if stalls:
                 self._stalls(name, stalls)
             elif result & _MOVED:
-                self.seen(name, TILT_SENSOR)
+                self.observed(name, TILT_SENSOR)
 
         return take
 
@@ -133,7 +133,7 @@ class DriveChecks(Part):
             self.stalled[name] = f"{text} made steps, and its mirror did not follow"
             self._tell(alarms.DRIVE_STALLED.raised(name, drives=text))
 
-    def seen(self, heliostat: str, by: str) -> None:
+    def observed(self, heliostat: str, by: str) -> None:
         """Note that the mirror was seen to follow its drives, by a sensor."""
         self._shown[heliostat] = self._today(), by
         self._follows(heliostat)
@@ -149,7 +149,7 @@ class DriveChecks(Part):
 
     @property
     def shown(self) -> Mapping[str, str]:
-        """What has shown today that mirrors follow their drives, by heliostat."""
+        """Today's evidence that mirrors follow their drives, by heliostat."""
         today = self._today()
         return {name: by for name, (day, by) in self._shown.items() if day == today}
 

@@ -35,7 +35,7 @@ class Firmware(Part):
         self._expected, self._clusters, self._tell = expected, clusters, tell
         #: When clusters that have not answered are asked next, monotonic s.
         self._due: dict[str, float] = {}
-        self._told: set[str] = set()
+        self._raised: set[str] = set()
 
     def on_connected(self, cluster: str, now: float) -> None:
         """Compare the boards of a cluster that has connected."""
@@ -52,26 +52,28 @@ class Firmware(Part):
 
     def _taker(self, cluster: str) -> Callable[[Answer], None]:
         def take(answer: Answer) -> None:
-            found = answer.data.get("found")
-            if not isinstance(found, list):
+            boards = answer.data.get("found")
+            if not isinstance(boards, list):
                 return  # it is asked again
             self._due.pop(cluster, None)
             others = {
-                str(one.get("name") or f"serial number {one.get('serial')}"): one.get("firmware")
-                for one in found
-                if isinstance(one, dict) and one.get("firmware") != self._expected
+                str(board.get("name") or f"serial number {board.get('serial')}"): board.get(
+                    "firmware"
+                )
+                for board in boards
+                if isinstance(board, dict) and board.get("firmware") != self._expected
             }
             if others:
                 listed = [f"{name} ({version})" for name, version in others.items()][:_NAMED]
                 more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
-                self._told.add(cluster)
+                self._raised.add(cluster)
                 self._tell(
                     alarms.FIRMWARE_DIFFERS.raised(
                         cluster, boards=", ".join(listed) + more, expected=self._expected
                     )
                 )
-            elif cluster in self._told:
-                self._told.remove(cluster)
+            elif cluster in self._raised:
+                self._raised.remove(cluster)
                 self._tell(alarms.FIRMWARE_DIFFERS.ended(cluster))
 
         return take

@@ -67,13 +67,13 @@ class Flights:
 
     def _set(self, taken: tuple[TakenFlight, ...]) -> None:
         self._taken = taken
-        sizes = [len(each.flight.shared) for each in taken]
+        sizes = [len(flown.flight.shared) for flown in taken]
         self._edges = np.concatenate([[0], np.cumsum(sizes, dtype=np.intp)])
         empty = np.zeros(0, np.intp)
         self._rows: dict[str, list[npt.NDArray[np.intp]]] = {}
-        for k, each in enumerate(taken):
-            for name, rows in each.flight.rows_by_heliostat().items():
-                if name not in each.left_out:
+        for k, flown in enumerate(taken):
+            for name, rows in flown.flight.rows_by_heliostat().items():
+                if name not in flown.left_out:
                     self._rows.setdefault(name, [empty] * len(taken))[k] = rows
 
     def __len__(self) -> int:
@@ -93,8 +93,8 @@ class Flights:
     def adding(self, new: TakenFlight) -> "Flights":
         """Return the flights with one more; beyond `MOST` the oldest are left out."""
         taken = (*self._taken, new)
-        gone = len(taken) - MOST if len(taken) > MOST else 0
-        first, size = self._edges[gone], len(new.flight.shared)
+        oldest = len(taken) - MOST if len(taken) > MOST else 0
+        first, size = self._edges[oldest], len(new.flight.shared)
         parts = {
             name: (
                 np.pad(information[first:, first:], ((0, size), (0, size))),
@@ -102,10 +102,10 @@ class Flights:
             )
             for name, (information, pull) in self._parts.items()
         }
-        return Flights(taken[gone:], parts)
+        return Flights(taken[oldest:], parts)
 
     def learn(self, heliostat: str, information: FloatArray, pull: FloatArray) -> None:
-        """Keep what the last fit of a heliostat revealed of the shared errors.
+        """Keep the information on the shared errors from the last fit of a heliostat.
 
         A fit that began before the last flight was taken knows nothing of its errors, and is left
         out.
@@ -122,8 +122,8 @@ class Flights:
         """Keep the numbers that the store gave to the sightings of a flight, (M,)."""
         self._set(
             tuple(
-                replace(each, identities=identities) if each.flight.name == flight else each
-                for each in self._taken
+                replace(flown, identities=identities) if flown.flight.name == flight else flown
+                for flown in self._taken
             )
         )
 
@@ -137,8 +137,8 @@ class Flights:
         """
         count = int(self._edges[-1])
         known, drawn = np.zeros((count, count)), np.zeros(count)
-        for each, first, last in zip(self._taken, self._edges[:-1], self._edges[1:], strict=True):
-            known[first:last, first:last] = np.linalg.inv(each.flight.covariance)
+        for flown, first, last in zip(self._taken, self._edges[:-1], self._edges[1:], strict=True):
+            known[first:last, first:last] = np.linalg.inv(flown.flight.covariance)
         for name, (information, pull) in self._parts.items():
             if name not in but:
                 known += information
@@ -155,7 +155,7 @@ class Flights:
     def identities(self, heliostat: str) -> Identities:
         """Return the numbers of a heliostat's rows, in the order of `common`."""
         rows = self._rows.get(heliostat, [])
-        parts = [each.identities[r] for each, r in zip(self._taken, rows, strict=bool(rows))]
+        parts = [flown.identities[r] for flown, r in zip(self._taken, rows, strict=bool(rows))]
         return np.concatenate([np.zeros(0, np.int64), *parts])
 
     def common(
@@ -180,10 +180,10 @@ class Flights:
                 shifts.append(np.zeros((len(photographs), 3, count)))
                 turned.append(np.zeros(len(photographs), np.bool_))
             rows_of = self._rows.get(name) or [np.zeros(0, np.intp)] * len(self._taken)
-            for k, (each, rows) in enumerate(zip(self._taken, rows_of, strict=True)):
+            for k, (flown, rows) in enumerate(zip(self._taken, rows_of, strict=True)):
                 if not len(rows):
                     continue
-                flight = each.flight
+                flight = flown.flight
                 parts.append(_as_row(flight.sightings.take(rows), i))
                 shift = np.zeros((len(rows), 3, count))
                 shift[:, :, self._edges[k] : self._edges[k + 1]] = flight.shift[rows]
@@ -203,24 +203,28 @@ class Flights:
         left out.
         """
         mean, covariance = self.shared({heliostat})
-        found = []
+        parts = []
         rows_of = self._rows.get(heliostat, ())
-        for k, (each, rows) in enumerate(zip(self._taken, rows_of, strict=bool(rows_of))):
+        for k, (taken, rows) in enumerate(zip(self._taken, rows_of, strict=bool(rows_of))):
             if not len(rows):
                 continue
-            part, flight = slice(self._edges[k], self._edges[k + 1]), each.flight
-            seen = _as_row(flight.sightings.take(rows), 0)
+            part, flight = slice(self._edges[k], self._edges[k + 1]), taken.flight
+            sightings = _as_row(flight.sightings.take(rows), 0)
             away = flight.shift[rows] @ mean[part]
-            seen = replace(
-                seen,
-                source=np.where(seen.source_at_infinity[:, None], seen.source, seen.source - away),
+            sightings = replace(
+                sightings,
+                source=np.where(
+                    sightings.source_at_infinity[:, None], sightings.source, sightings.source - away
+                ),
                 destination=np.where(
-                    seen.destination_at_infinity[:, None], seen.destination, seen.destination - away
+                    sightings.destination_at_infinity[:, None],
+                    sightings.destination,
+                    sightings.destination - away,
                 ),
             )
             turn = float(flight.turn_sigma[flight.heliostats.index(heliostat)])
-            found.append(Flown(seen, flight.shift[rows], covariance[part, part], turn))
-        return tuple(found)
+            parts.append(Flown(sightings, flight.shift[rows], covariance[part, part], turn))
+        return tuple(parts)
 
 
 def _as_row(sightings: Sightings, row: int) -> Sightings:

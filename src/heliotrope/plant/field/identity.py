@@ -35,18 +35,18 @@ class Identities(Part):
         State of the field.
     armatures
         Armatures of the plant's beliefs at its start, (N, 18).
-    wanted
+    expected
         Items that heliostats should store, by name and item.
     connections
         Returns how often the link to a cluster has been opened.
     tell
         Called with each alarm.
     give_up
-        Called with the reason and the names of heliostats newly found strange.
+        Called with the reason and the names of heliostats newly found mismatched.
 
     Attributes
     ----------
-    strange
+    mismatched
         Why a heliostat is not what its address says, by name.
     """
 
@@ -54,15 +54,15 @@ class Identities(Part):
         self,
         field: FieldState,
         armatures: FloatArray,
-        wanted: Mapping[str, Mapping[str, bytes]],
+        expected: Mapping[str, Mapping[str, bytes]],
         connections: Callable[[str], int],
         tell: Callable[[Alarm], None],
         give_up: Callable[[str, frozenset[str]], None],
     ) -> None:
         self._field, self._connections, self._tell = field, connections, tell
         self._give_up = give_up
-        self._wanted = wanted
-        self.strange: dict[str, str] = {}
+        self._expected = expected
+        self.mismatched: dict[str, str] = {}
         #: Rows of the heliostats that have ever had an armature, by its checksum.
         self._owners: defaultdict[int, set[int]] = defaultdict(set)
         #: Checksums last reported, 0 before; whether they are the heliostat's own.
@@ -80,7 +80,7 @@ class Identities(Part):
         self._judged: dict[str, int] = {}
         for row, armature in enumerate(armatures):
             self._owners[crc32(armature.tobytes())].add(row)
-        for name, items in wanted.items():
+        for name, items in expected.items():
             if "armature" in items:
                 self._owners[crc32(items["armature"])].add(field.index[name])
 
@@ -119,54 +119,54 @@ class Identities(Part):
             self._own[row] = row in self._of(row)
             alien = not self._own[row] and bool(self._of(row))
             (self._foreign.add if alien else self._foreign.discard)(row)
-        if not changed or not (self._foreign or self.strange):
+        if not changed or not (self._foreign or self.mismatched):
             return
-        names, found = self._field.names, dict[str, str]()
+        names, reasons = self._field.names, dict[str, str]()
         pairs = [(row, other) for row in sorted(self._foreign) for other in sorted(self._of(row))]
         for row, other in pairs:
             text = refusals.OTHER_PARAMETERS.text.format(other=names[other])
-            found.setdefault(names[row], text)
+            reasons.setdefault(names[row], text)
         for row, other in pairs:
             if not self._own[other]:
                 text = f"its parameters answer at the address of {names[row]}"
-                found.setdefault(names[other], text)
-        new = tuple(name for name, text in found.items() if self.strange.get(name) != text)
+                reasons.setdefault(names[other], text)
+        new = tuple(name for name, text in reasons.items() if self.mismatched.get(name) != text)
         for name in new:
-            self._tell(alarms.IDENTITY.raised(name, problem=found[name]))
-        for name in self.strange.keys() - found.keys():
+            self._tell(alarms.IDENTITY.raised(name, problem=reasons[name]))
+        for name in self.mismatched.keys() - reasons.keys():
             self._tell(alarms.IDENTITY.ended(name))
-        self.strange = found
+        self.mismatched = reasons
         if new:
-            self._give_up(found[new[0]], frozenset(new))
+            self._give_up(reasons[new[0]], frozenset(new))
 
     def _of(self, row: int) -> set[int]:
         """Return the rows of the heliostats that have ever had the armature of a row."""
         return self._owners.get(int(self._stored[row]), set())
 
-    def untrusted(self, heliostat: str) -> str:
-        """Return why nothing that a heliostat reports proves where its beam is, "" if it may.
+    def untrusted(self, heliostat: str) -> str | None:
+        """Return the reason why a heliostat's reports prove nothing of its beam, None if they do.
 
-        It is strange, or its board stores an armature that the plant has never known: its step
+        It is mismatched, or its board stores an armature that the plant has never known: its step
         counts are those of the mirror that it was at before.
         """
         row = self._field.index[heliostat]
-        unknown = self._stored[row] != 0 and not self._own[row] and heliostat in self._wanted
-        return self.strange.get(heliostat) or (_UNKNOWN if unknown else "")
+        unknown = self._stored[row] != 0 and not self._own[row] and heliostat in self._expected
+        return self.mismatched.get(heliostat) or (_UNKNOWN if unknown else None)
 
     def blocked(self, heliostat: str) -> str | None:
-        """Return why a heliostat may be neither moved nor written, None if it may."""
+        """Return the reason why a heliostat may be neither moved nor written, None if it may."""
         field, row = self._field, self._field.place(heliostat)
         cluster = field.clusters[field.cluster[row]]
-        if heliostat in self.strange:
-            return self.strange[heliostat]
+        if heliostat in self.mismatched:
+            return self.mismatched[heliostat]
         if heliostat in field.unlisted:
             return refusals.UNLISTED.text.format(cluster=cluster)
         judged = self._judged.get(cluster, -1) == self._connections(cluster)
         return None if judged and math.isfinite(field.heard[row]) else refusals.NOT_HEARD.text
 
     def off(self, now: float) -> dict[str, tuple[Act, str]]:
-        """Return the strange heliostats that must leave, by name: by which act, and why."""
-        if not self.strange:
+        """Return the mismatched heliostats that must leave, with the act and the reason."""
+        if not self.mismatched:
             return {}
         field = self._field
         # DEFOCUSED is not among them: a defocus is relative to goals, which may belong to the
@@ -175,6 +175,6 @@ class Identities(Part):
         needed = field.live(now) & ~going
         return {
             name: (Act.STOW, f"{name}: {text}")
-            for name, text in self.strange.items()
+            for name, text in self.mismatched.items()
             if needed[field.index[name]]
         }

@@ -1,4 +1,4 @@
-"""What a group of mirrors teaches, learnt in a process beside the plant."""
+"""The learning of groups of mirrors, in a process beside the plant."""
 
 import asyncio
 import os
@@ -16,7 +16,7 @@ _MODULE = "heliotrope.calibration.learn.worker"
 
 
 class LearnerProcess:
-    """Learns groups, each in a process of its own that takes what the plant leaves of the machine.
+    """Learns groups, each in a process of its own that uses the computing time left by the plant.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class LearnerProcess:
         self._longest = longest
 
     async def learn(self, group: GroupHistory) -> LearntGroup:
-        """Return what a group teaches.
+        """Return the result of learning a group.
 
         Raises
         ------

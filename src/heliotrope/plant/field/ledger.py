@@ -2,11 +2,11 @@
 
 A report says nothing of an order that the board had not taken yet when it made the report. A path
 is proven from where a heliostat was last reported: if another order has been sent since, it may
-have left that place, and is somewhere on a path that nobody has proven. Whoever asks whether a
-report counts, or which of two orders came later, asks here.
+have left that place, and be somewhere on a path without a proof. Whether a report counts, or
+which of two orders came later, is answered here.
 
-A heliostat that leaves the receiver was lost, unless it was ordered off, by anybody: `losses` asks
-here for that too.
+A heliostat that leaves the receiver was lost, unless somebody ordered it off, which `losses`
+looks up here too.
 """
 
 from collections.abc import Sequence
@@ -115,11 +115,11 @@ class Ledger(Part):
             # One that is silent, off already, or has refused a command since it was last heard, may
             # have left before: then the order is no cause.
             out_at = self._kinds[_OUT].sent
-            gone = np.isin(self._field.rows["state"][rows], _GONE)
-            gone &= out_at[rows] + _TAKEN_WITHIN <= self._field.heard[rows]
-            gone |= self._refused_at[rows] > self._field.heard[rows]
-            gone |= ~self._field.live(now)[rows] | (self._off_at[rows] > out_at[rows])
-            self._off_at[rows[~gone]], self._obeyed[rows[~gone]] = now, False
+            excused = np.isin(self._field.rows["state"][rows], _GONE)
+            excused &= out_at[rows] + _TAKEN_WITHIN <= self._field.heard[rows]
+            excused |= self._refused_at[rows] > self._field.heard[rows]
+            excused |= ~self._field.live(now)[rows] | (self._off_at[rows] > out_at[rows])
+            self._off_at[rows[~excused]], self._obeyed[rows[~excused]] = now, False
         self._number += 1
         for kind, column in self._of(name):
             mine = self._moved(kind, name, rows)
@@ -160,7 +160,7 @@ class Ledger(Part):
         self._off_at[self._rows(heliostats)] = -np.inf
 
     def _rows(self, heliostats: Sequence[str]) -> Rows:
-        return np.array([self._field.index[each] for each in heliostats], dtype=np.intp)
+        return np.array([self._field.index[name] for name in heliostats], dtype=np.intp)
 
     def _of(self, name: str) -> list[tuple[Kind, _Column]]:
         return [(kind, column) for kind, column in self._kinds.items() if name in kind]
@@ -174,22 +174,22 @@ class Ledger(Part):
     # -- questions -------------------------------------------------------------------------
 
     def reported(self, kind: Kind = MOVING) -> Mask:
-        """Return whose last report is from after their last order of a kind, (N,)."""
+        """Return a mask of heliostats that reported after their last order of a kind, (N,)."""
         return np.asarray(self._field.heard >= self._kinds[kind].shown)
 
     def sent_since(self, kind: Kind, at: float) -> Mask:
-        """Return which heliostats were first sent their last order of a kind since a time, (N,).
+        """Return a mask of the heliostats first sent their last order of a kind since a time, (N,).
 
         ``at`` is in monotonic s; a repetition does not count.
         """
         return np.asarray(self._kinds[kind].sent >= at)
 
     def later(self, kind: Kind, other: Kind) -> Mask:
-        """Return which heliostats were sent an order of a kind after all of another kind, (N,)."""
+        """Return a mask of heliostats sent an order of a kind after all of another, (N,)."""
         return np.asarray(self._kinds[kind].number > self._kinds[other].number)
 
     def obeyed_since(self, kind: Kind, at: float, after: Kind) -> Mask:
-        """Return which heliostats have acknowledged an order of a kind since a time, (N,).
+        """Return a mask of the heliostats that acknowledged an order of a kind since a time, (N,).
 
         It counts only if it was accepted after the last order of the kind ``after`` was sent.
         """
@@ -197,16 +197,16 @@ class Ledger(Part):
         in_order = column.accepted > self._kinds[after].sent
         return np.asarray(in_order & (column.acknowledged >= at))
 
-    def off(self, seen: FloatArray, now: float) -> Mask:
-        """Return which heliostats were ordered off, by anybody, (N,); to be asked at each check.
+    def off(self, out_at: FloatArray, now: float) -> Mask:
+        """Return a mask of the heliostats ordered off by anybody, (N,); call it at each check.
 
-        It is the last order that they were sent, or it was sent after they were last ``seen`` out,
-        monotonic s, (N,). An order to one that was silent, or fell silent before it acknowledged
-        it, or was off already, or had refused a command since it was last heard, does not count: it
-        may have left by itself. Nor does an order of the safety table to a whole cluster, which is
-        silent, or has lost the time.
+        It is their last order, or was sent after they were last out (``out_at``, monotonic s,
+        (N,)). An order does not count, since the heliostat may have left by itself, if it was
+        silent, fell silent before it acknowledged the order, was off already, or had refused a
+        command since its last report. Nor does an order of the safety table to a whole cluster that
+        is silent, or has lost the time.
         """
         self._off_at[~self._field.live(now) & ~self._obeyed] = -np.inf
         ordered = np.isfinite(self._off_at)
-        later = self._off_at + _TAKEN_WITHIN > seen
+        later = self._off_at + _TAKEN_WITHIN > out_at
         return np.asarray(ordered & (later | (self._off_at > self._kinds[_OUT].sent)))

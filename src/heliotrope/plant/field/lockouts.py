@@ -1,6 +1,6 @@
 """Locks of persons: heliostats out of service, and targets, receivers and towers under work.
 
-Each person has a lock of their own, as lockout-tagout asks for: what is locked is back in service
+Each person has a lock of their own, as lockout-tagout requires: a locked place is back in service
 when the last lock is returned. A heliostat that is locked stays in stow: nobody moves it, neither a
 person nor automatic control nor a command to a group. To a locked target or receiver no beam is
 sent; under a locked tower no heliostat leaves stow. EMERGENCY, DEFOCUS and STOW pass.
@@ -70,24 +70,24 @@ class Lockouts:
         return tuple(self._locks.get((kind, name), {}).values())
 
     def text(self, kind: Kind, name: str) -> str:
-        """Return the locks on something in one line, "" if there are none."""
+        """Return the locks on something in one line."""
         return "; ".join(lock.text for lock in self.on(kind, name))
 
     def closed(self, points: FloatArray) -> dict[str, npt.NDArray[np.bool_]]:
-        """Return which points (K, 3), ENU, m, lie on locked surfaces, by the reason."""
-        found = {}
+        """Return masks of the points (K, 3), ENU, m, on locked surfaces, by the reason."""
+        masks = {}
         for kind, name in self._locks:
             surface = self._surfaces.get((kind, name))
             if surface is not None:
                 reach = 0.5 * math.hypot(surface.width, surface.height) + _BESIDE
                 near = np.linalg.norm(points - surface.center, axis=-1) <= reach
-                found[f"{kind} {name} is locked: {self.text(kind, name)}"] = np.asarray(near)
-        return found
+                masks[f"{kind} {name} is locked: {self.text(kind, name)}"] = np.asarray(near)
+        return masks
 
     def reasons(
         self, heliostats: Sequence[str], points: FloatArray | None = None
     ) -> list[str | None]:
-        """Return why no command may move each of some heliostats, None if one may.
+        """Return the reasons why no command may move some heliostats, None where one may.
 
         Parameters
         ----------
@@ -97,11 +97,11 @@ class Lockouts:
             Where their beams are to be sent, ENU, m, (K, 3); None: to no surface.
         """
         tower = self.text(Kind.TOWER, TOWER)
-        found = np.full(len(heliostats), f"the tower is locked: {tower}" if tower else None, "O")
+        texts = np.full(len(heliostats), f"the tower is locked: {tower}" if tower else None, "O")
         for text, on in {} if points is None or tower else self.closed(points).items():
-            found[on] = text
+            texts[on] = text
         for i, name in enumerate(heliostats if self.heliostats else ()):
             if name in self:
-                found[i] = f"out of service: {self.text(Kind.HELIOSTAT, name)}"
-        reasons: list[str | None] = found.tolist()
+                texts[i] = f"out of service: {self.text(Kind.HELIOSTAT, name)}"
+        reasons: list[str | None] = texts.tolist()
         return reasons

@@ -79,15 +79,15 @@ class Locks:
             self._locked[name] = lock
 
     def record(self, heliostats: Iterable[str], *, visit: bool) -> Held:
-        """Return what is to be stored before a visit, or a person, locks heliostats."""
+        """Return the record to store before a visit, or a person, locks heliostats."""
         place = (self._utc(), 0.0, 0.0) if visit else None
         return {"LOCKED": dict.fromkeys(heliostats, place)}
 
     def reason(self, heliostat: str, visit: str, held: str = "") -> str:
-        """Return why a heliostat is LOCKED, since when and until when, in words.
+        """Return the reason why a heliostat is LOCKED, since when and until when, in words.
 
-        ``visit`` names the visit that it is in; "" if it is in none. ``held`` is why its cluster
-        may begin no motion now; "" if it may.
+        ``visit`` names the visit that it is in, if any. ``held`` is the reason why its cluster may
+        begin no motion now, if there is one.
         """
         lock = self._locked.get(heliostat)
         if lock is None:
@@ -100,11 +100,11 @@ class Locks:
             )
         if visit:
             return f"{visit} has locked it {since}, until its parameters are written and read back"
-        left = "a visit that the plant's program did not survive" if lock.recalled else "a visit"
-        there = "at stow, " if self._off(heliostat, lock) else ""
+        holder = "a visit that the plant's program did not survive" if lock.recalled else "a visit"
+        place = "at stow, " if self._off(heliostat, lock) else ""
         return (
-            f"{left} has left it locked ({since}); the plant unlocks it {there}as soon as motions "
-            "are accepted and somebody has the command authority"
+            f"{holder} has left it locked ({since}); the plant unlocks it {place}as soon as "
+            "motions are accepted and somebody has the command authority"
             f"{held and f'; now they are not: {held}'}"
         )
 
@@ -114,7 +114,7 @@ class Locks:
             self._locked.pop(name, None)
 
     def due(
-        self, now: float, left: Callable[[int, Iterable[str]], frozenset[str]]
+        self, now: float, released: Callable[[int, Iterable[str]], frozenset[str]]
     ) -> dict[str, list[str]]:
         """Return the heliostats that are to be given an order now, by its name.
 
@@ -122,32 +122,32 @@ class Locks:
         ----------
         now
             Monotonic s.
-        left
-            Returns those that no visit looks after any more: the visit has ended, or a person has
+        released
+            Returns those that no visit holds any more: the visit has ended, or a person has
             ordered something else.
         """
-        found: dict[str, list[str]] = {}
+        orders: dict[str, list[str]] = {}
         fresh = self._ledger.reported(LOCKING) & self._field.live(now)
         for name, lock in list(self._locked.items()):
-            if not fresh[self._field.index[name]] or not left(lock.token, (name,)):
+            if not fresh[self._field.index[name]] or not released(lock.token, (name,)):
                 continue
             what = self._next(name, lock)
             if not what:
                 del self._locked[name]
             elif now >= lock.due and what != _WAIT:
                 lock.due = now + lock.pause
-                found.setdefault(what, []).append(name)
-        return found
+                orders.setdefault(what, []).append(name)
+        return orders
 
-    def _next(self, name: str, lock: _Lock) -> str:
-        """Return the order that brings a heliostat on, "" if none is left to be given.
+    def _next(self, name: str, lock: _Lock) -> str | None:
+        """Return the next order for a heliostat, None when its lock is over.
 
-        It waits for a person if nobody knows whose lock it is.
+        It waits for a person if it is not known whose lock it is.
         """
         node = self._field.rows[self._field.index[name]]
         if node["state"] != states.LOCKED:
-            # It stands where it was unlocked until it is sent to its standby point.
-            return "IDLE" if lock.released and node["state"] == states.IDLE else ""
+            # It stays where it was unlocked until it is sent to its standby point.
+            return "IDLE" if lock.released and node["state"] == states.IDLE else None
         if lock.uncertain:
             return _WAIT
         return (

@@ -1,4 +1,4 @@
-"""The hooks by which the parts of a plant hear of what happens, each in its turn."""
+"""Hooks through which the parts of a plant learn of events, in the order of their list."""
 
 from collections.abc import Sequence
 
@@ -42,7 +42,7 @@ class Part:
         """Note what some heliostats of a ticket have acknowledged, refused or done."""
 
     def on_beat(self, now: float) -> None:
-        """Do what is due at every beat (`PlantSettings.beat`)."""
+        """Run the tasks of every beat (`PlantSettings.beat`)."""
 
     def on_second(self, now: float) -> None:
-        """Do what is due once a second, after the beat."""
+        """Run the tasks of every second, after the beat."""

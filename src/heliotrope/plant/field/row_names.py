@@ -25,7 +25,7 @@ class RowNames(Part):
         self._asked_at = dict.fromkeys(field.clusters, -math.inf)
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Ask for the names of rows that nobody can read."""
+        """Ask for the names of rows that the plant cannot read."""
         del status
         if self._field.knows_order(cluster) or now - self._asked_at[cluster] < _AGAIN:
             return

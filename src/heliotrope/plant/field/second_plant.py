@@ -1,4 +1,4 @@
-"""Another plant with the same keys: clusters tell in each status which run they belong to."""
+"""Another plant with the same keys: clusters report in each status to which run they belong."""
 
 from collections.abc import Callable, Iterable
 
@@ -40,11 +40,11 @@ class SecondPlant(Part):
         elif before and not self._lost:
             self._tell(alarms.SECOND_PLANT.ended())
 
-    def refusal(self, clusters: Iterable[str]) -> str:
-        """Return why clusters take no motion from this plant, "" if they do."""
+    def refusal(self, clusters: Iterable[str]) -> str | None:
+        """Return the reason why clusters take no motion from this plant, None if they do."""
         lost = sorted(set(clusters) & self._lost.keys())
         if not lost:
-            return ""
+            return None
         return (
             f"{', '.join(lost)} belong to another plant with the same keys "
             f"(alarm {alarms.SECOND_PLANT.name}); switch one of the two off"

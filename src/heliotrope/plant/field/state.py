@@ -65,7 +65,7 @@ class HeliostatState:
 
     @property
     def condition(self) -> str:
-        """Its state and its fault, or for how long it was not heard."""
+        """Its state and fault, or the time since its last report."""
         if not self.live:
             since = f"for {self.age:.0f} s" if math.isfinite(self.age) else "yet"
             return f"not heard {since}"
@@ -234,7 +234,7 @@ class FieldState:
         return as_float(now - self.heard)
 
     def live(self, now: float) -> Mask:
-        """Return which rows are younger than the limit, (N,)."""
+        """Return a mask of the rows younger than the limit, (N,)."""
         return np.asarray(self.age(now) <= self.limit)
 
     def values(self, field: str, now: float) -> "np.ma.MaskedArray[Any, Any]":
@@ -261,19 +261,19 @@ class FieldState:
         return np.stack([self.rows[name][rows] for name in names], axis=-1).astype(np.float64)
 
     def sure(self, now: float) -> Mask:
-        """Return which heliostats are live and know their step counts, (N,)."""
+        """Return a mask of the heliostats that are live and know their step counts, (N,)."""
         known = (self.rows["flags"] & meanings.COUNTS_UNKNOWN == 0) & np.isfinite(self.counted_at)
         return np.asarray(self.live(now) & known)
 
-    def among(self, wanted: Sequence[int], now: float) -> Mask:
-        """Return which heliostats are live and in one of some states, (N,)."""
-        return np.asarray(self.live(now) & np.isin(self.rows["state"], list(wanted)))
+    def among(self, numbers: Sequence[int], now: float) -> Mask:
+        """Return a mask of the heliostats that are live and in one of some states, (N,)."""
+        return np.asarray(self.live(now) & np.isin(self.rows["state"], list(numbers)))
 
     def counted(self, now: float) -> dict[str, int]:
         """Return the number of heliostats in each state; those not live count as "stale"."""
         live = self.live(now)
-        found = np.bincount(self.rows["state"][live], minlength=len(states.STATES))
-        counts = {name: int(n) for name, n in zip(states.STATES, found, strict=True) if n}
+        totals = np.bincount(self.rows["state"][live], minlength=len(states.STATES))
+        counts = {name: int(n) for name, n in zip(states.STATES, totals, strict=True) if n}
         stale = len(self) - int(live.sum())
         return {**counts, "stale": stale} if stale else counts
 

@@ -42,7 +42,7 @@ _LONGEST = 64
 
 
 class Witness(Protocol):
-    """What sees the sun, or computes it, independently of the plant's clock and file."""
+    """A source of the sun's direction, independent of the plant's clock and file."""
 
     @property
     def name(self) -> str:
@@ -82,8 +82,8 @@ class SatelliteWitness:
         place = receiver.latitude_deg, receiver.longitude_deg
         if ahead is None or not np.isfinite(place).all():
             return None
-        there = Site(*place, site.height, site.pressure, site.temperature_c)
-        return fast_vector(self._clock.utc().timestamp() - ahead, there), 0.0
+        place_of_receiver = Site(*place, site.height, site.pressure, site.temperature_c)
+        return fast_vector(self._clock.utc().timestamp() - ahead, place_of_receiver), 0.0
 
 
 class SunSensorFile:
@@ -124,7 +124,7 @@ class SunSensorFile:
 
 
 class Witnesses(Part):
-    """What the witnesses of a plant have said today.
+    """Today's statements of a plant's witnesses.
 
     Parameters
     ----------
@@ -161,50 +161,51 @@ class Witnesses(Part):
         return math.floor(utc / 86_400.0 + self._site.longitude_deg / 360.0)
 
     @property
-    def contradiction(self) -> str:
-        """Why no heliostat may leave stow, "" if heliostats may: a witness contradicts the sun."""
-        return self.refusal if self._contradicting else ""
+    def contradiction(self) -> str | None:
+        """The reason why no heliostat may leave stow, None unless a witness contradicts the sun."""
+        return self.refusal if self._contradicting else None
 
     @property
-    def refusal(self) -> str:
-        """Why no heliostat may join a receiver, "" if heliostats may."""
+    def refusal(self) -> str | None:
+        """The reason why no heliostat may join a receiver, None if heliostats may."""
         if self._contradicting:
             problem = "; ".join(self._contradicting.values())
         elif self._names and self._agreed_on != self._day(self._utc()):
             problem = f"none of its witnesses ({', '.join(sorted(self._names))}) has agreed today"
         else:
-            return ""
+            return None
         return refusals.UNWITNESSED.text.format(problem=problem)
 
-    def take(self, name: str, seen: FloatArray, error: float) -> None:
+    def take(self, name: str, observed: FloatArray, error: float) -> None:
         """Take the sun (3,) that a witness sees now, with its error, rad."""
-        off = float(angle_between(seen, fast_vector(self._utc(), self._site)))
+        off = float(angle_between(observed, fast_vector(self._utc(), self._site)))
         if off <= AGREES + error:
             self._agrees(name)
         else:
-            self._contradicts(name, seen - fast_vector(self._utc(), self._site))
+            self._contradicts(name, observed - fast_vector(self._utc(), self._site))
 
     def photographed(
-        self, record: HeliostatCalibration | None, mechanism: Mechanism, seen: Sightings
-    ) -> str:
+        self, record: HeliostatCalibration | None, mechanism: Mechanism, sightings: Sightings
+    ) -> str | None:
         """Take photographs of a heliostat's beam on a target, before they are learnt from.
 
         The beam shows where the sun stands, if the mirror was calibrated before today: what it
         has learnt today may have come from the wrong sun. One mirror that misses by more may have
-        moved; two that put the sun at the same wrong place have not. Returns why nothing may be
-        learnt from the photographs, "" if they may be: the sun that they assume may be wrong.
+        moved; two that put the sun at the same wrong place have not. Returns the
+        reason why not to learn from the photographs, if there is one: the sun that they assume may
+        be wrong.
 
         Parameters
         ----------
         record, mechanism
             The calibration believed, None before the first; and its mechanism, batch shape (1,).
-        seen
+        sightings
             Sightings of the photographs.
         """
         if self._names is None or record is None or not self.testifies(record):
-            return ""
-        pose = mechanism.pose(seen.counts)
-        source, path = ray_directions(seen, pose.vertex)
+            return None
+        pose = mechanism.pose(sightings.counts)
+        source, path = ray_directions(sightings, pose.vertex)
         offset = np.mean(reflect(path, pose.normal) - source, axis=0)
         if float(np.linalg.norm(offset)) <= BEAM_ERROR:
             self._agreeing.add(record.heliostat)
@@ -213,11 +214,11 @@ class Witnesses(Part):
                 return self.refusal
             self._offsets.clear()
             self._agrees(PHOTOGRAPHS)
-            return ""
+            return None
         self._agreeing.clear()
-        others = [each for name, each in self._offsets.items() if name != record.heliostat]
+        others = [other for name, other in self._offsets.items() if name != record.heliostat]
         self._offsets[record.heliostat] = offset
-        if any(np.linalg.norm(offset - each) <= BEAM_ERROR for each in others):
+        if any(np.linalg.norm(offset - other) <= BEAM_ERROR for other in others):
             self._contradicts(PHOTOGRAPHS, offset)
         return self.refusal
 

@@ -373,7 +373,7 @@ def _learning(
     settings: PhotographSettings,
     memory: Memory,
 ) -> tuple[Photograph, bytes, Memory]:
-    """Return a frame as it is read, its picture, and what is known of empty targets after it."""
+    """Return the reading of a frame, its picture, and the updated models of empty targets."""
     seen, jpeg = beam_of(frame, targets, camera, replace(settings, empty=memory.models))
     memory.learn(seen.faces)
     return replace(seen, faces=()), jpeg, memory

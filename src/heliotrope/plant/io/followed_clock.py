@@ -111,7 +111,7 @@ class ClockReader:
         return (last.now - first.now) / span if span > 1.0 else last.speed
 
     async def begin(self) -> None:
-        """Let the simulated field begin, once it is ready: its time stands still until then."""
+        """Start the simulated field once it is ready; its time stands still until then."""
         while not self.state.waits:
             await asyncio.to_thread(time.sleep, _SOON)
         await asyncio.to_thread(self.fetch, "begin")
@@ -122,7 +122,7 @@ class ClockReader:
             await asyncio.to_thread(time.sleep, _SOON)
 
     def fetch(self, path: str) -> bytes:
-        """Return what the simulated field serves.
+        """Return a document that the simulated field serves.
 
         Raises
         ------

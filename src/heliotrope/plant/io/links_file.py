@@ -3,7 +3,7 @@
 A cluster is reached in one of three ways: it connects to this plant over TCP, it meets the plant
 at an MQTT broker, or its bus is at this machine and its cluster file is given. In the last case
 the program that builds the plant also runs the cluster's program in this process
-(`cluster.program`) and adds its link. Keys stand in a file of their own that nobody else may read.
+(`cluster.program`) and adds its link. Keys are in a separate file that nobody else may read.
 """
 
 import ssl
@@ -331,7 +331,7 @@ class PlantLinks:
     firmware
         Version that every board should have; None: it is not compared.
     light
-        Reference by which the receiver's camera gives its flux; None: it gives none.
+        Reference for the flux on the receiver by its camera; None: not measured.
     twin
         Address of the simulated field; "" for a real one.
     """

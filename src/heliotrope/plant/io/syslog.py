@@ -185,7 +185,7 @@ class Syslog:
     def _next(self) -> _Message | None:
         """Wait for the next message; None at the end.
 
-        Messages that were lost are told before those that come after them.
+        Lost messages are reported before the messages that follow them.
         """
         if self.lost > self._told and self._waiting.qsize() <= self._waiting.maxsize // 2:
             count, self._told = self.lost - self._told, self.lost

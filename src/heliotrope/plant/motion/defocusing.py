@@ -96,9 +96,9 @@ def defocused(
         turn = np.broadcast_to(turn.min(axis=0), turn.shape)
 
     def pose(some: Rows, points: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        found = check.poses(rows[some], points, sun, counts[some])
-        good = np.asarray(found.chosen(found.status) == TrackingStatus.OK)
-        return as_float(found.best_angles), good
+        solved = check.poses(rows[some], points, sun, counts[some])
+        good = np.asarray(solved.chosen(solved.status) == TrackingStatus.OK)
+        return as_float(solved.best_angles), good
 
     tracks = np.isin(state, states.ON_AIM)
     other = np.where(tracks[:, None], standbys, aims)

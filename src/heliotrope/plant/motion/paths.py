@@ -97,8 +97,8 @@ class Paths:
         The azimuth turns first, as when stow is left.
         """
         corner = begin.copy()
-        each = np.arange(len(rows))
-        corner[each, self.azimuth[rows]] = end[each, self.azimuth[rows]]
+        every = np.arange(len(rows))
+        corner[every, self.azimuth[rows]] = end[every, self.azimuth[rows]]
         return self.angles(rows, np.stack([begin, corner, end], axis=1))
 
     def motion(
@@ -131,8 +131,8 @@ class Paths:
     def lasts(self, rows: Rows, begin: FloatArray, end: FloatArray, *, turns: bool) -> FloatArray:
         """Return how long a motion takes, s, (K,)."""
         steps = np.abs(self._turned(rows, begin, end) - begin)
-        each = _time(steps, self._rate[rows], self._ramp[rows])
-        return np.asarray((each.sum(axis=-1) if turns else each.max(axis=-1)) + _PAUSE)
+        spans = _time(steps, self._rate[rows], self._ramp[rows])
+        return np.asarray((spans.sum(axis=-1) if turns else spans.max(axis=-1)) + _PAUSE)
 
     def angles(self, rows: Rows, counts: FloatArray) -> FloatArray:
         """Return the angles of axes, rad, at counts; both (K, 2) or (K, W, 2)."""
@@ -159,38 +159,38 @@ class Paths:
         sun
             Returns the unit vector to the sun, (3,), some seconds from now.
         """
-        check, found = self.check, dict[str, str]()
+        check, reasons = self.check, dict[str, str]()
         now, later = sun(0.0), sun(_LONG)
         if now[2] <= 0.0 or not len(rows):
-            return found
+            return reasons
         points, length = self.points(rows, standbys)
-        at, time, left = begin.copy(), np.zeros(len(rows)), np.arange(len(rows))
+        at, time, going = begin.copy(), np.zeros(len(rows)), np.arange(len(rows))
         for place in range(int(length.max())):
-            left = left[place < length[left]]
-            share = (time[left] / _LONG)[:, None]
+            going = going[place < length[going]]
+            share = (time[going] / _LONG)[:, None]
             light = normalize(now + share * (later - now), "sun")
-            solved = check.poses(rows[left], points[left, place], light, at[left])
+            solved = check.poses(rows[going], points[going, place], light, at[going])
             good = solved.chosen(solved.status) == TrackingStatus.OK
-            for i, status in zip(left[~good], solved.chosen(solved.status)[~good], strict=True):
+            for i, status in zip(going[~good], solved.chosen(solved.status)[~good], strict=True):
                 why = TrackingStatus(int(status)).text
                 if status == TrackingStatus.STOPPED:
-                    why = check.stop(rows[i], points[i, place], light[left == i][0], at[i])
-                found[check.names[rows[i]]] = (
+                    why = check.stop(rows[i], points[i, place], light[going == i][0], at[i])
+                reasons[check.names[rows[i]]] = (
                     f"point {place + 1} of {length[i]} of the safe path, "
                     f"{point_text(points[i, place])} m: {why}"
                 )
-            left, light = left[good], light[good]
-            first, last = at[left], np.round(solved.best_counts[good])
+            going, light = going[good], light[good]
+            first, last = at[going], np.round(solved.best_counts[good])
             moves = self.turns if place == 0 else self.motion
-            path = moves(rows[left], first, last)
-            blocked = check.crossing(rows[left], path, light, _WHEN)
-            blocked |= check.moving(rows[left], path, light, _WHEN)
-            time[left] += self.lasts(rows[left], first, last, turns=place == 0)
-            at[left] = last
+            path = moves(rows[going], first, last)
+            blocked = check.crossing(rows[going], path, light, _WHEN)
+            blocked |= check.moving(rows[going], path, light, _WHEN)
+            time[going] += self.lasts(rows[going], first, last, turns=place == 0)
+            at[going] = last
             if blocked:
-                left = left[[check.names[row] not in blocked for row in rows[left]]]
-                found |= blocked
-        return found
+                going = going[[check.names[row] not in blocked for row in rows[going]]]
+                reasons |= blocked
+        return reasons
 
 
 def _time(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:

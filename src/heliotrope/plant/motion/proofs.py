@@ -99,7 +99,7 @@ class PathProofs:
         self._earlier: dict[int, Tables] = {}
 
     def check_points(
-        self, name: str, rows: Rows, wanted: FloatArray, tracking: npt.NDArray[np.bool_]
+        self, name: str, rows: Rows, points: FloatArray, tracking: npt.NDArray[np.bool_]
     ) -> None:
         """Prove that heliostats (K,) may be given points (K, 3) by AIM or STANDBY.
 
@@ -111,16 +111,16 @@ class PathProofs:
         stopped, light = name == "AIM", self.sun(0.0)
         blocked = self._early(name, rows)
         for start, among in self._starts(rows, tracking):
-            of = rows[among], wanted[among], light
+            of = rows[among], points[among], light
             blocked |= self._check.problems(*of, start=start, stopped=stopped)
         if not stopped:
             every = self.points.possible("STANDBY", np.arange(len(self.field)))
-            blocked |= self._check.glare(rows, wanted, every, light)
+            blocked |= self._check.glare(rows, points, every, light)
         if blocked:
             raise BeamError(name, _refusals(blocked))
 
     def _early(self, name: str, rows: Rows) -> dict[str, str]:
-        """Return which heliostats may not have a new point before they are heard again, and why.
+        """Return the heliostats that may not have a new point before their next report, and why.
 
         The path to it is proven from the point before. One that goes there, or may by an order
         that no report shows yet, would go to the new point from elsewhere.
@@ -130,8 +130,8 @@ class PathProofs:
         if name == "AIM":  # those that track join it, and are examined then
             return self._unplaced(rows, messages.JOINING)
         state = self.field.rows["state"][rows]
-        found = self._unplaced(rows[np.isin(state, _TO_STANDBY)])
-        return found | self._unsettled(rows[state == states.IDLE])
+        blocked = self._unplaced(rows[np.isin(state, _TO_STANDBY)])
+        return blocked | self._unsettled(rows[state == states.IDLE])
 
     def _starts(
         self, rows: Rows, tracking: npt.NDArray[np.bool_]
@@ -142,14 +142,14 @@ class PathProofs:
         """
         points = self.points
         start = np.where(tracking[:, None], points.aims[rows], points.standbys[rows])
-        found = [(start, np.arange(len(rows)))]
+        starts = [(start, np.arange(len(rows)))]
         for k in range(BEFORE):
             aims, standbys = (points.earlier[kind][k, rows] for kind in KINDS)
             before = np.where(tracking[:, None], aims, standbys)
             among = np.flatnonzero(np.isfinite(before).all(axis=-1))
             if among.size:
-                found.append((before[among], among))
-        return found
+                starts.append((before[among], among))
+        return starts
 
     def clear(
         self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
@@ -189,8 +189,8 @@ class PathProofs:
         stow, counts = self.paths.stow[rows], self.field.counts(rows)
         begin = dict(zip(rows.tolist(), np.where(np.isfinite(stow), stow, counts), strict=True))
         for some, standbys in self.points.possible("STANDBY", rows):
-            here = np.array([begin[row] for row in some.tolist()])
-            blocked |= self.paths.approach(some, here, standbys, self.sun)
+            starts = np.array([begin[row] for row in some.tolist()])
+            blocked |= self.paths.approach(some, starts, standbys, self.sun)
         return blocked | early
 
     def _back_to_standby(self, rows: Rows, now: float) -> dict[str, str]:
@@ -210,8 +210,8 @@ class PathProofs:
 
     def _unsettled(self, rows: Rows) -> dict[str, str]:
         """Return the heliostats that move, or were ordered to since their last report."""
-        found = {self.field.names[row]: STILL_MOVING.text for row in rows[self.moving(rows)]}
-        return found | self._unplaced(rows)
+        blocked = {self.field.names[row]: STILL_MOVING.text for row in rows[self.moving(rows)]}
+        return blocked | self._unplaced(rows)
 
     def _unplaced(
         self, rows: Rows, kind: Kind = MOVING, now: float | None = None
@@ -240,18 +240,18 @@ class PathProofs:
         before = self._tables(self.field.place(heliostat))
         return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
 
-    def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
-        """Return why a heliostat may not rest at the stow position in items, "" if it may."""
+    def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str | None:
+        """Return the reason why a heliostat may not rest at the stow position in items."""
         if "stow" not in items:
-            return ""
+            return None
         counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
         armature, drives = self.tables(heliostat, items)[1]
         rows = np.array([self.field.place(heliostat)])
         blocked = self._check.standing(rows, counts, (armature[None], drives[None]))
-        return blocked.get(heliostat, "")
+        return blocked.get(heliostat)
 
-    def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str:
-        """Return why new parameters may not be written where a heliostat stands, "" if they may.
+    def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str | None:
+        """Return the reason why new parameters may not be written in place, None if they may.
 
         With the present parameters and with the new ones, its beam must be free where it stands
         and on the path from there to its standby point; and with the present ones on the path that
@@ -266,7 +266,7 @@ class PathProofs:
         """
         row = self.field.place(heliostat)
         if not self._check.volumes or not np.isfinite(self.field.posed_at[row]):
-            return ""
+            return None
         rows, new, present = np.array([row]), (armature, drives), self._tables(row)
         for tables in (present, new):
             with self._believing(row, tables):
@@ -275,7 +275,7 @@ class PathProofs:
         standbys = self.points.standbys[rows]
         with self._believing(row, new):
             blocked = self._misled(rows, standbys, present)
-        return blocked[heliostat].partition(";")[0] if blocked else ""
+        return blocked[heliostat].partition(";")[0] if blocked else None
 
     @contextmanager
     def unverified(self, heliostat: str) -> Iterator[None]:
@@ -291,11 +291,11 @@ class PathProofs:
         finally:
             self._earlier.pop(row, None)
 
-    def misled(self, heliostat: str, point: FloatArray) -> str:
-        """Return why unverified parameters may not lead a beam to a point (3,), "" if they may."""
+    def misled(self, heliostat: str, point: FloatArray) -> str | None:
+        """Return the reason, if any, why unverified parameters block a path to a point (3,)."""
         rows = np.array([self.field.place(heliostat)])
         blocked = self._by_earlier(rows, point[None])
-        return blocked[heliostat].partition(";")[0] if blocked else ""
+        return blocked[heliostat].partition(";")[0] if blocked else None
 
     def _tables(self, row: int) -> Tables:
         return self._check.armature.table[row].copy(), self._check.drives.table[row].copy()
@@ -311,7 +311,7 @@ class PathProofs:
             self._check.replace(row, *present)
 
     def _misled(self, rows: Rows, point: FloatArray, tables: Tables) -> dict[str, str]:
-        """Return why the path on which one heliostat is led to a point (1, 3) is blocked.
+        """Return the reason why the path of one heliostat to a point (1, 3) is blocked.
 
         The parameters of the check lead it, and the beam goes by ``tables``.
         """
@@ -324,17 +324,17 @@ class PathProofs:
 
     def _by_earlier(self, rows: Rows, points: FloatArray) -> dict[str, str]:
         """Return the paths to points (K, 3) that are blocked by parameters that were replaced."""
-        found: dict[str, str] = {}
+        reasons: dict[str, str] = {}
         for i, row in enumerate(rows.tolist()):
             if row in self._earlier:
-                found |= self._misled(rows[i : i + 1], points[i : i + 1], self._earlier[row])
-        return found
+                reasons |= self._misled(rows[i : i + 1], points[i : i + 1], self._earlier[row])
+        return reasons
 
     def _from_here(self, rows: Rows) -> dict[str, str]:
-        """Return which heliostats may not go from where they stand to standby, and why."""
+        """Return the heliostats that may not go from their present place to standby, and why."""
         light = self.sun(0.0)
-        here = self.paths.angles(rows, self.field.posed[rows])
-        blocked = self._check.moving(rows, np.repeat(here[:, None], 2, axis=1), light)
+        present = self.paths.angles(rows, self.field.posed[rows])
+        blocked = self._check.moving(rows, np.repeat(present[:, None], 2, axis=1), light)
         known = rows[np.isfinite(self.points.standbys[rows]).all(axis=-1)]
         good, path = self._to_standby(known, self.points.standbys[known], light)
         blocked |= {
@@ -346,7 +346,7 @@ class PathProofs:
     def joining(
         self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
     ) -> dict[str, str]:
-        """Return which heliostats may not join their aims now, and why.
+        """Return the heliostats that may not join their aims now, and the reasons.
 
         AIM brings a new aim, its values; every other command leads to those that they may have.
         """
@@ -356,22 +356,22 @@ class PathProofs:
         new = name == "AIM"
         aims = np.tile(values, (len(rows), 1)) if new else self.points.aims[rows]
         unknown = ~np.isfinite(aims).all(axis=-1)
-        found = {
+        reasons = {
             heliostats[i]: f"{name}: its aim is not known here; give it one (AIM) first"
             for i in np.flatnonzero(unknown)
         }
         if not unknown.all():
             light = self.sun(0.0)
-            found |= self._unplaced(rows, messages.SAFE, now)
+            reasons |= self._unplaced(rows, messages.SAFE, now)
             possible = self.points.possible("AIM", rows[~unknown])
             for known, places in [(rows, aims)] if new else possible:
-                found |= self._by_earlier(known, places)
+                reasons |= self._by_earlier(known, places)
                 for some, begin in self._begins(known):
                     to = known[some], begin, places[some], light, self.paths.motion
-                    found |= self._check.on_the_way(*to)
+                    reasons |= self._check.on_the_way(*to)
                 if name == "SEARCH":
-                    found |= self._check.around(known, places, values[1], light)
-        return _refusals(found)
+                    reasons |= self._check.around(known, places, values[1], light)
+        return _refusals(reasons)
 
     def _begins(self, rows: Rows) -> list[tuple[npt.NDArray[np.bool_], FloatArray]]:
         """Return where motions of heliostats (K,) may begin: which, (K,), and their counts (M, 2).
@@ -380,21 +380,21 @@ class PathProofs:
         """
         counts, goals = self.field.counts(rows), self.field.goals(rows)
         moving = self.moving(rows)
-        found = [(np.ones(len(rows), dtype=np.bool_), counts)]
+        starts = [(np.ones(len(rows), dtype=np.bool_), counts)]
         if moving.any():
-            found += [
+            starts += [
                 (moving, counts[moving] + share * (goals - counts)[moving]) for share in (0.5, 1.0)
             ]
-        return found
+        return starts
 
     def _to_standby(
         self, rows: Rows, standbys: FloatArray, light: FloatArray
     ) -> tuple[Rows, FloatArray]:
         """Return the heliostats that reach their standby points (K, 3), and their paths there."""
         counts = self.field.counts(rows)
-        found = self._check.poses(rows, standbys, light, counts)
-        good = found.chosen(found.status) == TrackingStatus.OK
-        rows, ends = rows[good], found.best_counts[good]
+        solved = self._check.poses(rows, standbys, light, counts)
+        good = solved.chosen(solved.status) == TrackingStatus.OK
+        rows, ends = rows[good], solved.best_counts[good]
         return rows, self.paths.motion(rows, counts[good], ends)
 
     def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:
@@ -413,9 +413,9 @@ class PathProofs:
         return self.paths.motion(rows, counts, ends)
 
     def moving(self, rows: Rows) -> npt.NDArray[np.bool_]:
-        """Return which heliostats move to their goals, (K,)."""
-        left = np.abs(self.field.goals(rows) - self.field.posed[rows])
-        return np.asarray((left > _MOVES).any(axis=-1))
+        """Return a mask of the heliostats that move to their goals, (K,)."""
+        remaining = np.abs(self.field.goals(rows) - self.field.posed[rows])
+        return np.asarray((remaining > _MOVES).any(axis=-1))
 
 
 def _refusals(reasons: Mapping[str, str]) -> dict[str, str]:

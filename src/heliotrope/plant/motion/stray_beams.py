@@ -43,7 +43,7 @@ class StrayBeams:
 
     Attributes
     ----------
-    seen
+    shining
         Heliostats whose beams were on a receiver in their last check.
     """
 
@@ -52,8 +52,8 @@ class StrayBeams:
     ) -> None:
         self._paths, self._check = paths, paths.check
         self._field, self._points, self._sun = field, points, sun
-        self.seen: frozenset[str] = frozenset()
-        self._left = np.full(len(field), np.inf)
+        self.shining: frozenset[str] = frozenset()
+        self._remaining = np.full(len(field), np.inf)
         self._turn = 0
 
     @property
@@ -61,8 +61,8 @@ class StrayBeams:
         """Whether there are receivers to watch."""
         return bool(self._check.solids)
 
-    def lit(self, rows: npt.NDArray[np.intp]) -> Mask:
-        """Return whose beams are on a receiver, (K,), by the step counts last heard of (K,)."""
+    def on_receiver(self, rows: npt.NDArray[np.intp]) -> Mask:
+        """Return a mask of heliostats (K,) with beams on a receiver, by their last counts."""
         drives = Drive(self._check.drives.table[rows])
         return self._check.lights(rows, drives.angles(self._field.counts(rows)), self._sun(0.0))
 
@@ -72,15 +72,17 @@ class StrayBeams:
         self._turn = (self._turn + 1) % TURNS
         every = np.arange(len(field))
         watched = field.sure(now) & ~np.isin(field.rows["state"], states.ON_AIM)
-        left = np.abs(field.goals(every) - field.counts(every)).max(axis=-1)
-        moves = left > _MOVES
+        remaining = np.abs(field.goals(every) - field.counts(every)).max(axis=-1)
+        moves = remaining > _MOVES
         chosen = watched & (moves | (every % TURNS == self._turn))
-        comes = moves & (left < self._left - _GAINS)
-        self._left[~watched | chosen] = np.where(watched, left, np.inf)[~watched | chosen]
+        comes = moves & (remaining < self._remaining - _GAINS)
+        self._remaining[~watched | chosen] = np.where(watched, remaining, np.inf)[~watched | chosen]
         rows = np.flatnonzero(chosen & ~comes)
-        lit = {field.names[row] for row in rows[self.lit(rows)]}
+        shining = {field.names[row] for row in rows[self.on_receiver(rows)]}
         stay = watched & ~chosen
-        self.seen = frozenset(lit | {name for name in self.seen if stay[field.index[name]]})
+        self.shining = frozenset(
+            shining | {name for name in self.shining if stay[field.index[name]]}
+        )
 
     def order_out(self, name: str, *, again: bool) -> Act:
         """Return DEFOCUS, or STOW where DEFOCUS has not helped or would end on a receiver too."""

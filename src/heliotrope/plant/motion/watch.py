@@ -44,15 +44,15 @@ class BeamWatch:
         self.proofs, self._check = proofs, proofs.paths.check
         self._paths, self._field = proofs.paths, proofs.field
         self.stray = StrayBeams(proofs.paths, proofs.field, proofs.points, proofs.sun)
-        self._seen: frozenset[str] = frozenset()
+        self._entering: frozenset[str] = frozenset()
         self._turn = 0
         self._at = -np.inf
 
     @property
     def watched(self) -> frozenset[str]:
         """Names of the readings: of keep-out volumes and of receivers, where there are any."""
-        found = {"keep_out_predicted": self._check.volumes, "beam_unsent": self._check.solids}
-        return frozenset(name for name, places in found.items() if places)
+        surfaces = {"keep_out_predicted": self._check.volumes, "beam_unsent": self._check.solids}
+        return frozenset(name for name, places in surfaces.items() if places)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
         """Return 1 for each heliostat whose beam is where it may not be, 0 for others.
@@ -66,10 +66,10 @@ class BeamWatch:
                 self._check_volumes(now)
             if self.stray.watches:
                 self.stray.check(now)
-        seen = {"keep_out_predicted": self._seen, "beam_unsent": self.stray.seen}
-        found = {(what, ""): Reading(0.0, now) for what in self.watched}
-        return found | {
-            (what, name): Reading(1.0, now) for what in self.watched for name in seen[what]
+        named = {"keep_out_predicted": self._entering, "beam_unsent": self.stray.shining}
+        values = {(what, ""): Reading(0.0, now) for what in self.watched}
+        return values | {
+            (what, name): Reading(1.0, now) for what in self.watched for name in named[what]
         }
 
     def order_out(self, name: str, *, again: bool) -> Act:
@@ -83,9 +83,9 @@ class BeamWatch:
             Whether it has been ordered off already, and its beam is still there.
         """
         row = self._field.place(name)
-        if name not in self._seen:
-            lit = name in self.stray.seen
-            return self.stray.order_out(name, again=again) if lit else Act.DEFOCUS
+        if name not in self._entering:
+            stray = name in self.stray.shining
+            return self.stray.order_out(name, again=again) if stray else Act.DEFOCUS
         state = int(self._field.rows["state"][row])
         if state == states.STOWING or (again and self._stands(row)) or self.turned(name):
             return Act.STOW
@@ -94,8 +94,8 @@ class BeamWatch:
         return order_out(self._paths, row, counts, self.proofs.sun(0.0), state, aim, standby)
 
     def turned(self, name: str) -> bool:
-        """Return whether a beam stands where it may not be, and DEFOCUS turns it no further."""
-        if name not in self._seen and name not in self.stray.seen:
+        """Return whether a beam rests where it may not be, and DEFOCUS turns it no further."""
+        if name not in self._entering and name not in self.stray.shining:
             return False
         row = self._field.place(name)
         off = self._field.rows["state"][row] == states.DEFOCUSED or self._field.turned[row]
@@ -129,15 +129,15 @@ class BeamWatch:
         path = self._paths.motion(rows[both], begin[both], end[both], ramps=False)
         inside |= check.moving(rows[both], path, light)
         checked = {field.names[row] for row in rows}
-        self._seen = frozenset(inside) | (self._seen - checked)
+        self._entering = frozenset(inside) | (self._entering - checked)
 
     def _leaves_stow(
         self, rows: Rows, state: npt.NDArray[np.integer], begin: FloatArray, end: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return which approaches (K,) leave stow: the other axis has not moved yet."""
-        each, other = np.arange(len(rows)), 1 - self._paths.azimuth[rows]
-        stow = self._paths.stow[rows][each, other]
+        """Return a mask of approaches (K,) that leave stow: one axis has not moved yet."""
+        every, other = np.arange(len(rows)), 1 - self._paths.azimuth[rows]
+        stow = self._paths.stow[rows][every, other]
         turn = self._paths.angles(rows, end) - self._paths.angles(rows, begin)
         far = np.abs(turn).max(axis=-1) > _FROM_STOW
-        far = np.where(np.isfinite(stow), begin[each, other] == stow, far)
+        far = np.where(np.isfinite(stow), begin[every, other] == stow, far)
         return np.asarray(np.equal(state, states.APPROACHING) & far)

@@ -94,7 +94,7 @@ class AutomaticSettings:
     rate
         Heliostats that leave stow, and that go to the receiver, in a second.
     beat
-        Time between looks at the field, s.
+        Time between checks of the field, s.
     lowest
         Elevation of the sun below which the field is stowed, rad.
     patience
@@ -175,7 +175,7 @@ class AutomaticControl:
     flights
         Takes flights of a drone.
     learning
-        What is learnt of each group of mirrors at night.
+        The nightly learning about each group of mirrors.
     timetable
         Calibrations at times of day and at intervals.
     installed
@@ -322,7 +322,7 @@ class AutomaticControl:
                 raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
 
     def _locked(self, heliostats: Sequence[str]) -> list[str | None]:
-        """Return why persons' locks keep each of some heliostats from its aim, None if none do."""
+        """Return the locks that keep heliostats from their aims, in words; None where none does."""
         aims = self._plant.aims[[self._plant.field.place(name) for name in heliostats]]
         return self._plant.lockouts.reasons(heliostats, aims)
 
@@ -386,7 +386,7 @@ class AutomaticControl:
         return Step(f"it waits: {waits}" if waits else f"it waits for its turn: {shown.condition}")
 
     def calibrating(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
-        """Return how far calibrations are that persons asked for at a time, POSIX s."""
+        """Return the progress of calibrations that persons requested at a time, POSIX s."""
         return {name: self._calibration_step(name, since) for name in heliostats}
 
     def wants(self, heliostat: str) -> bool:
@@ -413,7 +413,7 @@ class AutomaticControl:
         return Step(f"at {found.target}: {found.text}", stages.get(found.outcome, Stage.FAILED))
 
     def _why_waiting(self, name: str, visits: bool) -> str:
-        """Return why a calibration that a person asked for has not begun."""
+        """Return the reason why a requested calibration has not begun."""
         row = self._plant.field.place(name)
         if why := self._why_not():
             return why
@@ -426,7 +426,7 @@ class AutomaticControl:
         return f"its turn comes after {', '.join(busy)}" if busy else "its turn comes next"
 
     def retries(self) -> tuple[Retry, ...]:
-        """Return what is tried again or was given up, and why."""
+        """Return the tasks that are tried again or were given up, with the reasons."""
         now, visits = self._plant.now(), self._calibrating
         return (
             *(() if visits is None else visits.retries()),
@@ -504,7 +504,7 @@ class AutomaticControl:
         running = {} if self._calibrating is None else self._calibrating.running
         return CalibrationView(
             not reason,
-            reason,
+            reason or "",
             self.book.calibrated,
             len(self._plant.field) - self.book.calibrated,
             self.book.failed,
@@ -573,16 +573,16 @@ class AutomaticControl:
         grant = self._plant.authority.grant
         return grant is not None and grant.holder == AUTOMATIC and grant.token == self._token
 
-    def _why_not(self) -> str:
-        """Return why nothing is calibrated now, "" if calibration may run."""
+    def _why_not(self) -> str | None:
+        """Return the reason why nothing is calibrated now, None if calibration may run."""
         if self._calibrating is None:
             return "there is no camera"
         if not self._on:
             return "it is switched off"
         return self._why_idle()
 
-    def _why_idle(self) -> str:
-        """Return why nothing is moved now, "" if heliostats may be moved."""
+    def _why_idle(self) -> str | None:
+        """Return the reason why nothing is moved now, None if heliostats may be moved."""
         if self._plant.sentinel.on:
             return "an emergency is active"
         if self.waits:
@@ -594,7 +594,7 @@ class AutomaticControl:
             return f"{grant.holder.name} has the command authority" if grant else _STARTING
         if not self._raising.wanted.any():
             return "no heliostat is given to automatic control; select some, then Automatic"
-        return ""
+        return None
 
     async def _govern(self) -> None:
         """Hold the authority while nobody else wants it; give up in an emergency and at night."""
@@ -652,11 +652,11 @@ class AutomaticControl:
             await self._raising.step(self._token, self._visiting, resting)
 
     def _left_alone(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats automatic control leaves where they are, (N,)."""
+        """Return a mask of the heliostats that automatic control leaves where they are, (N,)."""
         return self._losses.settling() | self.service.rows() | self._raising.given_up()
 
     async def _diagnose(self) -> None:
-        """Let drives show that they turn their mirrors, on each day before these are raised."""
+        """Check each day, before mirrors are raised, that their drives turn them."""
         if not self._why_idle():
             free = self._raising.wanted & ~self._left_alone()
             await self._checks.step(self._token, free)
@@ -677,7 +677,7 @@ class AutomaticControl:
         return frozenset(name for run in running for name in run.heliostats)
 
     def _ready(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats may be calibrated now, (N,)."""
+        """Return a mask of the heliostats that may be calibrated now, (N,)."""
         ready = self._plant.field.among(states.AVAILABLE, self._plant.now()) & self._raising.wanted
         ready &= ~self.service.rows() & self._raising.able()
         ready[[self._plant.field.place(name) for name in self._visiting()]] = False
@@ -712,7 +712,7 @@ class AutomaticControl:
         return visit
 
     async def _learn(self) -> None:
-        """Learn what is due of the groups, beside all else."""
+        """Learn the groups that are due, in the background."""
         await self.learning.step(night=not self._day)
 
     def _foresee(self, foresight: Foresight) -> Callable[[], Awaitable[None]]:

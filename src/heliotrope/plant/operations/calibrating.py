@@ -203,7 +203,7 @@ class Calibrating:
 
     @property
     def _requests(self) -> tuple[Requests, ...]:
-        """What persons want in joint visits and in receiver visits."""
+        """The requests of persons for joint visits and receiver visits."""
         return tuple(each.requests for each in (self._joint, self._receiver) if each is not None)
 
     def ask(self, heliostat: str, target: str, *, search: bool = False) -> None:
@@ -245,7 +245,7 @@ class Calibrating:
             visits.requests.ask(heliostats, surface)
 
     def withdraw(self, heliostats: Collection[str], why: str) -> None:
-        """Forget that persons wanted these heliostats calibrated, and why."""
+        """Withdraw persons' requests to calibrate these heliostats, with the reason."""
         self._withdrawn |= dict.fromkeys(set(self.asked).intersection(heliostats), why)
         for each in self._requests:
             each.withdraw(heliostats)
@@ -355,7 +355,7 @@ class Calibrating:
     ) -> tuple[str, ...]:
         """Calibrate those of the ready heliostats (N,) on the receiver that are due; return which.
 
-        One of which something is wrong there is looked at on a target next.
+        A heliostat with a doubtful result is measured on a target next.
         """
         if self._receiver is None:
             return ()
@@ -424,7 +424,7 @@ class Calibrating:
         return results
 
     def _fresh(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats were not on a target a moment ago, (N,)."""
+        """Return a mask of the heliostats that were not on a target a moment ago, (N,)."""
         return np.asarray(self._now() - self._visited > FRESH)
 
     def _interrupted(self, token: int) -> bool:
@@ -440,7 +440,7 @@ class Calibrating:
             self._places.failed(place, problem, self._plant.now())
 
     def _pressing(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats are in doubt or changed by a flight, (N,): they go alone."""
+        """Return a mask of the heliostats in doubt or changed by a flight, (N,): they go alone."""
         first = frozenset(self._first())
         # A flight is new knowledge of those that were given up.
         self._scheduler.attempts.renew(first - self._flown)

@@ -158,7 +158,7 @@ class CalibrationBook:
 
     def history(self, name: str) -> tuple[SightingView, ...]:
         """Return the sightings of a heliostat since the start, oldest first."""
-        seen = self._plant.beliefs.seen(name)
+        seen = self._plant.beliefs.known(name)
         if seen is None:
             return ()
         columns = zip(seen.sightings.time, seen.targets, seen.missed, strict=True)

@@ -112,7 +112,7 @@ class JointVisits:
     cycle
         As given.
     requests
-        What persons want.
+        Requests of persons.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class JointVisits:
     async def _several(
         self, target: str, ready: Mask, following: Next, most: int
     ) -> tuple[str, ...]:
-        """Return up to so many of the ready heliostats (N,), in the order of their gain."""
+        """Return up to ``most`` of the ready heliostats (N,), in the order of their gain."""
         names: list[str] = []
         left = ready.copy()
         # Two targets that chose in turn would leave too few to both.
@@ -195,7 +195,7 @@ class JointVisits:
         return tuple(names)
 
     def alone(self, ready: Mask) -> Mask:
-        """Return which of the ready heliostats (N,) go alone: joint visits did not prove them."""
+        """Return a mask of the ready heliostats (N,) that no joint visit proved: they go alone."""
         found = np.zeros_like(ready)
         found[[self._plant.field.place(name) for name in self.cycle.attempts.given_up]] = True
         return found & ready
@@ -222,11 +222,11 @@ class JointVisits:
         self._last.add(target)
 
     def again(self, result: CycleResult) -> bool:
-        """Return whether a result is no failure: its beam is looked for in another joint visit."""
+        """Return whether a result is no failure: another joint visit searches for its beam."""
         return result.verdict is not None and self.cycle.searching(result.heliostat)
 
     def concluded(self, result: CycleResult) -> None:
-        """Note the result of a visit: what it proves, or disproves, of a heliostat."""
+        """Note the result of a visit: what it proves or disproves about a heliostat."""
         self.cycle.note(result)
         name, kind = result.heliostat, alarms.BEAM_DISPROVED
         # Nothing says where the beam of a mirror without a calibration ought to be.
@@ -256,7 +256,7 @@ class ReceiverVisits:
     cycle
         As given.
     requests
-        What persons want.
+        Requests of persons.
     attempts
         Visits that came to nothing, by receiver.
     mirrors
@@ -315,7 +315,7 @@ class ReceiverVisits:
         return *self.attempts.shown(now), *self.mirrors.shown(now)
 
     def concluded(self, results: Sequence[CycleResult]) -> tuple[str, ...]:
-        """Note a visit's results; return the heliostats that are to be looked at on a target.
+        """Note a visit's results; return the heliostats to measure on a target.
 
         Where less than half of the beams are proven, the light is to blame and not the mirrors.
         One that was refused too often while others were measured goes to a target, too.

@@ -67,7 +67,7 @@ class Errands:
         progress
             See `Progress`.
         patience
-            Longest time, s; what has not ended then has failed.
+            Longest time, s; a heliostat that has not ended by then has failed.
         dropped
             Called with the heliostats for which the operation is given up, and why.
         """

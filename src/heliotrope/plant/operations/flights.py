@@ -1,9 +1,9 @@
 """Flights of a drone taken into the plant: all mirrors fitted together, new parameters in safety.
 
-A flight never moves a beam. A small change is taken while the heliostat stands at stow or locked,
-where its local controller may be written. A large change, and a first calibration, wait for a visit
-to a target, which fits the flight's rows with its photographs and verifies the result by one more;
-until then a heliostat that the flight sees far from where it should be stays off the receiver.
+A flight never moves a beam. A small change is taken while the heliostat is at stow or locked, where
+its local controller may be written. A large change, and a first calibration, wait for a visit to a
+target, which fits the flight's rows with its photographs and verifies the result by one more; until
+then a heliostat that the flight sees far from where it should be stays off the receiver.
 """
 
 import asyncio
@@ -197,7 +197,7 @@ class FlightIntake:
         version = 0 if record is None else record.version
         if fit.problem:
             return _Waiting(_Way.UNCHANGED, fit, version)
-        change = change_of(beliefs.present(fit.name), fit.mechanism, fit.seen)
+        change = change_of(beliefs.present(fit.name), fit.mechanism, fit.sightings)
         large = change > self._settings.large
         # A visit fits each heliostat with a model of its own, which may be a larger one.
         other = record is None or set(record.names) != set(fit.fitted.names)
@@ -231,7 +231,7 @@ class FlightIntake:
         self.look()
 
     def look(self) -> None:
-        """Take what waits for a heliostat that now stands where its parameters may be written."""
+        """Take the waiting fits of heliostats that are where their parameters may be written."""
         field, beliefs = self._plant.field, self._plant.beliefs
         resting = field.among(TAKES_POSE, self._plant.now())
         for name, waiting in list(self._waiting.items()):
@@ -254,7 +254,7 @@ class FlightIntake:
                     )
                 )
 
-        self._plant.doubtful.astray(
+        self._plant.doubtful.keep_off(
             name
             for name, waiting in self._waiting.items()
             if waiting.way is _Way.AT_TARGET and waiting.astray

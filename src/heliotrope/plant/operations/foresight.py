@@ -1,7 +1,8 @@
 """Predictions of the field's errors for the rest of the day, and what comes true of them.
 
 A prediction takes seconds for a large field, so it is made beside the loop, from a copy of what the
-schedule knows. The first of a day stays beside what comes true; the last one says what is to come.
+schedule knows. The first prediction of a day is kept for comparison; the last one is about the time
+to come.
 """
 
 from collections import deque
@@ -26,7 +27,7 @@ _DAY = 86_400.0
 
 
 class Prospect(Protocol):
-    """What is known of the field at one moment; its methods may be called in any process."""
+    """The knowledge of the field at one moment; its methods may be called in any process."""
 
     def now(self) -> FieldPoint:
         """Return the errors of the field."""
@@ -41,7 +42,7 @@ class Foreseeing(Protocol):
     """The schedule, as a prediction needs it."""
 
     def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> Prospect | None:
-        """Return what is known now; None if it cannot predict.
+        """Return the present knowledge; None if it cannot predict.
 
         Parameters
         ----------
@@ -102,7 +103,7 @@ class Foresight:
     async def look(
         self, able: npt.NDArray[np.bool_], ready: npt.NDArray[np.bool_], *, running: bool
     ) -> None:
-        """Add a point to what has come true, and predict if it is time.
+        """Record the present errors, and predict if it is time.
 
         Parameters
         ----------

@@ -41,7 +41,7 @@ class Forgetting(Protocol):
 
 
 class Keeping:
-    """The memory of what the plant learns, in a store; without a store it does nothing.
+    """The plant's memory of its calibrations, in a store; without a store it does nothing.
 
     It keeps and numbers sightings, and each new calibration, for the plant's beliefs.
 
@@ -71,7 +71,7 @@ class Keeping:
         return self.lost or (self._records.problem if self._records is not None else "")
 
     def recall(self) -> None:
-        """Let the plant believe the calibrations kept before, and keep new ones from now on."""
+        """Load the stored calibrations into the plant's beliefs, and keep new ones from now on."""
         records = self._records
         if records is None:
             return
@@ -129,7 +129,7 @@ class Keeping:
             self.lost = str(error)
 
     def learnings(self) -> list[LearningEntry]:
-        """Return what was learnt last of each group."""
+        """Return the last learning of each group."""
         return [] if self._records is None else self._records.learnings()
 
     def timetable(self) -> TimetableRecord | None:
@@ -221,7 +221,7 @@ class Keeping:
         )
         try:
             self._records.record(visit)
-            seen = self._beliefs.seen(entry.heliostat)
+            seen = self._beliefs.known(entry.heliostat)
             if seen is None or (seen.identities > 0).all():
                 self.lost = ""
         except StoreError as error:

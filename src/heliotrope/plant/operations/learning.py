@@ -1,4 +1,4 @@
-"""What the plant learns at night: the hyperparameters of each group, beside everything else.
+"""Nightly learning: the hyperparameters of each group, in the background.
 
 They say how far the mirrors of a group differ from the plant file, how their drives drift, and how
 noisy their photographs are. Visits follow the drift by them, and the predicted errors, the schedule
@@ -37,7 +37,7 @@ class Learner(Protocol):
     """Where groups are learnt: beside the plant, never in its loop."""
 
     async def learn(self, group: GroupHistory) -> LearntGroup:
-        """Return what a group teaches.
+        """Return the result of learning a group.
 
         Raises
         ------
@@ -69,7 +69,7 @@ class Learning:
     learner
         Where it is done; None: nothing is learnt.
     person
-        In whose name the nightly learning stands in the audit.
+        Name under which the audit lists the nightly learning.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class Learning:
         self._plant.note(person, "LEARN", f"group {', '.join(wanted)}")
 
     def views(self) -> tuple[LearningView, ...]:
-        """Return what is in force for each group."""
+        """Return the hyperparameters in force for each group."""
         return tuple(self._view(name, group) for name, group in self._groups.items())
 
     def _view(self, name: str, group: _Group) -> LearningView:
@@ -162,7 +162,7 @@ class Learning:
         group, beliefs = self._groups[name], self._plant.beliefs
         group.known = self._count(name)
         heliostats = self._plant.design.groups[name]
-        seen = [beliefs.seen(each) for each in heliostats.names]
+        seen = [beliefs.known(each) for each in heliostats.names]
         task = GroupHistory(
             heliostats.mechanism,
             tuple(None if one is None else one.sightings for one in seen),
@@ -249,7 +249,7 @@ class Learning:
         return learnt or defaults(heliostats.mechanism, self._names_of(name))
 
     def _count(self, name: str) -> int:
-        seen = [self._plant.beliefs.seen(n) for n in self._plant.design.groups[name].names]
+        seen = [self._plant.beliefs.known(n) for n in self._plant.design.groups[name].names]
         return sum(len(one) for one in seen if one is not None)
 
     def _utc(self) -> float:

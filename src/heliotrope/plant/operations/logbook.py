@@ -260,7 +260,7 @@ class _Listener:
         self._cluster, self._book = cluster, book
 
     async def posted(self, data: bytes, now: float) -> None:
-        """Wait for nothing: only a message that was sent is noted."""
+        """Do nothing: only messages that were sent are noted."""
 
     def sent(self, data: bytes, now: float) -> None:
         del now  # the book notes its own time

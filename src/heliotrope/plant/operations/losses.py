@@ -69,7 +69,7 @@ class Losses:
             self._wait(alarm)
 
     def look(self, wanted: Mask, at_stow: Mask = _NONE) -> Mask:
-        """Return which of the wanted heliostats (N,) were lost since the last look, (N,).
+        """Return a mask of the wanted heliostats (N,) lost since the last check, (N,).
 
         Those that are diagnosed ``at_stow`` (N,) are IDLE there, and no loss.
         """
@@ -96,7 +96,7 @@ class Losses:
         return lost
 
     def settling(self) -> Mask:
-        """Return which heliostats were lost a moment ago and are not raised yet, (N,)."""
+        """Return a mask of the heliostats lost a moment ago and not raised yet, (N,)."""
         return np.asarray(self._plant.now() - self._lost_at < SPAN)
 
     def resume(self) -> None:

@@ -76,7 +76,7 @@ class MovementChecks:
 
     @property
     def moved(self) -> Mask:
-        """Which heliostats are being diagnosed, (N,)."""
+        """A mask of the heliostats under diagnosis, (N,)."""
         moved = np.zeros(len(self._plant.field), dtype=np.bool_)
         moved[[self._plant.field.place(name) for name in self._running]] = True
         return moved
@@ -105,7 +105,7 @@ class MovementChecks:
         try:
             released = await self._given(token, "IDLE", names, _HOLDS)
             ended = await self._given(token, "DIAGNOSE", released, _ENDS)
-            await plant.drive_checks.told(ended, _TELLS)
+            await plant.drive_checks.checked(ended, _TELLS)
         finally:
             plant.stow(self._person.name, names)
             self._running = frozenset()

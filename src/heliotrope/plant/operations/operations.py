@@ -75,7 +75,7 @@ class Photographer(Protocol):
         ...
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return what a new photograph shows."""
+        """Return the light in a new photograph."""
         ...
 
 
@@ -454,7 +454,7 @@ class Operations:
         *,
         tower: bool,
     ) -> list[tuple[Kind, str]]:
-        """Return what is locked or given back, by kind and name."""
+        """Return the places to lock or give back, by kind and name."""
         for name in heliostats:
             self.plant.field.place(name)
         for name in targets:
@@ -675,7 +675,7 @@ def _some(heliostats: Sequence[str]) -> str:
 
 
 def _named(places: Sequence[tuple[Kind, str]]) -> str:
-    """Return what is locked in words; heliostats by their bare names."""
+    """Return the locked places in words; heliostats by their bare names."""
     bare = (Kind.HELIOSTAT, Kind.TOWER)
     return _some([name if kind in bare else f"{kind} {name}" for kind, name in places])
 

@@ -92,9 +92,9 @@ class PictureSettings:
     def __post_init__(self) -> None:
         if not (0.0 < self.whole <= self.last and self.most > 0.0):
             raise InputError(
-                f"pictures: every one for {self.whole:g} days, the last for {self.last:g} days, "
-                f"{self.most / 1e9:g} GB; give days above 0, no more for every one than for the "
-                "last, and a size above 0"
+                f"pictures: all are kept for {self.whole:g} days, some for {self.last:g} days, in "
+                f"{self.most / 1e9:g} GB; give days above 0, no more for all than for some, and a "
+                "size above 0"
             )
 
 
@@ -114,7 +114,7 @@ class Pictures:
     settings
         See `PictureSettings`.
     disk
-        Does everything that waits for the folder; None: it is done where it is asked for.
+        Runs everything that waits for the folder; None: it runs in the caller.
 
     Attributes
     ----------
@@ -330,7 +330,7 @@ class KeptCamera:
         self._kept = dict[str, int]()
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return what a new photograph shows of a heliostat's beam."""
+        """Return a heliostat's beam in a new photograph."""
         before = self._camera.view(target.name).version
         shot = await self._camera.photograph(target, heliostat)
         view = self._camera.view(target.name)

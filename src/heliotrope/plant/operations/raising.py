@@ -130,21 +130,21 @@ class Raising:
             self.attempts.failed(self._plant.field.names[row], reason, self._plant.now())
 
     def given_up(self) -> Mask:
-        """Return which heliostats are not raised for now: that has failed too often, (N,)."""
+        """Return a mask of the heliostats not raised for now, after too many failures, (N,)."""
         found = np.zeros(len(self._plant.field), dtype=np.bool_)
         waiting = self.attempts.waiting(self._plant.now())
         found[[self._plant.field.place(name) for name in waiting]] = True
         return found
 
-    def why_not(self, heliostat: str) -> str:
-        """Return why a wanted heliostat is not raised, "" if it is or waits for its turn."""
+    def why_not(self, heliostat: str) -> str | None:
+        """Return the reason why a heliostat is not raised, None if it is or waits for its turn."""
         if why := self._plant.drive_checks.stalled.get(heliostat):
             return f"{why}: see the alarm {alarms.DRIVE_STALLED.name}"
         if heliostat in self._blocked:
             return f"its beam has no free path: {self._blocked[heliostat]}"
         if not self.attempts.due(heliostat, self._plant.now()):
             return f"it was raised in vain too often: {alarms.RAISING_GIVEN_UP.name}"
-        return ""
+        return None
 
     def waits(self, heliostats: Sequence[str]) -> dict[str, str]:
         """Return the wanted heliostats that wait for more than their turn, and for what."""
@@ -160,7 +160,7 @@ class Raising:
         return found
 
     def _known(self) -> Mask:
-        """Return which heliostats are known well enough to go to the receiver, (N,)."""
+        """Return a mask of the heliostats known well enough to go to the receiver, (N,)."""
         calibrated = [self._plant.beliefs.record(name) is not None for name in self._names]
         return (self._clear | np.array(calibrated, dtype=np.bool_)) & bool(self._aims)
 
@@ -200,7 +200,7 @@ class Raising:
         self._busy_until[self._plant.field.place(heliostat)] = -math.inf
 
     def _clear_of_targets(self, clearance: float) -> Mask:
-        """Return which uncalibrated beams miss all targets on their way to the receiver, (N,)."""
+        """Return a mask of the uncalibrated beams that miss all targets on the path up, (N,)."""
         plant, aims = self._plant, self._aims
         if not aims:
             return np.zeros(len(plant.field), dtype=np.bool_)
@@ -213,7 +213,7 @@ class Raising:
         return np.asarray(math.sqrt(2.0) * clearance * slant < room)
 
     def _on_targets(self, points: FloatArray) -> Mask:
-        """Return which points (N, 3) are on a target: a person has ended the visit there."""
+        """Return a mask of the points (N, 3) on a target: a person has ended the visit there."""
         found = np.zeros(len(points), dtype=np.bool_)
         for middle, reach in self._targets:
             found |= np.linalg.norm(points - middle, axis=-1) <= reach
@@ -238,7 +238,7 @@ class Raising:
         return np.flatnonzero(found)
 
     def able(self) -> Mask:
-        """Return which heliostats can track from standby, as far as they tell, (N,)."""
+        """Return a mask of the heliostats that report that they can track from standby, (N,)."""
         field = self._plant.field
         found: Mask = field.rows["flags"] & meanings.READY != 0
         found[[field.place(name) for name in self._plant.wanted.missing]] = False

@@ -33,7 +33,7 @@ PARKING = RetryLaw(
 
 
 class Service:
-    """What persons have locked, and the heliostats that are in stow for it.
+    """Persons' locks, and the heliostats that are in stow because of them.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class Service:
         return tuple(self._plant.lockouts)
 
     def rows(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats persons' locks keep in stow, or have sent there, (N,).
+        """Return a mask of the heliostats that persons' locks keep in stow, or sent there, (N,).
 
         They are locked themselves, their beams are aimed at something that is, or the tower is.
         """
@@ -77,15 +77,15 @@ class Service:
             found |= near
         return found
 
-    def closed(self, target: str) -> str:
-        """Return why no beam may be sent to a target, "" if one may."""
+    def closed(self, target: str) -> str | None:
+        """Return the reason why no beam may be sent to a target, None if one may."""
         locks = self._plant.lockouts
-        return locks.text(Kind.TARGET, target) or locks.text(Kind.TOWER, TOWER)
+        return locks.text(Kind.TARGET, target) or locks.text(Kind.TOWER, TOWER) or None
 
     def take(
         self, person: Person, places: Sequence[Place], reason: str, hours: float
     ) -> tuple[str, ...]:
-        """Lock places for a person, and stow the heliostats concerned; return their names.
+        """Lock places for a person, and stow the affected heliostats; return their names.
 
         See `Operations.hold`.
         """
@@ -113,7 +113,7 @@ class Service:
         return tuple(field.names[row] for row in np.flatnonzero(found))
 
     def _under(self, lock: Lockout) -> npt.NDArray[np.bool_]:
-        """Return which heliostats must be in stow under one lock now, (N,)."""
+        """Return a mask of the heliostats that must be in stow under one lock now, (N,)."""
         field, found = self._plant.field, np.zeros(len(self._plant.field), dtype=np.bool_)
         if lock.kind is Kind.HELIOSTAT:
             found[field.place(lock.name)] = True

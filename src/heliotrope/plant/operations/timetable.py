@@ -51,7 +51,7 @@ class Timetable:
         self._looked = self._now()
 
     def recall(self) -> None:
-        """Put in force what a person had put in force before a restart."""
+        """Restore the timetable that a person had put in force before a restart."""
         kept = self._keeping.timetable()
         if kept is None or not kept.document:
             return
@@ -65,7 +65,7 @@ class Timetable:
             self._entries = entries
 
     def put(self, person: Person, entries: Sequence[TimetableEntry] | None) -> None:
-        """Put a timetable in force, or with None again that of the plant file.
+        """Put a timetable in force; None restores that of the plant file.
 
         Raises
         ------

@@ -154,7 +154,7 @@ class TypedParameters:
         values: Mapping[str, float],
         reason: str,
     ) -> Ticket:
-        """Set parameters of one heliostat that stands where they may be written.
+        """Set parameters of one heliostat that is where they may be written.
 
         Parameters
         ----------

@@ -558,7 +558,7 @@ class FlightView:
 
 @dataclass(frozen=True)
 class LearningView:
-    """What was learnt of a group of mirrors, and is in force.
+    """The hyperparameters of a group of mirrors that are in force.
 
     Attributes
     ----------

@@ -93,7 +93,7 @@ class Audit(Protocol):
 
 
 class Forgetful:
-    """An audit that stores nothing, for plants that are only looked at."""
+    """An audit that stores nothing, for plants that are only inspected."""
 
     def begin(self, record: Record) -> None:
         """Take a record."""

@@ -161,7 +161,7 @@ class Mandate:
     def take_out(
         self, heliostats: Iterable[str], why: str, *, fault: bool = False
     ) -> tuple[str, ...]:
-        """Take heliostats out, ``why`` saying who ordered what; return those that were in it.
+        """Take heliostats out for a reason ``why``; return those that were in it.
 
         With ``fault`` the heliostats have caused the order themselves.
         """
@@ -173,7 +173,7 @@ class Mandate:
         return names
 
     def give_up(self, heliostats: Iterable[str]) -> None:
-        """Let heliostats take part no longer, by the visit's own decision."""
+        """Release heliostats by the visit's own decision."""
         self.heliostats.difference_update(heliostats)
 
     def refused(self, heliostats: Iterable[str]) -> dict[str, str]:
@@ -374,7 +374,7 @@ class Authority:
                 self._own, self._last_kept = 0, self._clock.monotonic()
 
     def mandate_of(self, token: int) -> Mandate | None:
-        """Return the open mandate that a token stands for, None if there is none."""
+        """Return the open mandate of a token, None if there is none."""
         return self._mandates.get(token)
 
     def visited(self) -> dict[str, Mandate]:
@@ -403,7 +403,7 @@ class Authority:
         return frozenset() if token == self.token else frozenset(heliostats)
 
     def left(self, token: int, heliostats: Iterable[str]) -> frozenset[str]:
-        """Return the heliostats that nobody looks after any more under a token.
+        """Return the heliostats that no mandate holds any more under a token.
 
         Those of a visit that is told to end are still its own: it takes their beams off.
         """

@@ -61,7 +61,7 @@ class NewPoints:
 
     name: str
     names: tuple[str, ...]
-    wanted: FloatArray
+    points: FloatArray
     token: int
     store: Callable[[tuple[str, ...], FloatArray], Storing]
     note: Callable[[tuple[str, ...], FloatArray], None] = lambda *_: None
@@ -71,7 +71,7 @@ class NewPoints:
     def of(self, names: Sequence[str]) -> FloatArray:
         """Return the points of some heliostats, (M, 3)."""
         row = {name: i for i, name in enumerate(self.names)}
-        return self.wanted[np.array([row[name] for name in names], dtype=np.intp)]
+        return self.points[np.array([row[name] for name in names], dtype=np.intp)]
 
     def grouped(self, names: Iterable[str]) -> dict[tuple[float, ...], list[str]]:
         """Return the heliostats of each point, which share one command."""
@@ -88,13 +88,13 @@ class Commands:
         The plant's.
     guards
         What stops heliostats; see `GUARDS`.
-    given
-        Points that were given, and whether they were taken.
+    unacknowledged
+        Points that were assigned, and whether they were taken.
     proofs
         Where beams may go.
     design
         Knows the targets and receivers.
-    wanted
+    required
         Parameters that local controllers should store, their standby points among them.
     taken
         What visits have taken.
@@ -105,16 +105,16 @@ class Commands:
         orders: PlantOrders,
         joining: JoinQueue,
         guards: Guards,
-        given: Unacknowledged,
+        unacknowledged: Unacknowledged,
         proofs: PathProofs,
         design: Plant,
-        wanted: Wanted,
+        required: Wanted,
         taken: Taken,
     ) -> None:
         self._orders, self._joining, self._guards = orders, joining, guards
         self._now, self._authority = orders.clock.monotonic, orders.authority
-        self._given, self._proofs, self._field = given, proofs, proofs.field
-        self._design, self._wanted = design, wanted
+        self._unacknowledged, self._proofs, self._field = unacknowledged, proofs, proofs.field
+        self._design, self._required = design, required
         self._movements, self._locks, self._stepping = taken.movements, taken.locks, taken.stepping
 
     def give(
@@ -129,14 +129,14 @@ class Commands:
         row = wire.ROW_OF.get(wire.NUMBER_OF.get(name, -1))
         if row is None or row[2] != wire.AUTHORITY or name in wire.POINTS:
             known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY]
-            known = [each for each in known if each not in wire.POINTS]
+            known = [row_name for row_name in known if row_name not in wire.POINTS]
             raise UnknownNameError("command (points are given by aim and standby)", name, known)
         numbers = whole(values, row[3], name)
         self._authority.check(person, token, name)
         names = tuple(dict.fromkeys(heliostats)) or self._field.names
         others, out = self._guards.passed(Asked(name, names, token=token), OUT_OF_SERVICE)
-        clear, wrong = self.examine(name, numbers, others, token)
-        blocked = {**wrong, **out}
+        clear, refused = self.examine(name, numbers, others, token)
+        blocked = {**refused, **out}
         store = self._lock_record(clear, token) if name == "LOCK" else None
         ticket = self.accept(person, token, name, numbers, names, store=store, blocked=blocked)
         if name not in wire.SETTINGS:
@@ -160,23 +160,23 @@ class Commands:
         RefusedError
             If it may no longer be sent.
         """
-        name, left = ticket.name, ticket.waiting(heliostats)
-        if again and left:
-            out = self._guards.reasons(Asked(name, left), OUT_OF_SERVICE)
-            others = tuple(n for n in left if n not in out)
-            left, wrong = self.examine(name, numbers, others, token)
-            ticket.block({**wrong, **out})
+        name, waiting = ticket.name, ticket.waiting(heliostats)
+        if again and waiting:
+            out = self._guards.reasons(Asked(name, waiting), OUT_OF_SERVICE)
+            others = tuple(n for n in waiting if n not in out)
+            waiting, refused = self.examine(name, numbers, others, token)
+            ticket.block({**refused, **out})
             if name not in wire.SETTINGS:
                 # One that was given before it may have joined the queue after its acceptance.
-                self._joining.drop(f"superseded by {name}", frozenset(left))
-        if left and name == "LOCK":
-            self._note_lock(left, token)
+                self._joining.drop(f"superseded by {name}", frozenset(waiting))
+        if waiting and name == "LOCK":
+            self._note_lock(waiting, token)
         if name == "ROUGH":
-            self._stepping.ordered(left, bool(numbers[0]))
-        if left:
-            waits = name in wire.JOINING or in_slices(name, left)
+            self._stepping.ordered(waiting, bool(numbers[0]))
+        if waiting:
+            waits = name in wire.JOINING or in_slices(name, waiting)
             send = self._join if waits else self._orders.command
-            send(ticket, name, numbers, left, token)
+            send(ticket, name, numbers, waiting, token)
 
     def accept(
         self,
@@ -200,20 +200,22 @@ class Commands:
         RefusedError
             If it may not.
         """
-        for each in heliostats:
-            self._field.place(each)
+        for heliostat in heliostats:
+            self._field.place(heliostat)
         self._authority.check(person, token, name)
-        self._guards.refuse_now(name, [each for each in heliostats if each not in blocked])
+        self._guards.refuse_now(
+            name, [heliostat for heliostat in heliostats if heliostat not in blocked]
+        )
         mandate = self._authority.mandate_of(token)
         if mandate is not None:
-            wrong = mandate.refused(heliostats)
+            reasons = mandate.refused(heliostats)
         else:
             verifying = self._guards.doubtful.verifying(heliostats) if name in TO_AIMS else ()
-            wrong = dict.fromkeys(verifying, refusals.NOT_VERIFIED.text)
-            if name in wire.JOINING and len(wrong) < len(heliostats):
-                blocked, wrong = {**blocked, **wrong}, {}
-        if wrong:
-            raise BeamError(name, wrong)
+            reasons = dict.fromkeys(verifying, refusals.NOT_VERIFIED.text)
+            if name in wire.JOINING and len(reasons) < len(heliostats):
+                blocked, reasons = {**blocked, **reasons}, {}
+        if reasons:
+            raise BeamError(name, reasons)
         try:
             ticket = self._orders.accept(
                 (person.name, person.role.title, name), values, heliostats, note, store=store
@@ -248,11 +250,11 @@ class Commands:
             If none may.
         """
         asked = Asked(name, names, token=token)
-        able, wrong = self._guards.passed(asked, NOT_NOW, BEAM_REFUSED)
+        able, refused = self._guards.passed(asked, NOT_NOW, BEAM_REFUSED)
         if in_slices(name, able):
-            return able, wrong  # each slice is examined when its turn comes
+            return able, refused  # each slice is examined when its turn comes
         clear, blocked = self._proofs.clear(name, numbers, able, self._now())
-        return clear, wrong | blocked
+        return clear, refused | blocked
 
     def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
         """Declare the step counts of the axes of one heliostat that is locked or has a fault.
@@ -287,8 +289,8 @@ class Commands:
         def send(again: bool) -> None:
             if again:
                 self._guards.passed(asked, OUT_OF_SERVICE)
-            left = ticket.waiting((heliostat,))
-            self._orders.command(ticket, "ZERO", numbers, left, token)
+            waiting = ticket.waiting((heliostat,))
+            self._orders.command(ticket, "ZERO", numbers, waiting, token)
 
         self._orders.when_recorded(ticket, send)
         return ticket
@@ -297,8 +299,8 @@ class Commands:
         self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> Ticket:
         """Give AIM or STANDBY with a point (3,) for each heliostat; see `PlantController.aim`."""
-        names, _, wanted, out = self._pointed(name, points)
-        self.prove_points(name, names, wanted)
+        names, _, targets, out = self._pointed(name, points)
+        self.prove_points(name, names, targets)
         visit = self._authority.mandate_of(token) is not None
 
         def store(some: tuple[str, ...], places: FloatArray) -> Storing:
@@ -314,17 +316,17 @@ class Commands:
                 self._movements.forget(some)
             else:
                 for each, place in zip(some, places, strict=True):
-                    self._wanted.rest(each, tuple(place))
+                    self._required.rest(each, tuple(place))
 
-        groups = grouped(names, wanted)
+        groups = grouped(names, targets)
         values = next(iter(groups)) if len(groups) == 1 else ()
         all_names, text = (*names, *out), f"{len(groups)} points"
 
         def accept(store: tuple[Work, Work] | None) -> Ticket:
-            each = person, token, name, values, all_names, text, store, out
-            return self.accept(*each)
+            order = person, token, name, values, all_names, text, store, out
+            return self.accept(*order)
 
-        return self.give_points(NewPoints(name, names, wanted, token, store, note), accept)
+        return self.give_points(NewPoints(name, names, targets, token, store, note), accept)
 
     def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Move beams a little on their receiver, for a measurement; their aims stay assigned.
@@ -344,10 +346,10 @@ class Commands:
         RefusedError
             If it is not accepted, or one of the beams may not go there.
         """
-        names, rows, wanted, out = self._pointed("AIM", points)
+        names, rows, targets, out = self._pointed("AIM", points)
         tracking, aims = self._field.among((states.TRACKING,), self._now())[rows], self._aims(rows)
-        self._movements.check(names, rows, aims, wanted, tracking)
-        self.prove_points("AIM", names, wanted)
+        self._movements.check(names, rows, aims, targets, tracking)
+        self.prove_points("AIM", names, targets)
 
         def store(some: tuple[str, ...], places: FloatArray) -> Storing:
             return self.holding(self._lent(some, places))
@@ -362,11 +364,11 @@ class Commands:
             self._movements.take(some, self._aims(self._places(some)), token, self._now())
 
         def accept(store: tuple[Work, Work] | None) -> Ticket:
-            each = person, token, "AIM", (), (*names, *out), f"{len(names)} coded movements"
-            return self.accept(*each, store, out)
+            order = person, token, "AIM", (), (*names, *out), f"{len(names)} coded movements"
+            return self.accept(*order, store, out)
 
         every = frozenset(names)
-        new = NewPoints("AIM", names, wanted, token, store, note, check, lambda: every)
+        new = NewPoints("AIM", names, targets, token, store, note, check, lambda: every)
         return self.give_points(new, accept)
 
     @property
@@ -387,11 +389,11 @@ class Commands:
     def _pointed(
         self, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> tuple[tuple[str, ...], npt.NDArray[np.intp], FloatArray, dict[str, str]]:
-        """Return heliostats, rows (K,) and points (K, 3), and which are out of service, and why."""
-        wanted = points_of(name, points) if name == "AIM" else None
-        left, out = self._guards.passed(Asked(name, tuple(points), wanted), OUT_OF_SERVICE)
-        points = {n: points[n] for n in left}
-        rows = self._places(left)
+        """Return heliostats, rows (K,), points (K, 3), and reasons of those out of service."""
+        goals = points_of(name, points) if name == "AIM" else None
+        able, out = self._guards.passed(Asked(name, tuple(points), goals), OUT_OF_SERVICE)
+        points = {n: points[n] for n in able}
+        rows = self._places(able)
         return tuple(points), rows, points_of(name, points), out
 
     def storing(
@@ -401,7 +403,7 @@ class Commands:
         return self._proofs.points.storing(name, self._places(names), places, held)
 
     def _lent(self, names: tuple[str, ...], places: FloatArray) -> Held:
-        """Return what is to be stored before a visit sends beams to points (K, 3)."""
+        """Return the record to store before a visit sends beams to points (K, 3)."""
         return self._movements.record(names, self._aims(self._places(names)), places)
 
     def give_points(
@@ -425,7 +427,7 @@ class Commands:
         def send(again: bool) -> None:
             if again:
                 self._guards.refuse_now(new.name, new.names)
-                self.prove_points(new.name, new.names, new.wanted)
+                self.prove_points(new.name, new.names, new.points)
             new.check(new.names)
             self._joining.drop(f"superseded by another {new.name}", frozenset(new.names), new.name)
             joins = waiting | self._joins(new)
@@ -436,7 +438,7 @@ class Commands:
             for point, members in new.grouped(still).items():
                 self._orders.command(ticket, new.name, point, members, new.token)
             for point, members in new.grouped(n for n in new.names if n in joins).items():
-                part = replace(new, names=tuple(members), wanted=new.of(members))
+                part = replace(new, names=tuple(members), points=new.of(members))
                 assign = partial(self._assign_in_turn, part, ticket)
                 self._join(ticket, new.name, point, members, new.token, assign)
 
@@ -456,14 +458,14 @@ class Commands:
 
         def stored(again: bool) -> None:
             new.check(names)
-            left = names
+            cleared = names
             if again:
                 self._guards.refuse_now(new.name, names)
-                left = clear(names)
-            if gone := set(names).difference(left):
-                self._orders.owe(partial(store[1], gone))
-            self._assign(new, ticket, left)
-            send(left)
+                cleared = clear(names)
+            if dropped := set(names).difference(cleared):
+                self._orders.owe(partial(store[1], dropped))
+            self._assign(new, ticket, cleared)
+            send(cleared)
 
         self._orders.when_stored(ticket, names, store, stored)
 
@@ -472,7 +474,7 @@ class Commands:
         places = new.of(names)
         new.note(names, places)
         self._proofs.points.assign(new.name, self._places(names), places)
-        self._given.sent(ticket, names)
+        self._unacknowledged.sent(ticket, names)
 
     def _joins(self, new: NewPoints) -> frozenset[str]:
         """Return the heliostats that track, and need a turn to join their new aims.
@@ -486,10 +488,10 @@ class Commands:
         if new.free is not None:
             return frozenset(new.names[i] for i in np.flatnonzero(moves)) - new.free()
         return frozenset(
-            new.names[i] for i in np.flatnonzero(moves & ~self._stays(rows, new.wanted))
+            new.names[i] for i in np.flatnonzero(moves & ~self._stays(rows, new.points))
         )
 
-    def prove_points(self, name: str, names: tuple[str, ...], wanted: FloatArray) -> None:
+    def prove_points(self, name: str, names: tuple[str, ...], places: FloatArray) -> None:
         """Prove that heliostats (K,) may be given points (K, 3) now.
 
         Raises
@@ -501,25 +503,25 @@ class Commands:
         tracking = self._field.among(states.ON_AIM, self._now())[rows]
         moves = tracking if name == "AIM" else self._field.among((states.IDLE,), self._now())[rows]
         moved = tuple(names[i] for i in np.flatnonzero(moves))
-        if wrong := self._guards.reasons(Asked(name, moved, wanted[moves]), BEAM_REFUSED):
-            raise BeamError(name, wrong)
-        self._proofs.check_points(name, rows, wanted, tracking)
+        if reasons := self._guards.reasons(Asked(name, moved, places[moves]), BEAM_REFUSED):
+            raise BeamError(name, reasons)
+        self._proofs.check_points(name, rows, places, tracking)
 
-    def _stays(self, rows: npt.NDArray[np.intp], wanted: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which heliostats bring no light to a receiver by new points (K, 3), (K,).
+    def _stays(self, rows: npt.NDArray[np.intp], places: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return a mask of the heliostats that new points (K, 3) keep off receivers, (K,).
 
         Aim and new point lie on the same target, or near each other and off every receiver: so
         moves a beam that is sent beside a target, because it misses.
         """
         aims = self._proofs.points.aims[rows]
-        found = np.linalg.norm(wanted - aims, axis=-1) <= _BESIDE
+        stays = np.linalg.norm(places - aims, axis=-1) <= _BESIDE
         for receiver in self._design.receivers:
             clear = 0.5 * float(np.hypot(receiver.width, receiver.height)) + _BESIDE
-            for points in (aims, wanted):
-                found &= np.linalg.norm(points - receiver.center, axis=-1) > clear
+            for points in (aims, places):
+                stays &= np.linalg.norm(points - receiver.center, axis=-1) > clear
         for target in self._design.targets:
-            found |= target.holds(aims) & target.holds(wanted)
-        return np.asarray(found)
+            stays |= target.holds(aims) & target.holds(places)
+        return np.asarray(stays)
 
     def _join(
         self,

@@ -71,7 +71,7 @@ class JoinDispatcher(Part):
         self._orders.command(job.ticket, job.name, values, heliostats, token, self._life, again)
 
     def _wait_again(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
-        """Let heliostats whose cluster refused an earlier token wait for another turn."""
+        """Queue heliostats again whose cluster refused an earlier token."""
         self._queue.put(replace(job, waiting=deque(heliostats)))
 
     def _clear(self, job: JoiningJob, part: tuple[str, ...]) -> tuple[str, ...]:

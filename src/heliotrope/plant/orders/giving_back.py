@@ -58,7 +58,7 @@ class GivingBack(Part):
         self._stow = stow
 
     def on_beat(self, now: float) -> None:
-        """Give back what is due, as far as motions are accepted now."""
+        """Give back the heliostats that are due, as far as motions are accepted now."""
         self._unlock(now)
         self._bring_back(now)
         self._step(now)

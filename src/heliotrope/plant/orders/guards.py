@@ -147,7 +147,7 @@ def _each(reason: Callable[[Guards, str], str | None]) -> Check:
     return lambda plant, asked: (reason(plant, name) for name in asked.heliostats)
 
 
-def _cluster(reason: Callable[[Guards, str], str]) -> Check:
+def _cluster(reason: Callable[[Guards, str], str | None]) -> Check:
     """Ask once for each cluster."""
 
     def check(plant: Guards, asked: Asked) -> Iterable[str | None]:

@@ -77,7 +77,7 @@ class JoinQueue:
         self._jobs: deque[JoiningJob] = deque()
 
     def __len__(self) -> int:
-        """Return how many wait to join the receiver."""
+        """Return the number of heliostats that wait to join the receiver."""
         return sum(len(job.waiting) for job in self._jobs if job.name not in messages.SLICED)
 
     def waiting(self, name: str) -> frozenset[str]:

@@ -180,16 +180,16 @@ class KeptPoints:
         self._kept = {kind: dict(places) for kind, places in points.items()}
 
 
-def _room(keeper: Keeper) -> str:
-    """Return why the disk has no room, "" if it has room."""
+def _room(keeper: Keeper) -> str | None:
+    """Return the reason why the disk has no room, None if it has room."""
     file = keeper.database.file
     if file is None:
-        return ""
+        return None
     try:
         disk = os.statvfs(file.parent)
     except OSError as error:
         return f"store {file}: {error.strerror}; see to its disk"
     free = disk.f_bavail * disk.f_frsize
     if free >= LEAST_FREE:
-        return ""
+        return None
     return f"store {file}: {free} bytes are left on its disk, below {LEAST_FREE}; make room"

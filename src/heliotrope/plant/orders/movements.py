@@ -141,7 +141,7 @@ class Movements:
             self._moved[name] = _Moved(np.array(aim), 0, -np.inf, small=False)
 
     def record(self, names: Sequence[str], aims: FloatArray, wanted: FloatArray) -> Held:
-        """Return what is to be stored before a visit gives aims ``wanted``; see `lend`."""
+        """Return the record to store before a visit gives aims ``wanted``; see `lend`."""
         found: dict[str, tuple[float, ...] | None] = {}
         for name, present, point in zip(names, aims, wanted, strict=True):
             aim = np.array(self.aim(name, present))
@@ -160,14 +160,14 @@ class Movements:
 
     @contextmanager
     def ending(self, heliostats: Collection[str]) -> Iterator[None]:
-        """Let the beams of heliostats go back at the end of a block, however it ends."""
+        """Return the beams of heliostats at the end of a block, however it ends."""
         try:
             yield
         finally:
             self.end(heliostats)
 
     def end(self, heliostats: Collection[str]) -> None:
-        """Let beams go back at the next look."""
+        """Return beams at the next check."""
         for name in heliostats:
             if name in self._moved:
                 self._moved[name] = replace(self._moved[name], until=-np.inf)
@@ -175,8 +175,8 @@ class Movements:
     def due(self, now: float, token: int, left: Left) -> dict[str, FloatArray]:
         """Return the aims of beams that are to go back now, by heliostat.
 
-        None are without a command authority (``token`` 0). ``left`` returns those that nobody
-        looks after any more under the token that moved them.
+        Without a command authority (``token`` 0) there are none. ``left`` returns those that no
+        visit holds any more under the token that moved them.
         """
         for ticket in [ticket for ticket in self._sent if ticket.finished]:
             self._sent.remove(ticket)
@@ -199,7 +199,7 @@ class Movements:
                 self._moved[name] = replace(moved, until=now + moved.pause, pause=pause)
 
     def wait(self, heliostats: Iterable[str], token: int, now: float) -> None:
-        """Let beams that cannot go back now be tried again."""
+        """Try again later to return beams that cannot go back now."""
         for name in heliostats:
             if (moved := self._moved.get(name)) is not None:
                 self._moved[name] = replace(moved, token=token, until=now + _AGAIN)

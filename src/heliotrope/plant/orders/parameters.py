@@ -46,7 +46,7 @@ _SUNS = tuple(
 
 
 def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
-    """Return the largest angle by which new parameters turn a beam from its aim, rad.
+    """Return the largest turn of a beam from its aim by new parameters, rad.
 
     The mirror is taken to be as the present parameters say, and its local controller to aim by the
     new ones, for suns all around. Infinite if the new ones reach none of the poses, or an aim that
@@ -174,7 +174,7 @@ class ParameterSync(Part):
         self._strange.update(name for name in heliostats if name in self._wanted.items)
 
     def differing(self, heliostat: str) -> str | None:
-        """Return why the parameters of a heliostat differ or may differ, None if they do not.
+        """Return how the parameters of a heliostat differ or may differ, None if they agree.
 
         They may while they have not been compared since its cluster connected, or its board
         started.
@@ -254,7 +254,7 @@ class ParameterSync(Part):
         return sums
 
     def on_second(self, now: float) -> None:
-        """Ask for what is due, and push what differs if that may be done now."""
+        """Compare the heliostats that are due, and write items that differ where allowed."""
         for name, ticket in list(self._tickets.items()):
             if ticket.finished:
                 del self._tickets[name]

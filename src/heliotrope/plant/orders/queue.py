@@ -60,7 +60,7 @@ class _Under:
 
 @dataclass
 class _Recording:
-    """What must be on the disk before some heliostats of a ticket are sent their command."""
+    """Records that must be on the disk before heliostats of a ticket are sent their command."""
 
     ticket: Ticket
     heliostats: tuple[str, ...]
@@ -94,7 +94,7 @@ class PlantOrders(Part):
     clock
         Clock of the plant.
     authority
-        Tokens of the commands; what is accepted from anybody takes heliostats out of visits.
+        Tokens of the commands; a command accepted from anybody takes heliostats out of visits.
     audit
         Store of the records.
     disk
@@ -233,7 +233,7 @@ class PlantOrders(Part):
         store: tuple[Work, Work],
         send: Callable[[bool], None],
     ) -> None:
-        """Call ``send`` once what a recorded command assigns to some heliostats is on the disk.
+        """Call ``send`` once the points that a recorded command assigns are on the disk.
 
         See `when_recorded`; ``store`` is as in `accept`.
         """
@@ -245,7 +245,7 @@ class PlantOrders(Part):
             ticket.advance(heliostats, Stage.REFUSED, f"not sent: {error}")
 
     def _write(self, key: str, recording: _Recording) -> None:
-        """Give the disk what must be on it before a command is sent."""
+        """Write the records that must be on disk before a command is sent."""
         self._recording[key] = recording
         try:
             self._disk.do(recording.write, partial(self._recorded, key, recording))

@@ -49,7 +49,7 @@ class Stepping:
 
     @contextmanager
     def fine(self, heliostats: Iterable[str]) -> Iterator[None]:
-        """Let heliostats take fine steps for the time of a block; blocks may overlap.
+        """Order fine steps for the duration of a block; blocks may overlap.
 
         The orders go out meanwhile; `coarse` says which heliostats do not follow them yet.
         """
@@ -75,7 +75,7 @@ class Stepping:
         return frozenset(self._open & self._rough - self._rests)
 
     def record(self, heliostats: Iterable[str]) -> Held:
-        """Return what is to be stored before heliostats are ordered to take fine steps."""
+        """Return the record to store before heliostats are ordered to take fine steps."""
         return {"ROUGH": {n: (0.0, 0.0, 0.0) for n in heliostats if n in self.lent}}
 
     def coarse(self, heliostats: Iterable[str], now: float) -> tuple[str, ...]:
@@ -109,6 +109,6 @@ class Stepping:
         self._tried.update(dict.fromkeys(heliostats, now))
 
     def _reported(self, now: float) -> tuple[Mask, Mask]:
-        """Return whose last report is from after the last order, and which step roughly, (N,)."""
+        """Return masks of heliostats that reported since the last order, and that step roughly."""
         known = self._field.live(now) & self._ledger.reported(STEPPING)
         return known, np.asarray(self._field.rows["flags"] & meanings.ROUGH != 0)

@@ -1,4 +1,4 @@
-"""What visits have taken, and the record of it that outlives the plant's program."""
+"""Heliostats and aims that visits have taken, with a record that outlives the program."""
 
 from collections.abc import Callable
 
@@ -40,7 +40,7 @@ class Taken(Part):
         self._points, self._owe = points, owe
 
     def on_second(self, now: float) -> None:
-        """Settle the points that are taken, and remove the records of what no visit holds."""
+        """Settle the points that are taken, and remove records that no visit holds."""
         held = {
             "LOCKED": self.locks.names,
             "LENT": self.movements.names,

@@ -121,7 +121,7 @@ class Ticket:
             self.advance([self.heliostats[i]], Stage.FAILED, text)
 
     def waiting(self, heliostats: Iterable[str]) -> tuple[str, ...]:
-        """Return which of some heliostats have not ended."""
+        """Return those of some heliostats that have not ended."""
         return tuple(name for name in heliostats if self._stage[self._row[name]] < FINAL)
 
     def unacknowledged(self) -> tuple[str, ...]:

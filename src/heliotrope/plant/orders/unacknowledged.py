@@ -67,7 +67,7 @@ class Unacknowledged(Part):
             self._points.taken(ticket.name, rows)
 
     def untaken(self, kind: str, heliostat: str) -> str | None:
-        """Return why a heliostat has a point other than the assigned one, None if it has not."""
+        """Return the reason why a heliostat has another point than the assigned one, or None."""
         last = self._tickets[kind]
         if heliostat not in last:
             return None
@@ -79,7 +79,7 @@ class Unacknowledged(Part):
         return None
 
     def unknown(self, kind: str, heliostat: str) -> str | None:
-        """Return why a heliostat may have any point, None if its point is known; see `Points`."""
+        """Return the reason why a heliostat may have any point, or None; see `Points`."""
         reason = self.untaken(kind, heliostat)
         row = self._field.place(heliostat)
         return reason if reason and self._points.unknown(kind, slice(row, row + 1)).all() else None

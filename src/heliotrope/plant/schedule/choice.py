@@ -92,15 +92,15 @@ class Sight:
         self, target: Target, position: FloatArray, size: FloatArray, cameras: tuple[Camera, ...]
     ) -> None:
         self.target = target
-        way = target.center - position
-        self.way = way / np.linalg.norm(way, axis=1)[:, None]
-        self.obliquity = angle_between(-self.way, np.broadcast_to(target.normal, way.shape))
+        path = target.center - position
+        self.path = path / np.linalg.norm(path, axis=1)[:, None]
+        self.obliquity = angle_between(-self.path, np.broadcast_to(target.normal, path.shape))
         self._position, self._size = position, size.max(axis=1)
         self._eyes = [c.position for c in cameras if c.position is not None]
 
     def able(self, sun: FloatArray, limits: SightingLimits) -> Mask:
-        """Return which heliostats may be within the limits, with some slack, (N,)."""
-        half_way = 0.5 * angle_between(np.broadcast_to(sun, self.way.shape), self.way)
+        """Return a mask of the heliostats that may be within the limits, with some slack, (N,)."""
+        half_way = 0.5 * angle_between(np.broadcast_to(sun, self.path.shape), self.path)
         return np.asarray(
             (half_way <= limits.max_incidence + SLACK)
             & (self.obliquity <= limits.max_obliquity + SLACK)
@@ -120,14 +120,15 @@ class Sight:
 
     def glare(self, sun: FloatArray) -> float:
         """Return the smallest angle between the sun and a camera's line to the target, rad."""
-        ways = [self.target.center - eye for eye in self._eyes]
+        lines = [self.target.center - eye for eye in self._eyes]
         return min(
-            (float(angle_between(way / np.linalg.norm(way), sun)) for way in ways), default=np.pi
+            (float(angle_between(line / np.linalg.norm(line), sun)) for line in lines),
+            default=np.pi,
         )
 
 
 def hidden(
-    offsets: FloatArray, normal: FloatArray, size: FloatArray, way: FloatArray
+    offsets: FloatArray, normal: FloatArray, size: FloatArray, path: FloatArray
 ) -> FloatArray:
     """Return the share of mirrors that neighbours hide towards a direction, (K,).
 
@@ -139,7 +140,7 @@ def hidden(
         Normals of the mirrors, and of their neighbours, which are taken as parallel, (K, 3).
     size
         Width and height of the mirrors, m, (K, 2).
-    way
+    path
         Unit vector to the sun or the target, (3,) or (K, 3).
 
     Notes
@@ -148,7 +149,7 @@ def hidden(
     overlap of two rectangles is exact; overlaps of several neighbours are added, which is an upper
     bound.
     """
-    ray = np.broadcast_to(way, normal.shape)
+    ray = np.broadcast_to(path, normal.shape)
     steep = np.maximum(np.einsum("kc,kc->k", normal, ray), 0.05)
     height = np.einsum("kjc,kc->kj", offsets, normal)
     moved = offsets - (height / steep[:, None])[..., None] * ray[:, None, :]
@@ -341,8 +342,8 @@ class Judge:
             look = field.look(mine, moment.now, moment.sun, sight.target, counts)
             offsets = field.position[field.near[mine]] - field.position[mine][:, None, :]
             free = look.able
-            for way in (moment.sun, sight.way[mine]):
-                share = hidden(offsets, look.normal, field.size[mine], way)
+            for path in (moment.sun, sight.path[mine]):
+                share = hidden(offsets, look.normal, field.size[mine], path)
                 free &= share <= settings.most_hidden
             square = moment.square[mine]
             seen = sight.seen(square, mine)
@@ -357,13 +358,13 @@ class Judge:
                 continue
             k = int(np.argmax(np.where(free, value, -np.inf)))
             if best is None or value[k] > best.value:
-                assignment = self._told(
+                assignment = self._assignment(
                     moment, int(mine[k]), target, look, k, float(seen[k]), overdue
                 )
                 best = Choice(float(value[k]), int(mine[k]), look.slope[k], assignment)
         return best
 
-    def _told(
+    def _assignment(
         self,
         moment: Moment,
         row: int,

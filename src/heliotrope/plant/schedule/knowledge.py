@@ -159,7 +159,7 @@ class Knowledge:
         return found
 
     def grow_as(self, row: int, growth: Growth) -> None:
-        """Let a heliostat drift as its record says; its group shares one object."""
+        """Set a heliostat's drift from its record; its group shares one object."""
         if growth not in self._growths:
             used = np.unique(np.delete(self._grows, row))
             self._growths = (*(self._growths[k] for k in used), growth)
@@ -373,7 +373,7 @@ class FieldKnowledge:
         self._groups[self.group[row]].learn(int(self._place[row]), record)
 
     def grow_as(self, row: int, growth: Growth) -> None:
-        """Let a heliostat drift otherwise since its last calibration."""
+        """Change a heliostat's drift since its last calibration."""
         self._groups[self.group[row]].grow_as(int(self._place[row]), growth)
 
     def doubt(self, row: int, factor: float) -> None:

@@ -131,7 +131,7 @@ class PlantSchedule:
         return [p for p in shown if p.heliostat not in away and p.at >= since][:limit]
 
     def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> FieldProspect | None:
-        """Return what is known now, to predict the rest of the day from; None without targets."""
+        """Return the present knowledge, from which to predict the day; None without targets."""
         return self.scheduler.prospect(self._plant.clock.utc(), able, targets)
 
     def done(self, entry: CalibrationEntry) -> None:

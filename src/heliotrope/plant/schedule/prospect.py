@@ -1,4 +1,4 @@
-"""Predicts the errors of the field for the rest of a day, from what the schedule knows.
+"""Predicts the errors of the field for the rest of a day, from the schedule's knowledge.
 
 The prediction is a plan as of `calibration.plan.plan_commission`, with the visits of the schedule:
 their times, the accuracy of a photograph, the least gain, and the goal.
@@ -143,7 +143,7 @@ def _share(pace: float) -> float:
 
 @dataclass(frozen=True)
 class FieldProspect:
-    """What is known of a field at one moment; nothing in it changes, so any process may use it.
+    """The knowledge of a field at one moment; nothing in it changes, so any process may use it.
 
     Attributes
     ----------

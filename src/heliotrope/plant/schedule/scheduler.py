@@ -302,7 +302,7 @@ class Scheduler:
         self.attempts.done(record.heliostat)
 
     def drift(self, record: HeliostatCalibration) -> None:
-        """Let a heliostat drift as the record of its last calibration says now.
+        """Set a heliostat's drift from the record of its last calibration.
 
         Raises
         ------
@@ -445,7 +445,7 @@ class Scheduler:
     def prospect(
         self, now_utc: datetime, able: Mask, targets: Sequence[str]
     ) -> FieldProspect | None:
-        """Return what is known now, to predict the rest of the day from; None without targets.
+        """Return the present knowledge, from which to predict the day; None without targets.
 
         Parameters
         ----------
@@ -488,7 +488,7 @@ class Scheduler:
         holds: Collection[str] = (),
         most: int = 20,
     ) -> list[Assignment]:
-        """Return the next visits, if the sky stays clear and each brings what is expected.
+        """Return the next visits, if the sky stays clear and each yields what is expected.
 
         Parameters
         ----------

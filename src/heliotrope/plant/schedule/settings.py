@@ -100,8 +100,8 @@ class Settings:
         """Time of a visit without driving and searching, s."""
         return self.settle + self.shots * self.interval
 
-    def closed(self, sun: FloatArray, weather: Weather) -> str:
-        """Return why nothing can be photographed under a sun (3,) and weather; "" if it can."""
+    def closed(self, sun: FloatArray, weather: Weather) -> str | None:
+        """Return the reason why a sun (3,) and weather allow no photograph, None if they do."""
         elevation = float(np.arcsin(np.clip(sun[2], -1.0, 1.0)))
         if elevation < self.limits.min_elevation:
             lowest = np.degrees(self.limits.min_elevation)
@@ -110,4 +110,4 @@ class Settings:
             return f"clouds: {weather.dni:.0f} W/m², below {self.least_dni:.0f} W/m²"
         if weather.wind > self.most_wind:
             return f"wind: {weather.wind:.1f} m/s, above {self.most_wind:.1f} m/s"
-        return ""
+        return None

@@ -250,14 +250,14 @@ class CalibrationCycle:
         return CycleResult(heliostat, CalibrationOutcome.UNCHANGED, text)
 
     def _missed(self, heliostat: str, taken: Photographs) -> float:
-        """Return the beam error of photographs by what is believed now, rad RMS."""
+        """Return the beam error of photographs by the present belief, rad RMS."""
         seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
         return root_mean_square(beam_errors(self._plant.beliefs.present(heliostat), seen).beam)
 
-    def _witness(self, heliostat: str, taken: Photographs) -> str:
-        """Let photographs show where the sun stands; return why they may not be learnt from."""
+    def _witness(self, heliostat: str, taken: Photographs) -> str | None:
+        """Check the sun by photographs; return the reason why not to learn from them."""
         if not taken.used:
-            return ""
+            return None
         beliefs = self._plant.beliefs
         seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
         return self._plant.witnesses.photographed(
@@ -332,7 +332,7 @@ class CalibrationCycle:
             result = result.then(await self._again(visit, proof, say, fewest))
         if taken.used and self._missed(visit.heliostat, taken) <= PLACED:
             self._plant.doubtful.confirm(visit.heliostat, visit.boots)
-            self._plant.drive_checks.seen(visit.heliostat, PHOTOGRAPH)
+            self._plant.drive_checks.observed(visit.heliostat, PHOTOGRAPH)
         return result
 
     async def _again(self, visit: Visit, proof: Photographs, tell: Tell, least: int) -> CycleResult:
@@ -355,111 +355,113 @@ class CalibrationCycle:
         """Fit all sightings once; push, verify and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
         new, rejected = self._plausible(name, taken)
-        known = beliefs.seen(name)
+        known = beliefs.known(name)
         old = [] if known is None else [known.sightings]
         if not new:
             outcomes = CalibrationOutcome
             outcome = outcomes.NO_PHOTOGRAPH if taken.found else outcomes.NO_BEAM
             text = "unchanged: no photograph could be used"
             return CycleResult(name, outcome, text, rejected, 0 if known is None else len(known))
-        here = join(new)
-        every = join([*old, here])
+        new_sightings = join(new)
+        every = join([*old, new_sightings])
         count = len(every) + beliefs.flights.count(name)
-        measured = root_mean_square(beam_errors(beliefs.present(name), here).beam)
+        measured = root_mean_square(beam_errors(beliefs.present(name), new_sightings).beam)
         if count < least:
-            beliefs.note(name, visit.target.name, here)
+            beliefs.note(name, visit.target.name, new_sightings)
             return CycleResult(
                 name,
                 CalibrationOutcome.TOO_FEW_SIGHTINGS,
                 f"unchanged: {count} sightings, {least} are needed",
                 rejected,
                 count,
-                len(here),
+                len(new_sightings),
                 measured,
             )
         model = await self._models.of(name, beliefs.nominal(name), every)
-        found = await self.worker(
+        fit = await self.worker(
             fit_heliostat, Believed.of(beliefs, name), self.settings, model, every
         )
         pushed: tuple[str, ...] = ()
-        if not found.problem and leaving is not None:
-            found = await self._left(visit, found, here, leaving)
-        if not found.problem:
+        if not fit.problem and leaving is not None:
+            fit = await self._after_leaving(visit, fit, new_sightings, leaving)
+        if not fit.problem:
             with self._plant.unverified(name):
-                found, pushed = await self._try(visit, found, here, taken, tell, confirming)
-        alone = not old and found.outcome is not CalibrationOutcome.UNCHANGED
-        if found.problem and (alone or found.outcome is CalibrationOutcome.NOT_VERIFIED):
+                fit, pushed = await self._try(visit, fit, new_sightings, taken, tell, confirming)
+        alone = not old and fit.outcome is not CalibrationOutcome.UNCHANGED
+        if fit.problem and (alone or fit.outcome is CalibrationOutcome.NOT_VERIFIED):
             # No earlier sighting supports these, or a later photograph contradicts them: drop them.
-            text = f"unchanged: {found.problem}"
+            text = f"unchanged: {fit.problem}"
             count = 0 if known is None else len(known)
             return CycleResult(
-                name, found.outcome, text, rejected, count, 0, np.nan, found.before, found.after
+                name, fit.outcome, text, rejected, count, 0, np.nan, fit.before, fit.after
             )
-        beliefs.note(name, visit.target.name, here)
-        record = None if found.problem else self._take(visit, found, pushed)
+        beliefs.note(name, visit.target.name, new_sightings)
+        record = None if fit.problem else self._take(visit, fit, pushed)
         return CycleResult(
             name,
-            found.outcome,
-            f"unchanged: {found.problem}"
-            if found.problem
-            else _calibrated(found.before, found.after, count),
+            fit.outcome,
+            f"unchanged: {fit.problem}"
+            if fit.problem
+            else _calibrated(fit.before, fit.after, count),
             rejected,
             count,
-            len(here),
+            len(new_sightings),
             measured,
-            found.before,
-            found.after,
+            fit.before,
+            fit.after,
             record,
         )
 
-    def _sure(self, found: JudgedFit, here: Sightings) -> bool:
+    def _sure(self, fit: JudgedFit, new_sightings: Sightings) -> bool:
         """Return whether a fit needs no photograph that confirms it."""
         beliefs, settings = self._plant.beliefs, self.settings
-        last, present = beliefs.record(found.name), beliefs.present(found.name)
+        last, present = beliefs.record(fit.name), beliefs.present(fit.name)
         # Photographs that the calibration did not expect show a step of the mirror, or other light.
-        sure = last is not None and surprise_of(last, found.nominal, here) <= settings.agreement
-        return sure and change_of(present, found.mechanism, found.seen) <= settings.large
+        sure = (
+            last is not None and surprise_of(last, fit.nominal, new_sightings) <= settings.agreement
+        )
+        return sure and change_of(present, fit.mechanism, fit.sightings) <= settings.large
 
-    async def _left(
-        self, visit: Visit, found: JudgedFit, here: Sightings, leaving: Leaving
+    async def _after_leaving(
+        self, visit: Visit, fit: JudgedFit, new_sightings: Sightings, leaving: Leaving
     ) -> JudgedFit:
         """Return a fit for whose parameters a heliostat has left a receiver, or why it has not."""
-        if not self._sure(found, here):
+        if not self._sure(fit, new_sightings):
             text = "a photograph on a target must confirm the new parameters; calibrate it there"
-            return replace(found, outcome=CalibrationOutcome.NOT_VERIFIED, problem=text)
-        present = self._plant.beliefs.present(found.name)
-        change = change_of(present, found.mechanism, here)
+            return replace(fit, outcome=CalibrationOutcome.NOT_VERIFIED, problem=text)
+        present = self._plant.beliefs.present(fit.name)
+        change = change_of(present, fit.mechanism, new_sightings)
         if change >= leaving.worth:
             await leaving.leave(visit)
-            return found
+            return fit
         text = (
             f"new parameters would move its beam by {1e3 * change:.2f} mrad; it stays on "
             f"{visit.target.name}"
         )
-        return replace(found, outcome=CalibrationOutcome.UNCHANGED, problem=text)
+        return replace(fit, outcome=CalibrationOutcome.UNCHANGED, problem=text)
 
     async def _try(
         self,
         visit: Visit,
-        found: JudgedFit,
-        here: Sightings,
+        fit: JudgedFit,
+        new_sightings: Sightings,
         taken: Photographs,
         tell: Tell,
         confirming: Confirming,
     ) -> tuple[JudgedFit, tuple[str, ...]]:
         """Push a fit and verify it; return it, with why it was withdrawn, and the items pushed."""
         name, plant = visit.heliostat, self._plant
-        present, new = plant.beliefs.present(name), found.mechanism
-        sure = self._sure(found, here)
+        present, new = plant.beliefs.present(name), fit.mechanism
+        sure = self._sure(fit, new_sightings)
         try:
-            pushed = await self._push(visit, new[0], f"fit of {len(found.seen)} sightings")
+            pushed = await self._push(visit, new[0], f"fit of {len(fit.sightings)} sightings")
             if sure:
-                return found, pushed
+                return fit, pushed
             plant.want(name, new[0])
             shots = [shot for shot, _ in taken.used]
-            problem = await confirming(visit, found.fitted, found.nominal, shots, tell)
+            problem = await confirming(visit, fit.fitted, fit.nominal, shots, tell)
             if not problem:
-                return found, pushed
+                return fit, pushed
             await self._push(visit, present[0], "the new ones were not verified")
         except BaseException:
             # The local controller gets the old parameters as soon as its state allows it.
@@ -468,41 +470,40 @@ class CalibrationCycle:
             raise
         plant.want(name, present[0])
         said = f"{problem}; the old parameters are back"
-        return replace(found, outcome=CalibrationOutcome.NOT_VERIFIED, problem=said), ()
+        return replace(fit, outcome=CalibrationOutcome.NOT_VERIFIED, problem=said), ()
 
-    def _take(
-        self, visit: Visit, found: JudgedFit, pushed: tuple[str, ...]
-    ) -> HeliostatCalibration:
+    def _take(self, visit: Visit, fit: JudgedFit, pushed: tuple[str, ...]) -> HeliostatCalibration:
         """Make the record of a fit that is stored, and let the plant believe it."""
-        record = found.record(
+        record = fit.record(
             self._plant.beliefs,
             self._plant.clock.utc().timestamp(),
             person=visit.mandate.person.name,
             pushed=pushed,
         )
-        if found.revealed is not None:
-            self._plant.beliefs.flights.learn(visit.heliostat, *found.revealed)
+        if fit.revealed is not None:
+            self._plant.beliefs.flights.learn(visit.heliostat, *fit.revealed)
         return self._plant.beliefs.take(record)
 
     async def _push(self, visit: Visit, mechanism: Mechanism, why: str) -> tuple[str, ...]:
         """Write the items that differ, and read them back; ``why`` is for the audit."""
         plant, name = self._plant, visit.heliostat
-        wanted = items_of(mechanism)
-        missing = differing(wanted, await plant.stored(name))
+        new_items = items_of(mechanism)
+        missing = differing(new_items, await plant.stored(name))
         if not missing:
             return ()
         async with visit.locked():
-            items, mandate = {item: wanted[item] for item in missing}, visit.mandate
+            items, mandate = {item: new_items[item] for item in missing}, visit.mandate
             person, token = mandate.person, mandate.token
             await visit.obey(
                 "PARAMETERS",
                 lambda _: plant.parameters(person, token, name, items, confirmed=why),
                 60.0,
             )
-            left = differing(wanted, await plant.stored(name))
-            if left:
+            differences = differing(new_items, await plant.stored(name))
+            if differences:
                 raise RefusedError(
-                    f"{name}: {', '.join(left)} differ when read back; check its flash memory"
+                    f"{name}: {', '.join(differences)} differ when read back; check its flash "
+                    "memory"
                 )
         return missing
 

@@ -6,7 +6,7 @@ visit's: one fit, its safeguards, verification. What is not proven is named, and
 from it.
 
 A visit to a target is a *joint visit*, one of mirrors that shine on a receiver a *receiver visit*.
-They differ in how beams come and leave, in their light, and in what is done with new parameters.
+They differ in how beams come and leave, in their light, and in the use of new parameters.
 """
 
 import asyncio

@@ -114,7 +114,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class SentBeam:
-    """What is known of a beam before it is sent.
+    """The knowledge of a beam before it is sent.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ def beams_of(
     settings: CodedSettings,
     aims: Mapping[str, FloatArray] | None = None,
 ) -> tuple[dict[str, SentBeam], dict[str, str]]:
-    """Return what is known of beams, and why the others cannot be on a surface, by heliostat.
+    """Return the known beams, and the reasons against the others on a surface, by heliostat.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def coded(
     Parameters
     ----------
     target, known
-        The target, and what is known of the M beams, by name.
+        The target, and the knowledge of the M beams, by name.
     places, code
         m right of and above the centre; numbers of the codes.
     movement

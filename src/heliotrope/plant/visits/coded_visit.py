@@ -73,7 +73,7 @@ class CodedVisit(BroughtHome):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Those that take part."""
+        """Names of the participants."""
         return tuple(self.visits)
 
     @property
@@ -82,13 +82,13 @@ class CodedVisit(BroughtHome):
         return not self._away <= set(self.visits)
 
     def drop(self, why: Mapping[str, str]) -> None:
-        """Let heliostats take part no longer; `leave` brings them home."""
+        """Drop heliostats from the visit; `leave` brings them home."""
         for name, text in why.items():
             if self.visits.pop(name, None) is not None:
                 self.lost[name] = text
 
     def missing(self, wanted: int) -> dict[str, str]:
-        """Return which of those that take part are not live or not in a state, and why."""
+        """Return the participants that are not live or not in a state, and the reasons."""
         found = {}
         for name, visit in self.visits.items():
             try:
@@ -126,7 +126,7 @@ class CodedVisit(BroughtHome):
         await self._arrived(limit)
 
     async def track(self, limit: float = _ORDER) -> None:
-        """Let those at standby that take part track their aims."""
+        """Order the participants at standby to track their aims."""
         await self._obeyed("TRACK", self._command("TRACK"), self.missing(states.TRACKING), limit)
 
     async def aim(self, points: Mapping[str, FloatArray], limit: float = _ORDER) -> None:
@@ -147,7 +147,7 @@ class CodedVisit(BroughtHome):
         )
 
     def _command(self, name: str) -> Order:
-        """Return what gives a command to some heliostats."""
+        """Return a function that gives a command to some heliostats."""
         person, token, plant = self.mandate.person, self.mandate.token, self.plant
         return lambda some: plant.command(person, token, name, some)
 
@@ -159,7 +159,7 @@ class CodedVisit(BroughtHome):
         self.drop({name: f"{what} {name}: {why}" for name, why in failed.items()})
 
     async def _arrived(self, limit: float) -> None:
-        """Wait until all stay at their aims in two rows; who does not arrive drops out.
+        """Wait until all stay at their aims in two reports; those that do not arrive drop out.
 
         When most are there, the others get as long again, and some seconds.
         """
@@ -183,7 +183,7 @@ class CodedVisit(BroughtHome):
                 until = min(until, begin + 2.0 * (now - begin) + _LATE)
 
     async def look(self) -> None:
-        """Let a little time pass, and note the step counts that are new.
+        """Wait a little, and note new step counts.
 
         Those drop out that another order has taken out of the visit.
         """

@@ -1,4 +1,4 @@
-"""Step counts of a heliostat in a coded visit, while it stands beside its aim for photographs."""
+"""Step counts of a heliostat in a coded visit, while its beam is beside its aim for photographs."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ class CountsHeard:
         still: Iterable[tuple[float, float, FloatArray]],
         middle: float,
     ) -> "CountsHeard":
-        """Return what was heard in a visit.
+        """Return the reports of a visit.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""How far beams are expected to miss, by what is believed of their mirrors now."""
+"""Expected errors of beams, by the present beliefs about their mirrors."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""Fits of what the plant has seen of its heliostats, and their judgement.
+"""Fits of the plant's sightings of its heliostats, and their judgement.
 
 One heliostat is fitted after a visit, many after a flight. Both use all that is known of a mirror:
 its photographs, and its rows of flights with the errors that they share with other mirrors.
@@ -58,7 +58,7 @@ class JudgedFit:
         Of batch shape (1,).
     nominal
         The mechanism that it starts from, batch shape (1,).
-    seen
+    sightings
         The sightings, photographs first, without the errors that flights share.
     before, after
         Beam errors under the present and the fitted mechanism, weighted by the sightings, rad RMS.
@@ -68,7 +68,7 @@ class JudgedFit:
     name
         Of the heliostat.
     flown
-        Numbers of its rows of flights in the store, the last of ``seen``.
+        Numbers of its rows of flights in the store, the last of ``sightings``.
     revealed
         What it reveals of the shared errors of the flights; None without rows of flights.
     """
@@ -76,7 +76,7 @@ class JudgedFit:
     model: str
     fitted: FieldFit
     nominal: Mechanism
-    seen: Sightings
+    sightings: Sightings
     before: float
     after: float
     outcome: CalibrationOutcome
@@ -101,14 +101,14 @@ class JudgedFit:
         campaign: str = "",
     ) -> HeliostatCalibration:
         """Return the record of this fit, whose photographs the beliefs know already; see there."""
-        known, last = beliefs.seen(self.name), beliefs.record(self.name)
+        known, last = beliefs.known(self.name), beliefs.record(self.name)
         photographs = np.zeros(0, np.int64) if known is None else known.identities
         return HeliostatCalibration.from_fit(
             self.name,
             at,
             self.fitted,
             self.nominal,
-            self.seen,
+            self.sightings,
             np.concatenate([photographs, self.flown]),
             model=self.model,
             provenance=provenance,
@@ -130,7 +130,7 @@ class Believed:
     nominal, present
         The mechanism of the design, and the one that is believed now, batch shape (1,).
     hyper
-        What was learnt of its group; None: nothing.
+        Of its group; None: not learned yet.
     flights
         Flights of a drone.
     """
@@ -143,7 +143,7 @@ class Believed:
 
     @classmethod
     def of(cls, beliefs: Beliefs, name: str) -> "Believed":
-        """Return what is believed of a heliostat now, with the flights that saw it."""
+        """Return the present belief about a heliostat, with the flights that saw it."""
         flights = beliefs.flights if name in beliefs.flights else Flights()
         return cls(name, beliefs.nominal(name), beliefs.present(name), beliefs.hyper(name), flights)
 
@@ -176,32 +176,34 @@ def _following(
     photographed: Sightings | None,
 ) -> JudgedFit:
     """Return the fit that follows the drift of a mirror with rows of flights, or its constants."""
-    seen, flown = joint.seen, believed.flights.flown(believed.name)
-    photographs = seen.take(np.zeros(0, np.intp)) if photographed is None else photographed
+    sightings, flown = joint.sightings, believed.flights.flown(believed.name)
+    photographs = sightings.take(np.zeros(0, np.intp)) if photographed is None else photographed
     moving = model.following(believed.nominal, photographs, joint.fitted, believed.hyper, flown)
-    found = _better(believed, settings, model, seen, joint.flown, joint.fitted, moving)
-    return replace(found, revealed=joint.revealed)
+    fit = _better(believed, settings, model, sightings, joint.flown, joint.fitted, moving)
+    return replace(fit, revealed=joint.revealed)
 
 
 def _better(
     believed: Believed,
     settings: CycleSettings,
     model: OwnModel,
-    seen: Sightings,
+    sightings: Sightings,
     flown: Identities,
     still: FieldFit,
     moving: FieldFit,
 ) -> JudgedFit:
     """Return the fit that follows the drift if it explains the last day, else the constants."""
-    recent = seen.take(np.flatnonzero(seen.time >= seen.time.max() - DAY))
-    left = [
-        root_mean_square(beam_errors(believed.nominal.with_parameters(one.parameters), recent).beam)
-        for one in (still, moving)
+    recent = sightings.take(np.flatnonzero(sightings.time >= sightings.time.max() - DAY))
+    errors = [
+        root_mean_square(
+            beam_errors(believed.nominal.with_parameters(fitted.parameters), recent).beam
+        )
+        for fitted in (still, moving)
     ]
-    if not left[1] <= max(left[0], EXPLAINED * settings.sigma):
-        return _judged(believed, settings, model, still, seen, flown)
-    found = _judged(believed, settings, model, moving, recent, flown)
-    return replace(found, seen=seen)
+    if not errors[1] <= max(errors[0], EXPLAINED * settings.sigma):
+        return _judged(believed, settings, model, still, sightings, flown)
+    fit = _judged(believed, settings, model, moving, recent, flown)
+    return replace(fit, sightings=sightings)
 
 
 def _room(believed: Believed, settings: CycleSettings, flown: Identities) -> float:
@@ -231,7 +233,7 @@ def fit_flights(
     A mirror whose fit is wrong says nothing of the shared errors: the others are fitted again
     without it.
     """
-    found: dict[str, JudgedFit] = {}
+    fits_by_name: dict[str, JudgedFit] = {}
     groups: dict[int, list[str]] = {}
     for name in names:
         groups.setdefault(id(beliefs.design.find(name)[0]), []).append(name)
@@ -241,16 +243,16 @@ def fit_flights(
             good = members
             for _ in range(2):
                 fits = _fit_names(beliefs, flights, settings, good)
-                found.update(zip(good, fits, strict=True))
-                wrong = {n for n, f in zip(good, fits, strict=True) if f.outcome in WRONG}
-                for name, one in zip(good, fits, strict=True):
+                fits_by_name.update(zip(good, fits, strict=True))
+                unusable = {n for n, f in zip(good, fits, strict=True) if f.outcome in WRONG}
+                for name, fit in zip(good, fits, strict=True):
                     size = len(flights.shared()[0])
                     nothing = np.zeros((size, size)), np.zeros(size)
-                    flights.learn(name, *(nothing if name in wrong else one.revealed or nothing))
-                if not wrong or len(wrong) == len(good):
+                    flights.learn(name, *(nothing if name in unusable else fit.revealed or nothing))
+                if not unusable or len(unusable) == len(good):
                     break
-                good = [name for name in good if name not in wrong]
-    return found
+                good = [name for name in good if name not in unusable]
+    return fits_by_name
 
 
 def follow_flights(
@@ -260,14 +262,14 @@ def follow_flights(
 
     Each replays all sightings of its heliostat.
     """
-    found = {}
+    followed = {}
     for name, joint in fits.items():
-        known = beliefs.seen(name)
-        seen = None if known is None else known.sightings
+        known = beliefs.known(name)
+        sightings = None if known is None else known.sightings
         model = first_model(settings, joint.nominal)
         believed = replace(Believed.of(beliefs, name), flights=flights)
-        found[name] = _following(believed, settings, model, joint, seen)
-    return found
+        followed[name] = _following(believed, settings, model, joint, sightings)
+    return followed
 
 
 def first_model(settings: CycleSettings, mechanism: Mechanism) -> OwnModel:
@@ -283,8 +285,8 @@ def _fit_names(
 ) -> list[JudgedFit]:
     group = beliefs.design.find(names[0])[0]
     rows = np.array([group.index(name) for name in names], dtype=np.intp)
-    seen = [beliefs.seen(name) for name in names]
-    photographed = [None if one is None else one.sightings for one in seen]
+    sightings = [beliefs.known(name) for name in names]
+    photographed = [None if known is None else known.sightings for known in sightings]
     model, believed = (
         first_model(settings, group.mechanism),
         [Believed.of(beliefs, n) for n in names],
@@ -300,11 +302,11 @@ def _fit_group(
     mechanism: Mechanism,
     photographed: Sequence[Sightings | None],
 ) -> list[JudgedFit]:
-    seen, common = flights.common([one.name for one in believed], photographed)
-    found = fit_common(model.start(mechanism), seen, model.parameters, common)
+    sightings, common = flights.common([member.name for member in believed], photographed)
+    common_fit = fit_common(model.start(mechanism), sightings, model.parameters, common)
     return [
-        _of_one(one, settings, model, found, i, flights.identities(one.name))
-        for i, one in enumerate(believed)
+        _of_one(member, settings, model, common_fit, i, flights.identities(member.name))
+        for i, member in enumerate(believed)
     ]
 
 
@@ -312,27 +314,27 @@ def _of_one(
     believed: Believed,
     settings: CycleSettings,
     model: OwnModel,
-    found: CommonFit,
+    common_fit: CommonFit,
     i: int,
     flown: Identities,
 ) -> JudgedFit:
-    whole, mine = found.fitted, found.seen.heliostat == i
-    here = slice(i, i + 1)
+    whole, mine = common_fit.fitted, common_fit.sightings.heliostat == i
+    row = slice(i, i + 1)
     fitted = replace(
         whole,
-        values=whole.values[here],
-        covariance=whole.covariance[here],
-        prior=whole.prior[here],
-        scale=whole.scale[here],
+        values=whole.values[row],
+        covariance=whole.covariance[row],
+        prior=whole.prior[row],
+        scale=whole.scale[row],
         lengths=whole.lengths[mine],
-        count=whole.count[here],
-        iterations=whole.iterations[here],
-        outcome=whole.outcome[here],
-        centre=whole.centre[here],
+        count=whole.count[row],
+        iterations=whole.iterations[row],
+        outcome=whole.outcome[row],
+        centre=whole.centre[row],
     )
     fitted = model.completed(fitted)
-    judged = _judged(believed, settings, model, fitted, found.seen.of(i), flown)
-    return replace(judged, revealed=(found.information[i], found.pull[i]))
+    judged = _judged(believed, settings, model, fitted, common_fit.sightings.of(i), flown)
+    return replace(judged, revealed=(common_fit.information[i], common_fit.pull[i]))
 
 
 def _judged(
@@ -340,18 +342,20 @@ def _judged(
     settings: CycleSettings,
     model: OwnModel,
     fitted: FieldFit,
-    seen: Sightings,
+    sightings: Sightings,
     flown: Identities,
 ) -> JudgedFit:
     new = believed.nominal.with_parameters(fitted.parameters)
-    before, after = (_weighted(beam_errors(m, seen).beam, seen) for m in (believed.present, new))
+    before, after = (
+        _weighted(beam_errors(m, sightings).beam, sightings) for m in (believed.present, new)
+    )
     room = _room(believed, settings, flown)
     outcome, problem = _judge(settings, fitted, before, after, room)
     return JudgedFit(
         model.name,
         fitted,
         believed.nominal,
-        seen,
+        sightings,
         before,
         after,
         outcome,
@@ -361,17 +365,17 @@ def _judged(
     )
 
 
-def _weighted(errors: FloatArray, seen: Sightings) -> float:
+def _weighted(errors: FloatArray, sightings: Sightings) -> float:
     """Return the RMS of errors, each with the weight of its sighting."""
     # Photographs all have the same sigma; a row of a flight may weigh a hundred times as much.
-    weight = seen.sigma**-2.0 / np.mean(seen.sigma**-2.0)
+    weight = sightings.sigma**-2.0 / np.mean(sightings.sigma**-2.0)
     return root_mean_square(errors * np.sqrt(weight))
 
 
 def _judge(
     settings: CycleSettings, fitted: FieldFit, before: float, after: float, room: float
 ) -> tuple[CalibrationOutcome, str]:
-    """Return the outcome of a fit, and why it is rejected, "" if it is not."""
+    """Return the outcome of a fit, and the reason if it is rejected."""
     ending = FitOutcome(int(fitted.outcome[0]))
     if ending is not FitOutcome.CONVERGED:
         return CalibrationOutcome.FIT_FAILED, ending.text
@@ -404,7 +408,7 @@ def change_of(present: Mechanism, new: Mechanism, made: Sightings) -> float:
 
 
 def surprise_of(record: HeliostatCalibration, nominal: Mechanism, made: Sightings) -> float:
-    """Return how far sightings lie from what a calibration expects of them now, at most.
+    """Return the largest distance of sightings from the prediction of a calibration, in sigma.
 
     Parameters
     ----------

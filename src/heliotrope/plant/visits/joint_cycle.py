@@ -88,7 +88,7 @@ class JointCycle(CodedCycle):
     # -- which heliostats ------------------------------------------------------------------
 
     def searching(self, heliostat: str) -> bool:
-        """Return whether a beam that was not found is looked for again in a joint first visit."""
+        """Return whether a joint first visit searches again for a beam that was not found."""
         return 0 < self.attempts.counts.get(heliostat, 0) < LOOKS
 
     def note(self, result: CycleResult) -> None:
@@ -189,13 +189,13 @@ class _Waiting:
     fitted, nominal
         The fit of batch shape (1,), and the mechanism that it starts from.
     problem
-        Gives why the fit is not confirmed, "" if it is.
+        Gives the reason why the fit is not confirmed, None if it is.
     """
 
     visit: Visit
     fitted: FieldFit
     nominal: Mechanism
-    problem: "asyncio.Future[str]"
+    problem: "asyncio.Future[str | None]"
 
     def error(self, sun: FloatArray, target: Target) -> float:
         """Return the expected beam error of the new parameters on a target, rad RMS (2-D)."""
@@ -250,10 +250,10 @@ class _Verification:
 
     async def problem(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
-    ) -> str:
+    ) -> str | None:
         """Wait for the verification; see `Verification.problem`."""
         del used, tell
-        problem: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        problem: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
         self._waiting[visit.heliostat] = _Waiting(visit, fitted, nominal, problem)
         self.leave(visit.heliostat)
         return await problem
@@ -294,19 +294,19 @@ class _Verification:
 
     async def _verified(
         self, names: Sequence[str], *, own: bool
-    ) -> tuple[dict[str, str], list[str], tuple[str, ...]]:
+    ) -> tuple[dict[str, str | None], list[str], tuple[str, ...]]:
         """Take one series of photographs.
 
         Returns
         -------
-            Why each is not confirmed, "" if it is; those that may come once more; and those that
-            wait for another series.
+            The reason why each is not confirmed, None if it is; those that may come once more; and
+            those that wait for another series.
         """
         plant, target = self._visit.plant, self._visit.target
         sun = plant.sun_vector()
         errors = {name: self._waiting[name].error(sun, target) for name in names}
         layout, waits = verifying(plant, target, errors, self._coded.settings, own=own)
-        problems = dict(layout.left_out)
+        problems: dict[str, str | None] = dict(layout.left_out)
         if not layout.names:
             return problems, [], waits
         again = CodedVisit(plant, self._visit.mandate, layout.names, target)

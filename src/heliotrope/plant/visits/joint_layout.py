@@ -127,7 +127,7 @@ def _darkened(
 def _unknown(
     plant: PlantController, name: str, error: float, settings: JointSettings
 ) -> str | None:
-    """Return why a beam with an expected error on its target is not known well enough, if so."""
+    """Return the reason, if any, why a beam with an expected error is not known well enough."""
     if plant.beliefs.record(name) is None:
         return "it has no calibration yet; it is calibrated alone first"
     if error > settings.known:

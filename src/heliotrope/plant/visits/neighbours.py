@@ -1,7 +1,7 @@
 """Takes off a photographed centroid how far neighbours that shade and block the mirror moved it.
 
 The plant knows how the neighbours stood: their step counts are reported, and their mechanisms are
-believed. Most mirrors are clear, which a test of corners tells at once; the shift of one that is
+believed. Most mirrors are clear, which a test of corners shows at once; the shift of one that is
 not takes some milliseconds, and is computed where it does not hold up the loop.
 """
 
@@ -45,7 +45,7 @@ class Standing:
 
     @classmethod
     def of(cls, field: FieldState) -> "Standing":
-        """Return how a field stands now."""
+        """Return the present poses of a field."""
         every = np.arange(len(field), dtype=np.intp)
         return cls(field.posed.copy(), field.goals(every), field.posed_at.copy())
 
@@ -140,6 +140,6 @@ class UnhiddenCamera:
         self._camera, self._unhidden = camera, unhidden
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return what a new photograph shows of a heliostat's beam, as if it stood alone."""
+        """Return a heliostat's beam in a new photograph, as if it stood alone."""
         shot = await self._camera.photograph(target, heliostat)
         return await self._unhidden.shot(target, heliostat, shot)

@@ -67,7 +67,7 @@ class TargetCamera(Protocol):
     """A camera that photographs targets and reads the photographs."""
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return what a new photograph shows of a heliostat's beam."""
+        """Return a heliostat's beam in a new photograph."""
         ...
 
 
@@ -238,15 +238,15 @@ class Centred:
             taken.rejected.append("the light did not move with the aim often enough")
         return aim
 
-    def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str:
-        """Return why light is not the beam found first, "" if it is: a beam moves with its aim."""
+    def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str | None:
+        """Return the reason why light is not the beam: a beam moves with its aim."""
         place = seen(target, shot)
         if place is None:
-            return "" if shot.reasons else "no light on the target"
+            return None if shot.reasons else "no light on the target"
         expected = light.place + target.axes @ (aim - light.first)
         away = float(np.linalg.norm(place - expected))
         if away <= self._centring.astray * min(target.width, target.height):
-            return ""
+            return None
         return f"light {away:.1f} m from the expected place: another heliostat's beam"
 
     async def _go(self, visit: Visit, aim: FloatArray, before: FloatArray) -> None:

@@ -1,4 +1,4 @@
-"""Which heliostats that shine on a receiver take part in a receiver visit.
+"""The choice of heliostats that take part in a receiver visit.
 
 Each beam stays about its own aim. Every movement ends on the receiver, and all of them together
 cost no more of the power than is allowed.

@@ -183,12 +183,12 @@ async def light_on(
 
 
 async def noting(look: Callable[[], Awaitable[None]], made: Awaitable[T]) -> T:
-    """Return what is made, and look at the heliostats again and again meanwhile.
+    """Return the result of work, and poll the heliostats meanwhile.
 
     Raises
     ------
     HeliotropeError
-        As what is made raises it.
+        Raised by the work.
     """
     found: list[T | HeliotropeError] = []
 

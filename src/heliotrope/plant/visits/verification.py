@@ -41,8 +41,8 @@ class Confirming(Protocol):
 
     async def __call__(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
-    ) -> str:
-        """Return why they are not confirmed, "" if they are; see `Verification.problem`."""
+    ) -> str | None:
+        """Return the reason why they are not confirmed; see `Verification.problem`."""
         ...
 
 
@@ -69,7 +69,7 @@ class Prediction:
 
     @classmethod
     def of(cls, mechanism: Mechanism, fitted: FieldFit, made: Sightings) -> "Prediction":
-        """Return the distance of one sighting from what a fit predicts.
+        """Return the distance of one sighting from the prediction of a fit.
 
         Parameters
         ----------
@@ -121,14 +121,16 @@ class Verification:
         """Return the photograph that confirmed the last fit of a heliostat, once; None: none."""
         return self._confirmed.pop(heliostat, None)
 
-    def judge(self, nominal: Mechanism, fitted: FieldFit, shot: Shot, counts: FloatArray) -> str:
-        """Return why a shot with its step counts does not confirm a fit, "" if it does."""
+    def judge(
+        self, nominal: Mechanism, fitted: FieldFit, shot: Shot, counts: FloatArray
+    ) -> str | None:
+        """Return the reason why a shot with its step counts does not confirm a fit."""
         return self._judge(nominal, fitted, self._sighting(shot, counts))
 
     async def problem(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
-    ) -> str:
-        """Return why the new parameters are not confirmed, "" if they are.
+    ) -> str | None:
+        """Return the reason why the new parameters are not confirmed, None if they are.
 
         The heliostat stores them already. It stands at standby before and after.
 
@@ -154,7 +156,7 @@ class Verification:
 
     async def _photographed(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
-    ) -> str:
+    ) -> str | None:
         self._confirmed.pop(visit.heliostat, None)
         point = apart(visit.target, [shot.point for shot in used], room_of(visit, self._centring))
         if why := visit.plant.misled(visit.heliostat, point):
@@ -169,15 +171,15 @@ class Verification:
                     if problem := self.judge(nominal, fitted, *made):
                         return problem
                     self._confirmed[visit.heliostat] = Photographs([made])
-                    return ""
+                    return None
                 why = "; ".join(shot.reasons) or "no light on the target"
         return f"with the new parameters no photograph could be used: {why}"
 
-    def _judge(self, nominal: Mechanism, fitted: FieldFit, made: Sightings) -> str:
+    def _judge(self, nominal: Mechanism, fitted: FieldFit, made: Sightings) -> str | None:
         mechanism = nominal.with_parameters(fitted.parameters)
         found, most = Prediction.of(mechanism, fitted, made), self._settings.agreement
         if found.deviations <= most and found.miss <= self._settings.left:
-            return ""
+            return None
         allowed = min(most * found.reach, self._settings.left)
         return (
             f"with the new parameters the beam is {found.slant * found.miss:.2f} m from its "

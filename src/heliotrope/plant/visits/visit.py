@@ -91,14 +91,14 @@ async def carried_out(
 
 
 class BroughtHome(ABC):
-    """What takes fine steps in its ``async with``, and is brought home when that ends."""
+    """A visit that takes fine steps in its ``async with``, and is brought home when that ends."""
 
     plant: PlantController
 
     @property
     @abstractmethod
     def names(self) -> tuple[str, ...]:
-        """Those that take part."""
+        """Names of the participants."""
 
     @abstractmethod
     async def home(self) -> None:
@@ -297,7 +297,7 @@ class Visit(BroughtHome):
         return float(np.abs((goal - here) * self._drives.radians_per_count(here)).max())
 
     async def look(self) -> None:
-        """Let a little time pass, and note the counts if they are new.
+        """Wait a little, and note the counts if they are new.
 
         Raises
         ------
@@ -360,7 +360,7 @@ class Visit(BroughtHome):
         return goals[after - 1] - goals[after], times[after] - times[after - 1]
 
     def heard_moving(self, instant: float) -> float:
-        """Return how near to an instant it was heard away from its goals, s; infinite if never."""
+        """Return the time from an instant to the nearest report away from its goals, s, or inf."""
         rows = zip(self._times, self._there, strict=True)
         return min((abs(at - instant) for at, there in rows if not there), default=math.inf)
 

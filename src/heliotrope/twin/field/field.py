@@ -397,7 +397,7 @@ class Field:
         self.hear(heard)
 
     def put_up(self, values: tuple[int, ...], aims: npt.ArrayLike) -> Bools:
-        """Let heliostats at stow track, as if they had been raised before; return which do, (N,).
+        """Put heliostats at stow on track, as if raised before; return a mask of them, (N,).
 
         Those that cannot bring their beams to their aims stay at stow.
 
@@ -758,7 +758,7 @@ class Field:
         return self.wind.turned(pose.normal, place, 1e-3 * self.now_ms), pose.vertex
 
     def store(self, row: int, items: dict[str, bytes]) -> None:
-        """Let a controller take items into its journal; a new armature counts from now on."""
+        """Store items in a controller's journal; a new armature counts from now on."""
         self.journals.store(row, items)
         self.edition += 1
 

@@ -97,7 +97,7 @@ class Gates:
         return self._keys_of(place).told()
 
     def take_key(self, frame: wire.Frame, place: int) -> int:
-        """Let a row take SET_BUS_KEY; return its result."""
+        """Apply SET_BUS_KEY to a row; return its result."""
         gate, bus, values = self._gates[place], self._keys_of(place), frame.values()
         if values is None:
             return messages.BAD_VALUE

@@ -128,7 +128,7 @@ class Journals:
         return self._items[row]
 
     def store(self, row: int, items: dict[str, bytes]) -> None:
-        """Let a controller take items into its journal, and use them."""
+        """Store items in a controller's journal, and use them."""
         self.items(row).update(items)
         if "armature" in items:
             self.armatures[row] = struct.unpack(CODES_OF["armature"], items["armature"])

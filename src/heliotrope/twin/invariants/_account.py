@@ -245,7 +245,7 @@ class HeliostatAccount:
         return steps_from_stow(self.board) <= NEAR_STOW
 
     def rate(self, axis: int, count: int, now: float) -> str:
-        """Take steps handed to a timer now; return what is wrong with their rate, or ""."""
+        """Take steps handed to a timer now; return the fault of their rate, if any."""
         self.stepped_at = now
         limit = float(LIMITS[0])
         drained = limit * (now - self._filled_at[axis])
@@ -256,7 +256,7 @@ class HeliostatAccount:
         return f"axis {axis} is {level:.0f} steps ahead of {limit:.0f} steps/s"
 
     def ramp(self, axis: int, steps: int, now: float) -> str:
-        """Take the signed steps of a slot; return what is wrong with their acceleration, or ""."""
+        """Take the signed steps of a slot; return the fault of their acceleration, if any."""
         most = LIMITS[1] * SLOT * SLOT + 2.0
         begin = max(now, self._slot_ends[axis])
         before = self._slot_steps[axis]

@@ -46,7 +46,7 @@ LATE, EARLY, CYCLE_MOST = 1.0, 0.3, 1.5
 
 @dataclass
 class _Board:
-    """One board: its account, and what it has said.
+    """One board: its account, and its answers.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class AnswerObserver(Judge):
             self._later.append((good, subject, saw))
 
     def look(self, now: float) -> None:
-        """Judge what has been said since the last look, where nothing has failed meanwhile."""
+        """Judge the answers since the last check, where nothing has failed meanwhile."""
         later, self._later = self._later, []
         calm = self.quiet()
         whole = all(board.account.name in calm for board in self._boards.values())

@@ -544,7 +544,7 @@ class BeamObserver(Judge):
             self.check(13, passed <= OFF_WITHIN, now, mirror.name, saw)
 
     def _loss(self, on: int, now: float) -> None:
-        """Note a loss that took every mirror off the receiver, two at least."""
+        """Note a loss that took every mirror, of at least two, off the receiver."""
         while self._departures and now - self._departures[0][0] > TOGETHER:
             self._departures.popleft()
         if on == 0 and len({name for _, name in self._departures}) >= 2:
@@ -585,7 +585,7 @@ class BeamObserver(Judge):
             self.check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
 
     def _complete(self, order: EmergencyOrder, sun: FloatArray, now: float, *, holds: bool) -> None:
-        """Check that no beam is on the receiver that the proof calls done, alone or with all."""
+        """Check that beams that the proof calls done, one or all, are off the receiver."""
         complete = holds and order.report(now).complete
         if complete and order.ticket.identity != self._complete_order:
             self.proofs, self._complete_order = self.proofs + 1, order.ticket.identity

@@ -695,7 +695,7 @@ class Observer(Judge):
                     self.check(11, reached, now, subject, saw)
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
-        """Judge a report to the plant about each heliostat: no younger and no other than it is."""
+        """Judge a report to the plant: each heliostat's age and state must be true."""
         by_name = {account.name: account for account in self.accounts}
         for name, row in zip(names, status.nodes(), strict=True):
             account = by_name.get(name)

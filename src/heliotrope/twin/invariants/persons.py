@@ -90,7 +90,7 @@ class PersonsObserver(Judge):
         self.orders.pop(owner, None)
 
     def withdrawal_refused(self, owner: str, reason: str, now: float) -> None:
-        """Check the refusal of a withdrawal: no plant refuses that of an order that stands."""
+        """Check a refused withdrawal: a plant must accept the withdrawal of an order in force."""
         self.check(
             WORDS, False, now, "plant", f"the withdrawal of {owner}'s order is refused: {reason}"
         )
@@ -202,7 +202,7 @@ class PersonsObserver(Judge):
             self.check(WORDS, now - at <= DOWN_WITHIN or board.state not in _UP, now, name, saw)
 
     def _still(self, name: str, lock: _Lock, now: float) -> None:
-        """Check that a locked heliostat stands still once it has come to stow."""
+        """Check that a locked heliostat stays still once it has come to stow."""
         board = self._boards[name]
         if board.node is None:
             return

@@ -105,7 +105,7 @@ class _Order:
 
 @dataclass
 class _Mirror:
-    """One mirror: its account, what is expected of it, and when it last changed."""
+    """One mirror: its account, its expected state, and when it last changed."""
 
     account: HeliostatAccount
     cluster: str
@@ -276,7 +276,7 @@ class QuietObserver(Judge):
         self._refusals.append((mirror, good, saw))
 
     def on_progress(self, message: Progress, now: float) -> None:
-        """Note that the plant is told that orders are done."""
+        """Note the reports to the plant that orders are done."""
         del now
         if message.stage is Stage.DONE:
             for name in message.heliostats:

@@ -65,7 +65,7 @@ class Picture:
 
 @dataclass
 class _Account:
-    """What the observer knows of one heliostat's learning."""
+    """The observer's knowledge of one heliostat's learning."""
 
     pictures: list[Picture] = field(default_factory=list)
     kept: int = 0
@@ -139,7 +139,7 @@ class ResultObserver(Judge):
             self._accounts[name].typed = True
 
     def look(self, operations: Operations | None, now: float) -> None:
-        """Judge what is new since the last look; None: the plant's program does not run."""
+        """Judge the results since the last check; None: the plant's program does not run."""
         if operations is None:
             return
         begins = operations is not self._program
@@ -162,7 +162,7 @@ class ResultObserver(Judge):
 
     def _sightings(self, operations: Operations, name: str, now: float, *, begins: bool) -> None:
         account, beliefs = self._accounts[name], operations.plant.beliefs
-        record, stored = beliefs.record(name), beliefs.seen(name)
+        record, stored = beliefs.record(name), beliefs.known(name)
         count = 0 if stored is None else len(stored)
         version = 0 if record is None else record.version
         if account.typed and version != account.version and record is not None and not count:
@@ -211,7 +211,7 @@ class ResultObserver(Judge):
     def _concluded(self, operations: Operations, entry: CalibrationEntry, now: float) -> None:
         name, account = entry.heliostat, self._accounts[entry.heliostat]
         plant, at = operations.plant, entry.at - self._zero
-        record, stored = plant.beliefs.record(name), plant.beliefs.seen(name)
+        record, stored = plant.beliefs.record(name), plant.beliefs.known(name)
         self.check(16, at <= now + SAME, now, name, f"a result is dated {at - now:.1f} s ahead")
         brought = account.kept - account.last
         new, version = account.version != account.result_version, account.version

@@ -1,6 +1,6 @@
 """The observer of what is shown: tables, one heliostat, summary and events, beside what happened.
 
-It asks the plant for what a page would ask. It knows from the boards where their motors stand and
+It makes the same requests as a page. It knows from the boards where their motors stand and
 how their beams lie, from the bus what they have reported and when, and from the persons what they
 have done. A row must be what was reported; its age must be the true one; a calibration is shown
 with the error that its own covariance gives; each act of a person is an event, once, and no event
@@ -125,7 +125,7 @@ class ShownObserver(Judge):
     def look(
         self, operations: Operations | None, quiet: Set[str], sun: FloatArray, now: float
     ) -> None:
-        """Judge what is shown; None: the plant's program does not run, or is frozen."""
+        """Judge the displays; None: the plant's program does not run, or is frozen."""
         for name, board in self._boards.items():
             steps = np.array([(a.turned, a.emitted) for a in board.axes], dtype=np.float64).T
             self._counts[name].append((now, steps - board.slip))

@@ -79,7 +79,7 @@ class VisitObserver(Judge):
         self._kept.clear()
 
     def look(self, plant: PlantController | None, sun: FloatArray, now: float) -> None:
-        """Judge what the plant has learnt since the last look; None: the plant does not run."""
+        """Judge the calibrations since the last check; None: the plant does not run."""
         if plant is None:
             return
         for name, board in self._boards.items():
@@ -90,7 +90,7 @@ class VisitObserver(Judge):
             if record is not None and (name, record.version, record.at) not in self._judged:
                 self._judged.add((name, record.version, record.at))
                 self._believed(board, record, plant.beliefs.nominal(name)[0], sun, now)
-            kept = plant.beliefs.seen(name)
+            kept = plant.beliefs.known(name)
             known = self._kept.get(name, 0)
             if kept is None or len(kept.sightings) < known:
                 self._kept[name] = known = 0  # a person's parameters stand on none
@@ -109,7 +109,7 @@ class VisitObserver(Judge):
         sun: FloatArray,
         now: float,
     ) -> None:
-        """Check where the true beam goes if the mirror is aimed by what the plant believes.
+        """Check where the true beam goes if the mirror is aimed by the plant's belief.
 
         A mirror that has lost steps is left out: its photographs may be from before.
         """

@@ -338,7 +338,7 @@ class World:
             self.field.advance(50 * ticks)
 
     def put_up(self) -> None:
-        """Let a field of arrays track, as on a day of work; a plant must lead its clusters."""
+        """Put a field of arrays on track, as on a working day; a plant must lead its clusters."""
         gps = gps_seconds(self.clock.utc())
         utc = self.clock.utc().timestamp()
         values = sun.broadcast_values(round(gps), utc, self.design.site)

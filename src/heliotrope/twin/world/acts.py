@@ -1,4 +1,4 @@
-"""What persons do at a plant with automatic control, each act by the calls that a page makes.
+"""Acts of persons at a plant with automatic control, each by the calls that a page makes.
 
 Each act that the plant accepts is reported to the observers. Who acts, and when, is another matter:
 see `shift` and `crew`.

@@ -221,7 +221,7 @@ class Crew:
         )
 
     def _roughens(self, operations: Operations, person: Person, token: int) -> None:
-        """Let all step roughly, or finely."""
+        """Switch all to rough or fine steps."""
         rough = float(self._chance.random() < 0.7)
         self._acts.command(operations, person, token, "ROUGH", (), (rough,))
 

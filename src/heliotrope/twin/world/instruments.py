@@ -50,7 +50,7 @@ class Instruments:
         self._gust: tuple[float, float] = (-math.inf, 0.0)
 
     def gust(self, size: float) -> None:
-        """Let a gust pass, of 10 to 25 m/s for ``size`` of 0 to 1."""
+        """Blow a gust of 10 to 25 m/s, for ``size`` of 0 to 1."""
         self._gust = self._clock.monotonic(), 10.0 + 15.0 * size
 
     def _true(self, name: str) -> float:

@@ -46,7 +46,7 @@ class Maintenance:
     clock
         True time.
     seed
-        Seed of what they do.
+        Seed of their actions.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class Maintenance:
         self._operator.counts["locks returned"] += 1
 
     def confirms(self, plant: PlantController) -> None:
-        """Do what a restored store asks for: put the locks of now, and return those of then.
+        """Confirm a restored store: put the present locks, and return the old ones.
 
         The last one is that on the tower; then the standby points are given again.
         """

@@ -58,7 +58,7 @@ class Maintenance(Protocol):
         ...
 
     def confirms(self, plant: PlantController) -> None:
-        """Do what a restored store asks for."""
+        """Confirm a restored store."""
         ...
 
 
@@ -178,7 +178,7 @@ class Operator:
         return None
 
     def seize(self, plant: PlantController, person: Person) -> None:
-        """Let a person break the authority of whoever has it, and go on duty."""
+        """Put a person on duty, who breaks the present authority."""
         try:
             token = plant.seize_authority(person, "on duty now").token
         except RefusedError:
@@ -194,7 +194,7 @@ class Operator:
         self._observer.granted(person, token, self._clock.monotonic(), seized=seized)
 
     def _change(self, plant: PlantController) -> None:
-        """Let another person take over, by breaking the authority or after it was released."""
+        """Put another person on duty, who breaks the authority or takes it after its release."""
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
         if self._chance.random() < 0.5:
             with contextlib.suppress(RefusedError):
@@ -245,7 +245,7 @@ class Operator:
         token: int | None = None,
         values: tuple[float, ...] | None = None,
     ) -> Ticket | None:
-        """Give a command, and tell the observer if the plant accepts it; else return None."""
+        """Give a command, and report it to the observer if it is accepted; else return None."""
         who = person or self._duty
         mine = self._tokens.get(who.name, 0) if token is None else token
         names = heliostats or self._names

@@ -100,7 +100,7 @@ class LyingCamera:
         self.on_photograph: Callable[[str, str, FloatArray, float], None] | None = None
 
     def away(self, at: float) -> float:
-        """Return how far a time is from that of the nearest photograph, s of the monotonic clock.
+        """Return the time to the nearest photograph, s; times are monotonic.
 
         A sighting of a stack has the time of its middle, which may be between two photographs.
         """

@@ -250,13 +250,13 @@ class _ClusterEar:
         self._observer = observer
 
     async def posted(self, data: bytes, now: float) -> None:
-        """Let the cluster send."""
+        """Allow the cluster to send."""
 
     def sent(self, data: bytes, now: float) -> None:
-        """Let the cluster send."""
+        """Allow the cluster to send."""
 
     async def waits(self) -> None:
-        """Let the cluster receive."""
+        """Allow the cluster to receive."""
 
     def received(self, data: bytes, now: float) -> None:
         """Note a lease."""
@@ -286,7 +286,7 @@ class PlantEar:
         self._ended = False
 
     def end(self) -> None:
-        """Judge nothing more: what a killed program does while its tasks end leaves no line."""
+        """Stop judging: a killed program's last acts leave no line."""
         self._ended = True
 
     def hang(self, *, on: bool) -> None:
@@ -304,7 +304,7 @@ class PlantEar:
         await self._goes.wait()
 
     async def waits(self) -> None:
-        """Let the plant receive, unless it is frozen."""
+        """Allow the plant to receive, unless it is frozen."""
         await self._goes.wait()
 
     def sent(self, data: bytes, now: float) -> None:
@@ -337,7 +337,7 @@ class PlantEar:
                     each.on_command(message, whom, now)
 
     def _asked(self, message: Command | Parameters) -> tuple[str, tuple[str, ...]]:
-        """Return what is ordered, and of which heliostats."""
+        """Return the order, and its heliostats."""
         if isinstance(message, Command):
             return message.name, message.heliostats or tuple(self._addresses)
         return "PARAMETERS", (message.heliostat,)

@@ -337,7 +337,7 @@ class Simulation:
         self._program: list[asyncio.Task[None]] = []
 
     def _observe(self, scene: Scene) -> None:
-        """Let observers see boards, beams, sensors, alarms and persons."""
+        """Attach observers to boards, beams, sensors, alarms and persons."""
         plan = self.plan
         alone = "twice" not in plan.worlds
         self.persons = PersonsObserver(self.begin, self.boards, alone=alone)
@@ -585,7 +585,7 @@ class Simulation:
             await asyncio.sleep(1.0)
 
     async def _sees(self, plant: PlantController) -> None:
-        """Let a sun sensor see the true sun."""
+        """Show the true sun to a sun sensor."""
         (name,) = WITNESSES
         while True:
             plant.witnesses.take(name, self.sun(self._clock.monotonic()), SENSOR_ERROR)

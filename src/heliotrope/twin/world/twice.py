@@ -80,7 +80,7 @@ class SecondPlant:
         self._program: list[asyncio.Task[None]] = []
 
     async def work(self) -> None:
-        """Let its people lead mirrors on, one at a time."""
+        """Have its people raise mirrors, one at a time."""
         while True:
             await asyncio.sleep(self._chance.expovariate(1.0 / _PAUSE))
             if self.plant is not None:

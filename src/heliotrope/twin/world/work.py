@@ -161,7 +161,7 @@ class Work:
         self.logbook: Logbook | None = None
 
     def away(self, at: float) -> float:
-        """Return how far a POSIX time, s, is from that of the nearest photograph, s."""
+        """Return the span from a POSIX time, s, to the nearest photograph, s."""
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
         return self.camera.away(at - zero)
 

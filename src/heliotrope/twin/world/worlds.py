@@ -107,7 +107,7 @@ _REPAIRING_CALMLY = (60, 10, 1, 1.5, 0.3, 0.3, 2, 2, 1)
 
 @dataclass(frozen=True)
 class Habits:
-    """What the simulated persons do, and how often.
+    """The acts of simulated persons, and their rates.
 
     Attributes
     ----------
@@ -266,7 +266,7 @@ def covered_by(names: Sequence[str], worlds: Sequence[str], seed: int) -> frozen
 
 
 def wrong_items(fit: Outfit, others: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:
-    """Return some wrong items of a heliostat, or all that another one of a list has."""
+    """Return some wrong items of a heliostat, or another one's location and armature."""
     what = chance.choice([*(["another"] if others else []), "armature", "biases", "machine"])
     if what == "another":
         other = items_of(chance.choice(list(others)).mechanism)
@@ -304,7 +304,7 @@ def common_error(worlds: Sequence[str], seed: int) -> timedelta:
 
 
 class PodErrors:
-    """What is wrong with one cluster from the start.
+    """The errors of one cluster from the start.
 
     Parameters
     ----------

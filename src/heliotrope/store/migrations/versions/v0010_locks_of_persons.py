@@ -10,7 +10,7 @@ _STANDING = sa.text("ended IS NULL")
 
 
 def upgrade() -> None:
-    """Name what is locked by kind and name, and let each person have a lock on it."""
+    """Identify locked places by kind and name, and allow one lock for each person."""
     op.drop_index("uq_hold_standing", "hold")
     kind = sa.Column("kind", sa.Text, nullable=False, server_default="heliostat")
     op.add_column("hold", kind)
