@@ -8,6 +8,7 @@ from typing import Any
 
 import httpx
 import pytest
+from starlette.datastructures import Headers
 
 from heliotrope.console import _secrets
 from heliotrope.console.by_proxy import ByProxy
@@ -99,6 +100,54 @@ def test_a_session_ends_when_the_proxy_says_another_thing(behind: httpx.Client) 
     assert behind.get("api/v1/session", headers=engineer).json()["role"] == "engineer"
 
 
+def test_a_name_may_have_any_letters(console: LiveConsole, behind: httpx.Client) -> None:
+    """Headers are bytes: those of UTF-8 are no two letters of Latin-1 each."""
+    for composed in ("\u00e9lise", "e\u0301lise"):
+        person = {"X-Heliotrope-Person": composed.encode()}
+        assert behind.get("login", headers=person).status_code == 303
+        assert behind.get("api/v1/session", headers=person).json()["name"] == "\u00e9lise"
+    behind.cookies.clear()
+    broken = behind.get("login", headers={"X-Heliotrope-Person": b"\xe9lise"})
+    assert "set-cookie" not in broken.headers
+    assert console.keeper.people.account("\u00e9lise") is not None
+
+
+@pytest.mark.parametrize(
+    ("line", "groups", "role"),
+    [
+        ("", "guests,solar-engineers", "engineer"),
+        ('separator = "|"', "guests,solar-engineers", ""),
+        ('separator = "|"', "guests,solar-engineers|solar-guests", "viewer"),
+        ('separator = "|"', "solar-guests | solar-operators", "operator"),
+    ],
+)
+def test_groups_end_where_the_file_says(tmp_path: Path, line: str, groups: str, role: str) -> None:
+    """A provider that allows commas in names of groups needs another separator."""
+    file = FILE.replace("[roles]", f"{line}\n[roles]")
+    found = ByProxy.read(written(tmp_path, file)).introduced(
+        Headers({**HEADERS, "X-Heliotrope-Groups": groups})
+    )
+    assert found is not None
+    assert found.role == role
+
+
+def test_an_address_is_believed_of_the_proxy_alone_and_shown_as_its_word(
+    console: LiveConsole, behind: httpx.Client
+) -> None:
+    """Other programs on the proxy's machine can send the same headers, but not the secret."""
+    guess = {"name": "viewer", "password": "not the password"}
+    for secret in (WORD, "0" * 64):
+        headers = {"X-Forwarded-For": "203.0.113.5", "X-Heliotrope-Secret": secret}
+        assert behind.post("api/v1/session", json=guess, headers=headers).status_code == 401
+    events = console.call(lambda: console.live.operations.logbook.events(50))
+    failed = [event for event in events if "failed to sign in" in event.text]
+    found = [event.text for event in failed if event.who == "viewer"]
+    assert sorted(text.partition("(from ")[2] for text in found) == [
+        "127.0.0.1)",
+        "203.0.113.5 via 127.0.0.1)",
+    ]
+
+
 @pytest.mark.parametrize(
     ("headers", "text"),
     [
@@ -157,6 +206,7 @@ def test_the_example_of_nginx_sets_each_header(tmp_path: Path) -> None:
         ({"text": FILE.replace("X-Heliotrope-Person", "X Person")}, "person"),
         ({"text": FILE.replace("groups =", "group =")}, "'groups' is missing"),
         ({"word": "short"}, "at least 32 letters"),
+        ({"text": FILE.replace("[roles]", 'separator = ""\n[roles]')}, "separator"),
         ({"mode": 0o644}, "others may read it"),
     ],
 )

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -289,6 +290,14 @@ def test_what_a_token_may_see_and_order(plant: LiveConsole, tokens: dict[str, st
     assert (ticket["command"], ticket["heliostats"]) == ("DEFOCUS", 1)
     with pytest.raises(CallError, match="no call"):
         ask_once(folder / EMERGENCY, operator, "summary", {})
+
+
+def test_the_processes_of_a_console_have_an_end_of_their_memory(plant: LiveConsole) -> None:
+    """Whatever others make them keep, it never takes the plant's."""
+    _answers(plant)
+    for process, most in ((plant.process, 2 << 30), (plant.way, 512 << 20)):
+        limits = Path(f"/proc/{process.pid}/limits").read_text("ascii")
+        assert re.search(rf"^Max data size +{most} +{most} ", limits, re.MULTILINE), limits
 
 
 def test_a_standing_connection_loses_what_its_account_loses(plant: LiveConsole) -> None:

@@ -44,6 +44,10 @@ class TestAccounts:
         assert again.account("anna") == wanted
         assert again.account("Anna") is None
 
+    def test_have_names_of_any_letters(self, people: People) -> None:
+        for name in ("\u00e9lise", "elise", "\u0418\u0432\u0430\u043d", "ann", "Hanna", "ben 2"):
+            assert people.add(name, HASH, "viewer", 100.0).name == name
+
     def test_never_show_the_hash(self, people: People) -> None:
         assert HASH not in repr(people.accounts())
 
@@ -57,6 +61,15 @@ class TestAccounts:
         ("name", "password_hash", "role", "text"),
         [
             ("anna", HASH, "viewer", "account anna: it exists"),
+            (
+                "Anna",
+                HASH,
+                "viewer",
+                "account Anna: the name looks like that of anna",
+            ),
+            (" anna ", HASH, "viewer", "looks like that of anna"),
+            ("\u0430nna", HASH, "viewer", "looks like that of anna"),  # a Cyrillic a
+            ("\uff42en", HASH, "viewer", "looks like that of ben"),  # of full width
             (" ", HASH, "viewer", "give a name of 1 to 100 printable"),
             ("x" * 101, HASH, "viewer", "give a name of 1 to 100 printable"),
             ("a\nb", HASH, "viewer", "give a name of 1 to 100 printable"),

@@ -31,25 +31,36 @@ HELIOSTATS = 320
 #: Limits: lag of the loop, age of a lease and EMERGENCY, s; memory of all processes, MB; lines of
 #: the log in one attack.
 LAG, LEASE, EMERGENCY, MEMORY, LINES = 0.2, 3.0, 1.0, 2000.0, 200
+#: Everybody's password, and tokens of the operator who stands by.
+PASSWORD, TOKENS = "a password of one's own", 40
 #: Length of an attack, pause between orders, and longest wait for one, s.
 SECONDS, PAUSE, LONGEST = 8.0, 2.0, 20.0
 
 
 @dataclass
 class Target(Place):
-    """The plant under attack, with its processes, its log and the file of the gauges."""
+    """The plant under attack, with its processes, its log and the file of the gauges.
 
+    ``unmet`` are tokens of the operator Olga that no process has met.
+    """
+
+    unmet: list[str] = field(repr=False)
     process: "subprocess.Popen[bytes]" = field(repr=False)
     log: Path
     gauges: Path
 
     def memory(self) -> float:
-        """Return the resident memory of all processes, MB."""
-        pages = 0
+        """Return the memory of all processes, MB; what they share counts once."""
+        size = 0
         for pid in (self.process.pid, *_children(self.process.pid)):
             with contextlib.suppress(OSError):
-                pages += int(Path(f"/proc/{pid}/statm").read_text("ascii").split()[1])
-        return pages * resource.getpagesize() / 1e6
+                text = Path(f"/proc/{pid}/smaps_rollup").read_text("ascii")
+                size += sum(int(kb) for kb in re.findall(r"^Pss:\s+(\d+) kB", text, re.MULTILINE))
+        return size * 1024 / 1e6
+
+    def stored(self) -> float:
+        """Return the size of the plant's records, MB."""
+        return sum(file.stat().st_size for file in self.data.glob("*sqlite*")) / 1e6
 
     def lines(self) -> int:
         """Return the number of lines that the plant has written."""
@@ -113,10 +124,10 @@ def plant(folder: Path, descriptors: int | None) -> Iterator[Target]:
             preexec_fn=few,  # noqa: PLW1509 - no thread runs yet
         )
     try:
-        viewer, operator = _tokens(port, _link(process, log))
+        viewer, operator, *unmet = _tokens(port, _link(process, log))
         cluster = int(gauges.with_name(f"{gauges.name}.port").read_text("ascii"))
         data = folder / "data"
-        yield Target(port, urgent, cluster, viewer, operator, data, process, log, gauges)
+        yield Target(port, urgent, cluster, viewer, operator, data, unmet, process, log, gauges)
     finally:
         process.send_signal(signal.SIGINT)
         time.sleep(1.0)
@@ -138,17 +149,35 @@ def _link(process: "subprocess.Popen[bytes]", log: Path) -> str:
 
 
 def _tokens(port: int, link: str) -> list[str]:
-    """Set the first password; return tokens of a viewer and of an operator."""
+    """Set the first password and make accounts.
+
+    Returns
+    -------
+    A token of Vera, a viewer, one of Mallory, an operator, and some of Olga, an operator.
+    """
     from heliotrope.console.client import Client
     from support.one_time_link import set_password
 
-    own = "a password of one's own"
-    set_password(link, own)
+    set_password(link, PASSWORD)
+    secrets: list[str] = []
     with Client(url=f"http://127.0.0.1:{port}/") as client:
-        client.sign_in("engineer", own)
-        given = {"label": "attack", "days": 1, "own_password": own}
-        made = [client.ask("POST", "tokens", {"role": r, **given}) for r in ("viewer", "operator")]
-    return [str(one["secret"]) for one in made]
+        client.sign_in("engineer", PASSWORD)
+        for name, role, count in (
+            ("Vera", "viewer", 1),
+            ("Mallory", "operator", 1),
+            ("Olga", "operator", TOKENS),
+        ):
+            account = {"name": name, "role": role, "password": "given " + PASSWORD}
+            client.ask("POST", "accounts", {**account, "own_password": PASSWORD})
+            with Client(url=f"http://127.0.0.1:{port}/") as own:
+                own.sign_in(name, account["password"])
+                own.change_password(account["password"], PASSWORD)
+            with Client(url=f"http://127.0.0.1:{port}/") as own:
+                own.sign_in(name, PASSWORD)
+                given = {"label": "attack", "days": 1, "own_password": PASSWORD, "role": role}
+                made = [own.ask("POST", "tokens", given) for _ in range(count)]
+            secrets += [str(one["secret"]) for one in made]
+    return secrets
 
 
 @dataclass

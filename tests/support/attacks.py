@@ -31,7 +31,8 @@ FLOOD = b'{"name":[' + b",".join([_NESTED] * (16_000_000 // len(_NESTED))) + b"]
 class Place:
     """The plant under attack: its ports, tokens of a viewer and of an operator, its folder.
 
-    ``cluster`` is the port for clusters.
+    ``cluster`` is the port for clusters. The attackers are Vera, a viewer, and Mallory, an
+    operator.
     """
 
     port: int
@@ -310,6 +311,61 @@ def wrong_cookies(place: Place, over: threading.Event) -> None:
         _bytes(place, order, place.urgent)
 
 
+def _scattered(number: int) -> str:
+    """Return one of 65,536 addresses, each a stranger's of its own."""
+    return f"127.77.{number // 256 % 256}.{number % 256}"
+
+
+def _from(place: Place, number: int, data: bytes, port: int = 0, wait: float = 5.0) -> bytes:
+    """Send bytes from another address than ever before; return the beginning of the answer."""
+    with contextlib.suppress(OSError), socket.socket() as line:
+        line.settimeout(max(wait, 0.5))
+        line.bind((_scattered(number), 0))
+        line.connect(("127.0.0.1", port or place.port))
+        line.sendall(data)
+        return line.recv(1000) if wait else b""
+    return b""
+
+
+def _guess(place: Place, name: str) -> bytes:
+    body = json.dumps({"name": name, "password": "not the password"}).encode()
+    length = f"Content-Length: {len(body)}"
+    return _head(place, "POST /api/v1/session", "Content-Type: application/json", length) + body
+
+
+_NUMBERS = itertools.count(1)
+
+
+def scattered_guesses(place: Place, over: threading.Event) -> None:
+    """Guesses for ever new names from ever new addresses, which do not wait for the answer."""
+    while not over.wait(0.01):
+        number = next(_NUMBERS)
+        _from(place, number, _guess(place, f"name {number}"), wait=0.0 if number % 4 else 0.1)
+
+
+def scattered_guesses_for_one(place: Place, over: threading.Event) -> None:
+    """Guesses for the engineer from ever new addresses."""
+    while not over.wait(0.01):
+        _from(place, next(_NUMBERS), _guess(place, "engineer"))
+
+
+def scattered_tokens(place: Place, over: threading.Event) -> None:
+    """Tokens that nobody has, from 48 addresses, on the way for EMERGENCY alone."""
+    while not over.wait(0.001):
+        number = next(_NUMBERS)
+        bearer = f"Authorization: Bearer {number:064}"
+        order = _head(place, "POST /api/v1/emergency", bearer, "Content-Length: 2") + b"{}"
+        _from(place, number % 48, order, place.urgent)
+
+
+def pages(place: Place, over: threading.Event) -> None:
+    """The sign-in page and its files again and again, each over a connection of its own."""
+    paths = ("login", "", "account", "emergency", "console/static/console.js", "nothing")
+    while not over.wait(0.001):
+        number = next(_NUMBERS)
+        _from(place, number % 48, _head(place, f"GET /{paths[number % 6]}"))
+
+
 # -- people who are signed in --------------------------------------------------------------------
 
 
@@ -330,6 +386,35 @@ def viewer_streams(place: Place, over: threading.Event) -> None:
     data = _socket(place, "/api/v1/live").replace(b"Origin: http://evil.example\r\n", b"")
     token = f"\r\nAuthorization: Bearer {place.token}\r\n".encode()
     _held(place, over, data.replace(b"\r\n", token, 1), 300)
+
+
+def viewer_sends(place: Place, over: threading.Event) -> None:
+    """A viewer's streams that send long messages, parts of endless ones, and pings."""
+    data = _socket(place, "/api/v1/live").replace(b"Origin: http://evil.example\r\n", b"")
+    token = f"\r\nAuthorization: Bearer {place.token}\r\n".encode()
+    opening = data.replace(b"\r\n", token, 1)
+    long = b"\x82\xff" + struct.pack(">Q", 9_999_999_999) + bytes(1 << 16)
+    parts = b"\x02\x80" + bytes(4) + (b"\x00\x80" + bytes(4)) * 10_000
+    pings = (b"\x89\xfd" + bytes(129)) * 500
+    for text in itertools.cycle((long, parts, pings)):
+        if over.wait(0.01):
+            return
+        with (
+            contextlib.suppress(OSError),
+            socket.create_connection(("127.0.0.1", place.port), timeout=1.0) as line,
+        ):
+            line.sendall(opening)
+            line.recv(1000)
+            for _ in range(200):
+                line.sendall(text)
+
+
+def viewer_emergencies(place: Place, over: threading.Event) -> None:
+    """A viewer orders EMERGENCY as fast as it is answered."""
+    order = {"reason": "attack"}
+    _requests(
+        place, over, lambda client, _: client.post("api/v1/emergency", json=order), place.token
+    )
 
 
 def operator_orders(place: Place, over: threading.Event) -> None:
@@ -493,8 +578,9 @@ ATTACKS: dict[str, Attack] = {
         nothing, nested, unauthorised, small_nested, uploads, chunks, slow_bodies, idle, half_open,
         churn, resets, unread, pipelining, header_bombs, long_paths, unknown_paths, methods,
         not_http, foreign_hosts, foreign_sockets, stranger_streams, wrong_passwords, many_names,
-        wrong_tokens, wrong_cookies, viewer_reads, viewer_orders, viewer_streams, operator_orders,
-        operator_stows, large_orders, cluster_strangers, local_strangers, local_idle, local_frames,
-        local_blobs, local_unread, local_orders,
+        wrong_tokens, wrong_cookies, scattered_guesses, scattered_guesses_for_one,
+        scattered_tokens, pages, viewer_reads, viewer_orders, viewer_streams, viewer_sends,
+        viewer_emergencies, operator_orders, operator_stows, large_orders, cluster_strangers,
+        local_strangers, local_idle, local_frames, local_blobs, local_unread, local_orders,
     )
 }  # fmt: skip

@@ -3,8 +3,9 @@
 Each 50 ms a line is added to the file: the time, the longest wait of the plant's loop since the
 line before, the longest time since a cluster's last lease, and the time since which every one of
 the ``COUNT`` simulated local controllers has heard DEFOCUS; POSIX s and s. Where ``FILE.withdraw``
-appears, the emergency is withdrawn, past all interfaces, and the file removed. A simulated plant
-has no port for clusters: one is opened in its loop, and its number written to ``FILE.port``.
+appears, the emergency is withdrawn, past all interfaces, and the file removed. The simulated field
+is a program of its own, with a gauge that writes ``FILE.heard``. Its port for clusters is its own:
+another is opened in the plant's loop for the attacks, and its number written to ``FILE.port``.
 """
 
 import asyncio
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from heliotrope.cli import main
+from heliotrope.cli.run import twin_process
 from heliotrope.errors import HeliotropeError
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.tcp import TcpServer
@@ -28,7 +30,6 @@ from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations import Operations
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.twin.field.field_bus import FieldBus
-from heliotrope.twin.live.loop import PacedLoop
 
 #: Time between two looks at the loop, and between two lines, s.
 _LOOK, _LINE = 0.02, 0.05
@@ -38,10 +39,10 @@ class Gauges:
     """What is noted, by the plant's loop and by a thread of its own."""
 
     def __init__(self, file: Path, count: int) -> None:
-        self._file, self._heard = file, np.zeros(count)
+        self._file, self.count = file, count
         self._leases: dict[str, float] = {}
         self._gap = 0.0
-        self.loop: PacedLoop | None = None
+        self.loop: asyncio.AbstractEventLoop | None = None
         self.operations: Operations | None = None
         self._listens: asyncio.Task[None] | None = None
 
@@ -54,20 +55,16 @@ class Gauges:
             file = self._file.with_name(f"{self._file.name}.port")
             file.write_text(str(server.port), encoding="ascii")
 
-    def start(self) -> None:
-        """Begin `listen`, once the plant's loop runs."""
-        self._listens = asyncio.get_running_loop().create_task(self.listen())
+    def start(self, operations: Operations) -> None:
+        """Begin, in the plant's loop."""
+        self.loop, self.operations = asyncio.get_running_loop(), operations
+        self._listens = self.loop.create_task(self.listen())
 
     def lease(self, cluster: str) -> None:
         """Note a lease for a cluster."""
         now = time.monotonic()
         self._gap = max(self._gap, now - self._leases.get(cluster, now))
         self._leases[cluster] = now
-
-    def heard(self, command: str, rows: range) -> None:
-        """Note that local controllers have heard a command."""
-        if command == "DEFOCUS":
-            self._heard[rows.start : rows.stop] = time.time()
 
     def run(self) -> None:
         """Write lines for ever."""
@@ -80,7 +77,14 @@ class Gauges:
                     time.sleep(_LOOK)
                 now, self._gap, gap = time.monotonic(), 0.0, self._gap
                 gap = max([gap, *(now - at for at in self._leases.values())])
-                out.write(f"{time.time()} {lag} {gap} {self._heard.min()}\n")
+                out.write(f"{time.time()} {lag} {gap} {self._heard()}\n")
+
+    def _heard(self) -> float:
+        """Return the time since which all local controllers have heard DEFOCUS, POSIX s."""
+        try:
+            return float(_heard_file(self._file).read_text("ascii"))
+        except (OSError, ValueError):
+            return 0.0
 
     def _withdraw(self) -> None:
         """Withdraw the emergency if that is asked for, and acknowledge the alarms that it left."""
@@ -91,7 +95,7 @@ class Gauges:
 
         def work() -> None:
             for call in operations.plant.sentinel.calls:
-                operations.withdraw(who, call.who)
+                operations.withdraw(Person(call.who, Role.ENGINEER))
             for alarm in operations.logbook.alarms():
                 if not alarm.acknowledged_by:
                     with contextlib.suppress(HeliotropeError):
@@ -117,17 +121,11 @@ class Gauges:
 
 def attach(gauges: Gauges) -> None:
     """Let the classes of the plant tell the gauges."""
-    make, keep, tell = PacedLoop.__init__, ClusterEnd.keep, FieldBus._tell
-    serve = PlantInterface.__init__
-
-    def made(self: PacedLoop, *given: Any, **named: Any) -> None:
-        make(self, *given, **named)
-        gauges.loop = self
-        self.call_soon(gauges.start)
+    keep, serve = ClusterEnd.keep, PlantInterface.__init__
 
     def served(self: PlantInterface, operations: Operations, *given: Any) -> None:
         serve(self, operations, *given)
-        gauges.operations = operations
+        gauges.start(operations)
 
     async def kept(self: ClusterEnd, lease: Callable[[], Any], *given: Any) -> None:
         def noted() -> Any:
@@ -136,18 +134,35 @@ def attach(gauges: Gauges) -> None:
 
         await keep(self, noted, *given)
 
-    def told(self: FieldBus, name: str, rows: range) -> None:
-        gauges.heard(name, rows)
-        tell(self, name, rows)
-
-    PacedLoop.__init__ = made  # type: ignore[method-assign]
     PlantInterface.__init__ = served  # type: ignore[method-assign]
     ClusterEnd.keep = kept  # type: ignore[method-assign]
-    FieldBus._tell = told  # type: ignore[method-assign]
     threading.Thread(target=gauges.run, daemon=True).start()
 
 
+def attach_to_field(file: Path, count: int) -> None:
+    """Note in the simulated field's program when its local controllers hear DEFOCUS."""
+    tell, heard = FieldBus._tell, np.zeros(count)
+
+    def told(self: FieldBus, name: str, rows: range) -> None:
+        if name == "DEFOCUS":
+            heard[rows.start : rows.stop] = time.time()
+            _heard_file(file).write_text(str(heard.min()), encoding="ascii")
+        tell(self, name, rows)
+
+    FieldBus._tell = told  # type: ignore[method-assign]
+
+
+def _heard_file(file: Path) -> Path:
+    return file.with_name(f"{file.name}.heard")
+
+
 if __name__ == "__main__":
-    attach(Gauges(Path(sys.argv[1]), int(sys.argv[2])))
+    path, heliostats = Path(sys.argv[1]), int(sys.argv[2])
+    attach(Gauges(path, heliostats))
+    twin_process._MAIN = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r}); "
+        "from pathlib import Path; from support import gauges; from heliotrope.cli import main; "
+        f"gauges.attach_to_field(Path({str(path)!r}), {heliostats}); main()"
+    )
     sys.argv[1:3] = []
     sys.exit(main())

@@ -18,7 +18,7 @@ from heliotrope.console.auth import (
     signed_in,
 )
 from heliotrope.console.hashing import CrowdError, GoneError
-from heliotrope.console.headers import COOKIE, address_of
+from heliotrope.console.headers import COOKIE
 from heliotrope.console.people import ROLES
 from heliotrope.console.sign_in import confirm, log_in, set_cookie
 from heliotrope.plant.operations.security import SecurityEvent
@@ -227,7 +227,7 @@ async def _without_password(console: Console, who: Caller) -> bool:
 
 async def _hashed(console: Console, who: Caller, request: Request, password: str) -> str:
     """Return the hash of a new password, which somebody who has signed in gives."""
-    pair = (who.person.name, address_of(console.settings, request))
+    pair = (who.person.name, console.address(request))
     try:
         async with console.hashing.turn(pair, request.is_disconnected, known=True):
             return await asyncio.to_thread(_secrets.hash_password, password)

@@ -111,7 +111,21 @@ class Console:
         now = time.monotonic()
         if len(times) < MOST_NOTED or now - times[0] >= SPAN:
             times.append(now)
-            await self.plant.note(kind, who, address_of(self.settings, connection), plain(detail))
+            address = self.address(connection)
+            nearest = connection.client.host if connection.client else ""
+            # What a proxy says of an address is no more certain than the proxy.
+            seen = address if address == nearest else f"{address} via {nearest}"
+            await self.plant.note(kind, who, seen, plain(detail))
+
+    def address(self, connection: HTTPConnection) -> str:
+        """Return the address that a request comes from, see `address_of`.
+
+        Where the proxy has a secret, what a request without it says of an address is not believed:
+        other programs on the proxy's machine send some too.
+        """
+        if self.by_proxy is not None and not self.by_proxy.sends(connection.headers):
+            return connection.client.host if connection.client else ""
+        return address_of(self.settings, connection)
 
     async def heliostats(self) -> int:
         """Return the number of heliostats of the plant."""

@@ -6,6 +6,7 @@ made and get their role from the groups at each sign-in; they have no password.
 """
 
 import hmac
+import unicodedata
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -34,6 +35,7 @@ class _ProxyFile(BaseModel):
     groups: _Header
     secret: _Header
     secret_file: Annotated[str, Field(min_length=1)]
+    separator: Annotated[str, Field(pattern=r"^[!-~]{1,4}$")] = ","
     roles: Annotated[dict[str, _Role], Field(min_length=1)]
 
 
@@ -57,6 +59,8 @@ class ByProxy:
         Content of the secret header.
     roles
         Role by group.
+    separator
+        Between groups; a group whose name has it is taken for two.
     """
 
     person: str
@@ -64,6 +68,7 @@ class ByProxy:
     secret: str
     word: str = field(repr=False)
     roles: dict[str, str]
+    separator: str = ","
 
     @classmethod
     def read(cls, path: Path) -> "ByProxy":
@@ -83,17 +88,30 @@ class ByProxy:
             raise FormatError(
                 place, f"give at least {_SHORTEST} letters and digits, as of `openssl rand -hex 32`"
             )
-        return cls(document.person, document.groups, document.secret, word, document.roles)
+        names = (document.person, document.groups, document.secret)
+        return cls(*names, word, document.roles, document.separator)
+
+    def sends(self, headers: Headers) -> bool:
+        """Whether the proxy has sent a request: it has the secret."""
+        return hmac.compare_digest(headers.get(self.secret, "").encode(), self.word.encode())
 
     def introduced(self, headers: Headers) -> Introduced | None:
         """Return the person of a request from a proxy; None without the secret or a name."""
-        word = headers.get(self.secret, "").encode()
-        names = headers.getlist(self.person)
-        if not hmac.compare_digest(word, self.word.encode()) or len(names) != 1 or not names[0]:
+        names = [_text(name) for name in headers.getlist(self.person)]
+        if not self.sends(headers) or len(names) != 1 or not names[0]:
             return None
-        groups = {group.strip() for group in ",".join(headers.getlist(self.groups)).split(",")}
+        listed = self.separator.join(map(_text, headers.getlist(self.groups)))
+        groups = {group.strip() for group in listed.split(self.separator)}
         roles = [role for group, role in self.roles.items() if group in groups]
         return Introduced(names[0], max(roles, key=ROLES.index, default=""))
+
+
+def _text(header: str) -> str:
+    """Return the text of a header, which is UTF-8; "" if it is not."""
+    try:
+        return unicodedata.normalize("NFC", header.encode("latin-1").decode())
+    except UnicodeError:
+        return ""
 
 
 def check_account(who: Introduced, account: Account | None) -> None:

@@ -9,7 +9,7 @@ from fastapi import HTTPException
 from starlette.requests import HTTPConnection
 
 from heliotrope.console.auth import Caller, Console, find_caller
-from heliotrope.console.headers import STRANGER, STRANGERS, address_of, network_of
+from heliotrope.console.headers import STRANGER, STRANGERS, network_of
 from heliotrope.local import Buckets
 
 #: Requests of one person; 1/s, and at once.
@@ -46,7 +46,7 @@ class Edge:
         """
         who = await find_caller(console, connection)
         if who is None:
-            address = network_of(address_of(console.settings, connection))
+            address = network_of(console.address(connection))
             _refuse(self._stranger.take(address))
             if not console.attempts.is_home(address):
                 _refuse(self._strangers.take(""))

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import json
 import os
+import resource
 import signal
 import socket
 import sys
@@ -52,8 +53,19 @@ class Served(Protocol):
         ...
 
 
-def main(work: Callable[[ProcessInput], Coroutine[Any, Any, None]]) -> int:
-    """Do the work of a process until standard input ends; return the exit code."""
+def main(work: Callable[[ProcessInput], Coroutine[Any, Any, None]], memory: int) -> int:
+    """Do the work of a process until standard input ends; return the exit code.
+
+    Parameters
+    ----------
+    work
+        The work.
+    memory
+        Most memory that the process may have, bytes: what others make it keep ends there, before
+        the plant or its machine has none left.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     # The plant stows its field after Ctrl-C, and people watch that here.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     log_lines.install()

@@ -11,7 +11,7 @@ from heliotrope.console import _secrets
 from heliotrope.console.auth import Caller, Console
 from heliotrope.console.by_proxy import Introduced, check_account
 from heliotrope.console.hashing import CrowdError, GoneError
-from heliotrope.console.headers import COOKIE, address_of, network_of
+from heliotrope.console.headers import COOKIE, network_of
 from heliotrope.console.settings import is_loopback
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import BY_PROXY, Account
@@ -73,7 +73,7 @@ async def enter_once(console: Console, secret: str, connection: HTTPConnection) 
         403 for a caller on another machine, who leaves the link valid; 410 if the link is not valid
         any more.
     """
-    if not is_loopback(address_of(console.settings, connection)):
+    if not is_loopback(console.address(connection)):
         await console.note(
             SecurityEvent.SIGN_IN_FAILED, connection, "", f"{_BY_LINK}, from another machine"
         )
@@ -90,7 +90,7 @@ async def _begin(
 ) -> tuple[str, float]:
     """Begin a session; return its secret and its end, POSIX s."""
     now, lifetime = console.now(), console.settings.session_s
-    address = address_of(console.settings, connection)
+    address = console.address(connection)
     secret = await console.ask(lambda: console.people.open_session(name, now, lifetime, address))
     console.roster.forget()
     await console.note(SecurityEvent.SIGNED_IN, connection, name, detail)
@@ -135,7 +135,7 @@ async def checked(
         failures, or while too many others sign in.
     """
     attempts = console.attempts
-    keys = (name, network_of(address_of(console.settings, request)))
+    keys = (name, network_of(console.address(request)))
     if (wait := attempts.wait(*keys)) > 0.0:
         await console.note(SecurityEvent.LOCKED_OUT, request, await _known(console, name))
         raise _too_often("too many failed sign-ins", wait)

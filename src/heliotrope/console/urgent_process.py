@@ -17,6 +17,8 @@ from heliotrope.local import EMERGENCY, LocalConnection
 _ANSWER = 10.0
 #: Time for the connection to the plant, s: it is made anew where it has ended.
 _CONNECT = 5.0
+#: Most memory, bytes.
+_MEMORY = 512 << 20
 
 
 def way_of(plant: LocalConnection, inputs: ProcessInput) -> EmergencyWay:
@@ -53,4 +55,4 @@ async def _run(inputs: ProcessInput) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(_run))
+    sys.exit(main(_run, _MEMORY))

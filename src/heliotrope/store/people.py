@@ -7,6 +7,7 @@ use them. Times are POSIX seconds and always arguments.
 
 import hashlib
 import secrets
+import unicodedata
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -170,6 +171,13 @@ _NOTED = 60.0
 _TOKENS = select(_TOKEN, _ACCOUNT.c.role.label("owner_role"), _ACCOUNT.c.disabled).join(_ACCOUNT)
 
 
+#: Letters, in small ones, that look like others, small or capital: Cyrillic, Greek and digits.
+_ALIKE = str.maketrans(
+    "авекмнорстухісѕјԁһӏԛԝѵαβεζηικμνορτυχϲ10|i",
+    "abekmhopctyxlcsjdhlqwvabezhlkmvoptyxcloll",
+)
+
+
 class People:
     """Accounts, sessions and tokens in a database.
 
@@ -217,7 +225,7 @@ class People:
         Raises
         ------
         InputError
-            A name that exists, is empty or too long; an empty hash.
+            A name that exists or looks like another, is empty or too long; an empty hash.
         UnknownNameError
             An unknown role.
         StoreError
@@ -235,6 +243,11 @@ class People:
                 raise InputError(
                     f"account {name}: it exists already; change it, or give another name"
                 )
+            for other in connection.scalars(select(_ACCOUNT.c.name)):
+                if _likeness(other) == _likeness(name):
+                    raise InputError(
+                        f"account {name}: the name looks like that of {other}; give another one"
+                    )
             connection.execute(_ACCOUNT.insert().values(rows.row_of(_ACCOUNT, made)))
             _set_due(connection, name, due=due)
 
@@ -466,6 +479,11 @@ class People:
 
     def _secret(self) -> str:
         return self._entropy(_SECRET).hex()
+
+
+def _likeness(name: str) -> str:
+    """Return what two names share that people would take for one another."""
+    return " ".join(unicodedata.normalize("NFKC", name).casefold().translate(_ALIKE).split())
 
 
 def _valid_token(row: RowMapping, now: float) -> ApiToken | None:
