@@ -7,7 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import httpx
+from starlette.requests import HTTPConnection
 
+from heliotrope.console.auth import Console
+from heliotrope.plant.operations.security import MOST, SecurityEvent
 from heliotrope.store.records import Event
 from support.live_console import PASSWORD, LiveConsole
 
@@ -62,6 +65,24 @@ def test_expiry_leaves_a_trace(console: LiveConsole) -> None:
     console.console_wait(begin())
     recorded(console, "operator: session expired")
     recorded(console, "operator: token expired: old report")
+
+
+def test_sign_ins_of_one_person_leave_out_nobody_else(console: LiveConsole) -> None:
+    """The console sends the plant the sum of those that it leaves out."""
+    inside: Console = console.server.app.state.console
+    scope = {"type": "http", "headers": [], "client": ("10.0.0.9", 1)}
+
+    async def flood() -> None:
+        for _ in range(MOST + 3):
+            await inside.note(SecurityEvent.SIGNED_OUT, HTTPConnection(scope), "viewer")
+        await inside.note(SecurityEvent.SIGNED_OUT, HTTPConnection(scope), "engineer")
+        for kind, who, more in inside.counter.sums(time.monotonic(), all_=True):
+            await inside.plant.note(kind, who, more=more)
+
+    console.console_wait(flood())
+    recorded(console, "engineer: signed out (from 10.0.0.9)")
+    console.call(console.live.operations.security.close)
+    recorded(console, "viewer: signed out: 3 more in a minute")
 
 
 CHANGES: tuple[tuple[str, str, dict[str, Any], str], ...] = (

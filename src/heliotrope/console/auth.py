@@ -8,7 +8,6 @@ elsewhere cannot read. Programs have a token (``Authorization: Bearer``).
 import asyncio
 import contextlib
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -27,7 +26,7 @@ from heliotrope.console.people import ROLES, person_of
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
-from heliotrope.plant.operations.security import SPAN, SecurityEvent, plain
+from heliotrope.plant.operations.security import EventCounter, SecurityEvent, plain
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.people import Account, ApiToken, Session
 
@@ -37,8 +36,6 @@ TRUSTED = 5.0
 #: The same for EMERGENCY alone, s.
 LONG_TRUSTED = 3600.0
 MOST_KNOWN = 2000
-#: Security events of one kind that are sent to the plant within a minute.
-MOST_NOTED = 100
 #: The shared answer that never changes.
 FIXED = "field"
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -85,8 +82,8 @@ class Console:
     #: Recently authenticated callers, with the time, by kind and secret.
     known: dict[tuple[str, str], tuple[float, "Caller"]] = field(default_factory=dict)
 
-    #: When the last security events of each kind were sent to the plant, s.
-    noted: dict[SecurityEvent, deque[float]] = field(default_factory=dict)
+    #: Counts the security events that are not sent to the plant one by one.
+    counter: EventCounter = field(default_factory=EventCounter)
 
     #: Answers that all viewers ask for, with the time: made at most twice a second.
     shared: dict[str, tuple[float, bytes, bytes | None]] = field(default_factory=dict)
@@ -94,15 +91,20 @@ class Console:
     async def forget_expired(self) -> None:
         """Remove expired sessions and tokens from the store, and record that they have ended.
 
-        Sessions end by the machine's time.
+        Sessions end by the machine's time. Security events that were only counted are recorded too.
         """
         while True:
+            for kind, name, more in self.counter.sums(time.monotonic()):
+                try:
+                    await self.plant.note(kind, name, more=more)
+                except HeliotropeError:
+                    self.counter.count(kind, name, time.monotonic(), more)
             with contextlib.suppress(HeliotropeError):  # others report a full store
                 for expired in await self.ask(lambda: self.people.forget_expired(self.now())):
                     ended = (
                         SecurityEvent.TOKEN_ENDED if expired.token else SecurityEvent.SESSION_ENDED
                     )
-                    await self.plant.note(ended, expired.name, "", expired.label)
+                    await self.plant.note(ended, expired.name, detail=expired.label)
             await asyncio.sleep(60.0)
 
     async def note(
@@ -110,12 +112,10 @@ class Console:
     ) -> None:
         """Record a security event that a request has caused.
 
-        The plant counts floods; strangers who cause one must not cost it a call each.
+        A flood must not cost the plant a call for each: events are counted here as there, and
+        `forget_expired` sends the sums.
         """
-        times = self.noted.setdefault(kind, deque(maxlen=MOST_NOTED))
-        now = time.monotonic()
-        if len(times) < MOST_NOTED or now - times[0] >= SPAN:
-            times.append(now)
+        if self.counter.admits(kind, who, time.monotonic()):
             await self.plant.note(kind, who, address_of(self.settings, connection), plain(detail))
 
     async def heliostats(self) -> int:

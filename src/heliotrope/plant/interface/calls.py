@@ -292,7 +292,7 @@ async def bus_frames(desk: Desk, who: Person, order: orders.Named) -> tuple[view
 def note(desk: Desk, order: orders.Note) -> None:
     """Record a security event."""
     kind = SecurityEvent[order.kind]
-    desk.operations.security.note(kind, order.who, order.address, order.detail)
+    desk.operations.security.note(kind, order.who, order.address, order.detail, order.more)
 
 
 # -- the command authority -----------------------------------------------------------------------
