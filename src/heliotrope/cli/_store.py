@@ -147,7 +147,7 @@ def migrate(place: Place) -> None:
 
 @app.command()
 def head(place: Place) -> None:
-    """Print the heads of the chains of events and audit: note them on another machine."""
+    """Print the heads of the hash chains: note them on another machine."""
     if place.endswith(_LINES):
         from heliotrope.plant.orders import audit
 
@@ -173,7 +173,7 @@ def verify(
         ),
     ] = None,
 ) -> None:
-    """Check that no event and no record of the audit was altered or removed."""
+    """Check that nobody added, altered or removed events, audit, accounts or tokens."""
     from heliotrope.store import chain
     from heliotrope.store.database import Database
     from heliotrope.store.digests import Head

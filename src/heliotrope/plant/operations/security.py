@@ -16,8 +16,12 @@ from heliotrope.safety import AlarmKind, Severity, alarms
 
 #: Kind of these events in the store and in the page.
 KIND = "security"
-#: Most events of one kind that are recorded singly in a span, s: of a person, and of all persons.
-MOST, MOST_OF_ALL, SPAN = 30, 300, 60.0
+#: Most events of one kind and person that are recorded singly in a span.
+MOST = 30
+#: The same of all persons together.
+MOST_OF_ALL = 300
+#: That span, s.
+SPAN = 60.0
 #: Refused orders within a span, s, that raise an alarm.
 ORDERS, ORDERS_SPAN = 5, 300.0
 #: An alarm ends after this time without a cause, s.
