@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from heliotrope.cli._common import parse_time, print_json, print_table
+from heliotrope.cli._noted import note_use, this_person
 
 app = typer.Typer(
     help="Look at, back up, restore and export the store of a plant.", no_args_is_help=True
@@ -72,6 +73,7 @@ def backup(
     with Database(place) as database:
         archive = None if without_telemetry else telemetry or _telemetry(database)
         made = backups.backup(database, to, parse_time("now"), archive, key=key)
+    note_use(place, "BACKED_UP", str(to))
     _tell(made, "made", as_json)
 
 
@@ -101,7 +103,9 @@ def restore(
     signed_by = None if key is None else PublicKey(key)
     file = Database(place).file
     archive = telemetry or (file.with_name(backups.TELEMETRY) if file is not None else None)
-    _tell(backups.restore(backup, place, archive, signed_by=signed_by), "restored", as_json)
+    who, now = this_person(), parse_time("now")
+    done = backups.restore(backup, place, now, archive, signed_by=signed_by, who=who)
+    _tell(done, "restored", as_json)
 
 
 @app.command()
@@ -128,6 +132,7 @@ def export(
 
     with Database(place) as database:
         written = exports.export(database, to, heliostat)
+    note_use(place, "EXPORTED", f"{len(written)} heliostats to {to}")
     print(f"{to}: {len(written)} heliostats")
 
 
@@ -211,6 +216,8 @@ def query(
 
     inside = place / TELEMETRY
     answer = telemetry_query.query(inside if inside.is_dir() else place, sql)
+    if inside.is_dir():
+        note_use(str(place), "QUERIED", sql)
     rows = answer.to_pylist()
     if as_json:
         print_json(rows)

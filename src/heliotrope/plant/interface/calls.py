@@ -295,6 +295,13 @@ def note(desk: Desk, order: orders.Note) -> None:
     desk.operations.security.note(kind, order.who, order.address, order.detail, order.more)
 
 
+@_call()
+def note_use(desk: Desk, who: Person, order: orders.Use) -> None:
+    """Record what a person on this machine did with the records; see `cli._noted`."""
+    kind = SecurityEvent[order.kind]
+    desk.operations.security.note(kind, who.name, detail=order.detail)
+
+
 # -- the command authority -----------------------------------------------------------------------
 
 

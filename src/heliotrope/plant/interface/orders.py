@@ -212,6 +212,13 @@ class Note(Strict):
     more: Annotated[int, Field(ge=0, le=2**53)] = 0
 
 
+class Use(Strict):
+    """What a person on this machine did with the records: the name of its event, and details."""
+
+    kind: Annotated[str, Field(pattern="^(BACKED_UP|EXPORTED|QUERIED)$")]
+    detail: Words
+
+
 class Beat(Strict):
     """A sign of life: the part of a console that gives it, and where it listens."""
 

@@ -51,6 +51,10 @@ class SecurityEvent(Enum):
     HOST_REFUSED = ("request for an unknown host name refused", Severity.WARNING)
     ORIGIN_REFUSED = ("request from another site refused", Severity.WARNING)
     LINK_REFUSED = ("link refused", Severity.WARNING)
+    BACKED_UP = ("made a backup", Severity.INFO)
+    EXPORTED = ("exported calibrations", Severity.INFO)
+    QUERIED = ("queried the telemetry", Severity.INFO)
+    KEYS_RENEWED = ("keys or certificates renewed", Severity.WARNING)
     CHAIN_HEAD = ("head of the records' chains", Severity.INFO)
 
     @property
