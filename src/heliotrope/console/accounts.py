@@ -6,7 +6,7 @@ from dataclasses import asdict
 from fastapi import APIRouter, HTTPException, Request, Response
 
 from heliotrope.console import _secrets, models
-from heliotrope.console.api import REFUSALS, Named
+from heliotrope.console.api import REFUSALS, AccountNamed, Named
 from heliotrope.console.auth import (
     Anyone,
     AppConsole,
@@ -96,9 +96,9 @@ async def own_password(
     await console.note(SecurityEvent.PASSWORD_CHANGED, request, who.person.name)
 
 
-@router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
+@router.post("/accounts/{name:path}/password", response_model=models.GivenPassword, tags=["people"])
 async def reset_password(
-    console: AppConsole, who: Engineer, request: Request, name: Named, body: models.Confirmed
+    console: AppConsole, who: Engineer, request: Request, name: AccountNamed, body: models.Confirmed
 ) -> models.GivenPassword:
     """Give a person a new password, shown once; all their sessions and tokens end.
 
@@ -136,9 +136,13 @@ async def new_account(
     return _account(made)
 
 
-@router.patch("/accounts/{name}", response_model=models.AccountState, tags=["people"])
+@router.patch("/accounts/{name:path}", response_model=models.AccountState, tags=["people"])
 async def change_account(
-    console: AppConsole, who: Engineer, request: Request, name: Named, body: models.AccountChange
+    console: AppConsole,
+    who: Engineer,
+    request: Request,
+    name: AccountNamed,
+    body: models.AccountChange,
 ) -> models.AccountState:
     """Change the role or password of an account, or disable it; not yours."""
     await confirm(console, who, request, body.own_password)

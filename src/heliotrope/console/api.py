@@ -38,6 +38,7 @@ from heliotrope.local.frames import REQUEST_BLOB
 from heliotrope.plant.interface import CALLS, Call, WithBlob, orders
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.orders.authority import OPERATOR_COMMANDS, Role
+from heliotrope.store.people import LONGEST_NAME
 
 #: Answers that any route behind the sign-in may give.
 REFUSALS: dict[int | str, dict[str, Any]] = {
@@ -52,6 +53,8 @@ MOST_SHARED = 100
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 Named = Annotated[str, Path(max_length=64)]
+#: Name of an account, whatever it is: the path of its route takes a slash too.
+AccountNamed = Annotated[str, Path(max_length=LONGEST_NAME)]
 
 
 def answer(value: Any) -> JSONResponse:

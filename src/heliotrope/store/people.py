@@ -37,6 +37,8 @@ _STATE = (
     (_ACCOUNT.c.password_hash == UNSET).label("no_password"),
 )
 ROLES = ("viewer", "operator", "engineer")
+#: Longest name of an account, characters.
+LONGEST_NAME = 100
 
 
 @dataclass(frozen=True)
@@ -196,8 +198,11 @@ class People:
             If it could not be written.
         """
         _check_role(role)
-        if not name.strip() or len(name) > 100 or not name.isprintable():
-            raise InputError(f"account {name!r}: give a name of 1 to 100 printable characters")
+        if not name.strip(" .") or len(name) > LONGEST_NAME or not name.isprintable():
+            raise InputError(
+                f"account {name[:LONGEST_NAME]!r}: give a name of 1 to {LONGEST_NAME} printable "
+                "characters, not of dots alone"
+            )
         if not password_hash:
             raise InputError(f"account {name}: a password hash is needed to sign in")
         made = Account(name, role, password_hash, False, now, now, due)
