@@ -526,13 +526,13 @@ def retries(desk: Desk) -> tuple[Retry, ...]:
 
 
 @_call("GET heliostats/{name}/parameters", "calibration")
-async def parameters(desk: Desk, order: orders.Named) -> ParametersView:
+async def parameters(desk: Desk, who: Person, order: orders.Named) -> ParametersView:
     """Return the error parameters of a heliostat.
 
-    It gives those of the plant file, those in use with σ, whether its local controller stores them,
-    and earlier versions.
+    It gives those of the plant file, those in use with σ, whether its local controller stores them
+    (asked now for an operator, else as last compared), and earlier versions.
     """
-    return await desk.operations.parameters.view(order.name)
+    return await desk.operations.parameters.view(order.name, who)
 
 
 @_call("POST parameters", "calibration", ENGINEER)
