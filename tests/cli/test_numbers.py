@@ -73,7 +73,7 @@ WORDS: dict[str, tuple[str, ...]] = {
         "plant.toml", "sim", "--size", "64x48", "--columns", "1", "--rows", "1",
         "--heliostats", "1", "--distance", "20",
     ),
-    "ctl token": ("a", "--password", "p"),
+    "ctl token": ("a",),
     "ctl command": ("GOTO", "A1"),
     "ctl aim": ("0,0,10", "A1"),
     "ctl calibrate": ("A1",),

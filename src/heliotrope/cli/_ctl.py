@@ -120,12 +120,9 @@ def token(
             min=0.001, max=365, help="Validity in days: at most 365 for a viewer, 90 above."
         ),
     ] = 30.0,
-    password: Annotated[
-        str,
-        typer.Option(prompt=True, hide_input=True, help="Password of your account; prompted for."),
-    ] = "",
 ) -> None:
-    """Make an API token; it is printed once."""
+    """Make an API token; it is printed once. It asks for your password."""
+    password = typer.prompt("Password", hide_input=True, err=True)
     with _sign_in_client(context) as client:
         _sign_in(client, name, password)
         made = client.ask(

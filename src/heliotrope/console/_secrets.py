@@ -32,12 +32,16 @@ def hash_password(password: str) -> str:
 
 
 def verify_password(kept: str | None, password: str) -> bool:
-    """Return whether a password matches a hash; takes the same time without one."""
+    """Return whether a password matches a hash.
+
+    It takes the same time without an account, and for one that has no password.
+    """
+    known = kept if kept is not None and kept.startswith("$argon2") else None
     try:
-        good = _HASHER.verify(kept if kept is not None else _NOBODY, password)
+        good = _HASHER.verify(known or _NOBODY, password)
     except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
         return False
-    return bool(good) and kept is not None
+    return bool(good) and known is not None
 
 
 def new_password() -> str:

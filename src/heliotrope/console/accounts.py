@@ -17,9 +17,8 @@ from heliotrope.console.auth import (
     same_origin,
     signed_in,
 )
-from heliotrope.console.headers import COOKIE
 from heliotrope.console.people import ROLES
-from heliotrope.console.sign_in import confirm, log_in, set_cookie
+from heliotrope.console.sign_in import confirm, drop_cookie, log_in, set_cookie
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.orders.authority import Role
 from heliotrope.store.people import Account
@@ -73,7 +72,7 @@ async def sign_out(console: AppConsole, who: Anyone, request: Request, response:
     if who.by == "session":
         await console.ask(lambda: console.people.close_session(who.secret))
         console.known.clear()
-        response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+        drop_cookie(console, response)
         await console.note(SecurityEvent.SIGNED_OUT, request, who.person.name)
 
 
@@ -92,7 +91,7 @@ async def own_password(
     if body.new == body.old:
         raise HTTPException(422, "this is your password already; give another one")
     await _set_password(console, who.person.name, body.new)
-    response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+    drop_cookie(console, response)
     await console.note(SecurityEvent.PASSWORD_CHANGED, request, who.person.name)
 
 

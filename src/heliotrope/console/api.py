@@ -92,11 +92,11 @@ async def health(console: AppConsole) -> dict[str, Any]:
 
 
 async def photograph(console: AppConsole, request: Request, who: Anyone, name: Named) -> Response:
-    """Send a photograph only where the browser does not have it."""
+    """Send a photograph only where the page does not show it; no browser keeps one."""
     known = request.headers.get("if-none-match", "").strip('"')
     version = int(known) if known.isdecimal() and len(known) < 16 else -1
     view, jpeg = await console.plant.fetch("photograph", who.person, name=name, known=version)
-    headers = {"ETag": f'"{view["version"]}"', "Cache-Control": "private, no-cache"}
+    headers = {"ETag": f'"{view["version"]}"'}
     if not jpeg:
         unchanged = view["version"] == version
         return Response(status_code=304 if unchanged and version else 204, headers=headers)
@@ -137,8 +137,7 @@ def _endpoint(name: str, call: Call) -> Callable[..., Any]:
             return Response(status_code=204)
         if call.answer is not WithBlob:
             return answer(value)
-        kept = f"private, max-age={call.fresh:.0f}, immutable" if call.fresh else "no-store"
-        return Response(data, media_type="image/jpeg", headers={"Cache-Control": kept})
+        return Response(data, media_type="image/jpeg")
 
     fixed = {"console": AppConsole, "request": Request, "who": _AT_LEAST[call.role]}
     own = [_argument(key, hint) for key, hint in fixed.items()]

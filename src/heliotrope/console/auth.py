@@ -206,7 +206,7 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
     EMERGENCY accepts a caller known recently: it must not wait for a store that is slow or
     gone.
     """
-    presented = secret_of(connection)
+    presented = secret_of(console.settings, connection)
     if presented is None:
         return None
     by, secret = presented

@@ -48,7 +48,7 @@ class Edge:
         HTTPException
             429 if requests come too often.
         """
-        secret = secret_of(connection)
+        secret = secret_of(console.settings, connection)
         if secret is None or secret not in self._admitted:
             self._count_stranger(console, connection)
         who = None if secret is None else await find_caller(console, connection)

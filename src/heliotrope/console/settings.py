@@ -117,6 +117,11 @@ class ConsoleSettings:
         return self.certificate is not None
 
     @property
+    def secure(self) -> bool:
+        """Whether browsers reach it by TLS: its own, or that of a proxy."""
+        return self.tls or self.plain
+
+    @property
     def local(self) -> bool:
         """Whether only this machine can connect."""
         return self.host == "localhost" or is_loopback(self.host)
@@ -128,13 +133,14 @@ class ConsoleSettings:
         There is no TLS, no proxy that hides where a request comes from, and no second factor is
         due.
         """
-        asks = self.tls or self.plain or self.proxies or self.second_factor
+        asks = self.secure or self.proxies or self.second_factor
         return self.local and not asks
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Host names that a request may carry."""
-        return frozenset({"127.0.0.1", "localhost", "[::1]", "::1", self.host, *self.names})
+        """Host names that a request may carry, in small letters."""
+        own = {"127.0.0.1", "localhost", "[::1]", "::1"}
+        return frozenset(own.union(name.lower() for name in (self.host, *self.names)))
 
     def address(self, port: int) -> str:
         """Return the address for a browser."""

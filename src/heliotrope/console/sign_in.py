@@ -10,7 +10,7 @@ from starlette.responses import Response
 from heliotrope.console import _secrets
 from heliotrope.console.auth import Caller, Console
 from heliotrope.console.by_proxy import Introduced, check_account
-from heliotrope.console.headers import COOKIE, address_of, network_of
+from heliotrope.console.headers import address_of, cookie_of, network_of
 from heliotrope.console.settings import is_loopback
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import BY_PROXY, Account
@@ -98,13 +98,24 @@ async def _begin(
 def set_cookie(console: Console, response: Response, secret: str) -> None:
     """Give a browser its session."""
     response.set_cookie(
-        COOKIE,
+        cookie_of(console.settings),
         secret,
         max_age=int(console.settings.session_s),
         path="/",
         httponly=True,
         samesite="strict",
-        secure=console.settings.tls or console.settings.plain,
+        secure=console.settings.secure,
+    )
+
+
+def drop_cookie(console: Console, response: Response) -> None:
+    """Take the session from a browser."""
+    response.delete_cookie(
+        cookie_of(console.settings),
+        path="/",
+        httponly=True,
+        samesite="strict",
+        secure=console.settings.secure,
     )
 
 

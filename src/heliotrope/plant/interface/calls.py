@@ -44,8 +44,6 @@ VIEWER, OPERATOR, ENGINEER = Role
 FRESH = 0.5
 #: The same of a view that never changes.
 ALWAYS = float("inf")
-#: Time for which a browser keeps a photograph, s.
-DAY = 86_400.0
 _LINK = re.compile(r"\[([^\]]+)\]\([^)]+\)")
 
 
@@ -94,7 +92,7 @@ class Call:
     bare
         Whether a request may come without a body.
     fresh
-        Time for which all callers share an answer, or a browser keeps a picture, s; 0: none.
+        Time for which all callers share an answer, s; 0: none.
     urgent
         Whether it belongs to the socket for EMERGENCY, DEFOCUS and STOW.
     console
@@ -582,7 +580,7 @@ async def kept_photographs(desk: Desk, order: orders.KeptOf) -> tuple[views.Pict
     return tuple(await desk.kept(order.heliostat, order.limit))
 
 
-@_call("GET photographs/{identity}", "calibration", fresh=DAY)
+@_call("GET photographs/{identity}", "calibration")
 async def kept_photograph(desk: Desk, order: orders.KeptOne) -> WithBlob:
     """Return a kept photograph, annotated with the findings of the software."""
     return WithBlob({"identity": order.identity}, await desk.kept_picture(order.identity))
