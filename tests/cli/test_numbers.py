@@ -74,6 +74,7 @@ WORDS: dict[str, tuple[str, ...]] = {
         "--heliostats", "1", "--distance", "20",
     ),
     "ctl token": ("a",),
+    "keys tls": ("none", "--name", "a.example.org"),
     "ctl command": ("GOTO", "A1"),
     "ctl aim": ("0,0,10", "A1"),
     "ctl calibrate": ("A1",),
