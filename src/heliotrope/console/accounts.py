@@ -90,6 +90,7 @@ async def own_password(
         await confirm(console, who, request, body.old)
     if body.new == body.old:
         raise HTTPException(422, "this is your password already; give another one")
+    _secrets.check_password(body.new, who.person.name)
     await _set_password(console, who.person.name, body.new)
     drop_cookie(console, response)
     await console.note(SecurityEvent.PASSWORD_CHANGED, request, who.person.name)
@@ -126,6 +127,7 @@ async def new_account(
 ) -> models.AccountState:
     """Create an account; its password must be changed at first use."""
     await confirm(console, who, request, body.own_password)
+    _secrets.check_password(body.password, body.name)
     kept = await _hashed(console, body.password)
     made = await console.ask(
         lambda: console.people.add(body.name, kept, body.role, console.now(), due=True)
@@ -150,6 +152,8 @@ async def change_account(
     if name == who.person.name and (body.disabled or body.role not in (None, "engineer")):
         raise HTTPException(409, f"{name}: you cannot change your own role; ask another engineer")
     await _find(console, name, password=body.password is not None)
+    if body.password is not None:
+        _secrets.check_password(body.password, name)
     kept = await _hashed(console, body.password) if body.password is not None else None
     made = await console.ask(
         lambda: console.people.change(
