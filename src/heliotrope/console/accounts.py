@@ -76,6 +76,18 @@ async def sign_out(console: AppConsole, who: Anyone, request: Request, response:
         await console.note(SecurityEvent.SIGNED_OUT, request, who.person.name)
 
 
+@router.put("/session/presence", status_code=204, tags=["people"])
+async def confirm_presence(
+    console: AppConsole, who: Anyone, request: Request, body: models.Confirmed
+) -> None:
+    """Confirm by your own password that you are there; a page that was left alone asks for it.
+
+    An order from a session that has ordered nothing for a while is refused by 423 until then.
+    """
+    await confirm(console, who, request, body.own_password)
+    console.presence.seen(who.secret)
+
+
 @router.put(
     "/session/password",
     status_code=204,

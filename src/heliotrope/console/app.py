@@ -24,6 +24,7 @@ from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
 from heliotrope.console.guard import Guard
 from heliotrope.console.live import Stream
+from heliotrope.console.presence import Presence
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.routes import Routes
 from heliotrope.console.settings import ConsoleSettings
@@ -63,7 +64,8 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     chosen = settings or ConsoleSettings()
     people, stream = RemotePeople(plant), Stream(plant, chosen.period)
     attempts = SignInFailures(time.monotonic, chosen.proxies)
-    console = Console(plant, people, chosen, stream, attempts)
+    presence = Presence(chosen.idle_s, time.monotonic)
+    console = Console(plant, people, chosen, stream, attempts, presence)
     if chosen.people_by_proxy is not None:
         console.by_proxy = ByProxy.read(chosen.people_by_proxy)
 
@@ -164,7 +166,10 @@ def _pages(app: FastAPI) -> None:
             answer = RedirectResponse("/", 303)
             set_cookie(console, answer, await enter(console, person, request))
             return answer
-        return HTMLResponse(page("login"))
+        notice, text = escape(console.settings.notice), page("login")
+        if notice:
+            text = text.replace('id="notice" hidden>', f'id="notice">{notice}')
+        return HTMLResponse(text)
 
     async def follow_link(request: Request) -> Response:
         console: Console = request.scope["heliotrope"]

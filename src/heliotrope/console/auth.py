@@ -10,7 +10,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeVar, cast
 
 from fastapi import Depends, HTTPException
@@ -23,6 +23,7 @@ from heliotrope.console.connections import FOUND
 from heliotrope.console.headers import address_of, host_known, parts_of, secret_of
 from heliotrope.console.live import Stream
 from heliotrope.console.people import ROLES, person_of
+from heliotrope.console.presence import Presence
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
@@ -54,6 +55,11 @@ DUES: dict[str, tuple[str, frozenset[tuple[str, str]]]] = {
         frozenset({("POST", f"{_API}/session/factor"), ("PUT", f"{_API}/session/factor")}),
     ),
 }
+#: What a page sends by itself, or what gives command back: no sign that a person is there, and
+#: nothing that needs one.
+_BY_ITSELF = frozenset({("PUT", f"{_API}/authority"), ("DELETE", f"{_API}/authority")})
+#: Settles that a person has been away.
+_THERE = ("PUT", f"{_API}/session/presence")
 
 
 @dataclass
@@ -65,6 +71,7 @@ class Console:
     settings: ConsoleSettings
     stream: Stream
     attempts: SignInFailures
+    presence: Presence
     #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
     hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
 
@@ -180,6 +187,8 @@ class Caller:
     factor: bool = False
     by_proxy: bool = False
     no_password: bool = False
+    #: Whether this order needs the password again, see `presence`.
+    away: bool = False
 
     @property
     def csrf(self) -> str:
@@ -321,19 +330,38 @@ async def caller(connection: HTTPConnection, console: AppConsole) -> Caller:
         if not same_origin(console, connection) or not _words.same(word, who.csrf):
             await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
             raise HTTPException(403, "the header X-CSRF-Token is missing or not this session's")
+        who = _attended(console, connection, who)
     if (connection.scope.get("method", "GET"), connection.scope["path"]) not in _ALWAYS:
         settle(who, connection)
     return who
 
 
+def _attended(console: Console, connection: HTTPConnection, who: Caller) -> Caller:
+    """Return the caller of a session, away or not; whoever is there counts as seen."""
+    request = (connection.scope.get("method", "GET"), connection.scope["path"])
+    # Those without a password here cannot give it again; the proxy asks them in its own time.
+    if request in _BY_ITSELF or who.by_proxy or who.no_password:
+        return who
+    if console.presence.away(who.secret):
+        return replace(who, away=request != _THERE)
+    console.presence.seen(who.secret)
+    return who
+
+
 def settle(who: Caller, connection: HTTPConnection) -> None:
-    """Admit a caller who owes nothing, or whose request settles it.
+    """Admit a caller who is there and owes nothing, or whose request settles it.
 
     Raises
     ------
     HTTPException
-        403 for any other request.
+        423 for a person who must confirm that they are there; 403 for any other request.
     """
+    if who.away:
+        raise HTTPException(
+            423,
+            "nothing was ordered here for a while: give your password again; EMERGENCY, DEFOCUS "
+            "and STOW are accepted all the same",
+        )
     if who.owes:
         text, requests = DUES[who.owes]
         if (connection.scope.get("method", "GET"), connection.scope["path"]) not in requests:

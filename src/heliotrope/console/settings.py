@@ -40,6 +40,10 @@ class ConsoleSettings:
         Least role that needs a second factor; "" for none.
     emergency_port
         Port that serves EMERGENCY alone; None: the next one, or a free one if that is taken.
+    idle_s
+        Time without an order after which a page's next one needs the password again, s; 0: never.
+    notice
+        Text for everybody who is about to sign in; "" for none.
 
     Raises
     ------
@@ -61,6 +65,8 @@ class ConsoleSettings:
     people_by_proxy: Path | None = None
     second_factor: str = ""
     emergency_port: int | None = None
+    idle_s: float = 1800.0
+    notice: str = ""
 
     def __post_init__(self) -> None:
         for port in (self.port, self.emergency_port or 0):
