@@ -151,6 +151,22 @@ def migrate(place: Place) -> None:
 
 
 @app.command()
+def purge(
+    folder: Annotated[Path, typer.Argument(help="Data folder of a plant that is stopped.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Overwrite and remove all that a plant keeps, for a machine that leaves service."""
+    from heliotrope.store.purge import purge as remove
+
+    if not yes:
+        typer.confirm(f"{folder}: remove all records, accounts and keys for good?", abort=True)
+    count, left = remove(folder)
+    print(f"{folder}: {count} files overwritten and removed")
+    if left:
+        print(f"left, since no plant made it: {', '.join(path.name for path in left)}")
+
+
+@app.command()
 def head(place: Place) -> None:
     """Print the heads of the hash chains: note them on another machine."""
     if place.endswith(_LINES):

@@ -316,7 +316,7 @@ def make_private(folder: Path) -> None:
 
 
 #: What a plant makes in its data folder, beside the store.
-_MADE = ("telemetry", "targets", "interface", "first-password")
+MADE = ("telemetry", "targets", "marks", "photographs", "interface", "first-password")
 
 
 def tighten(folder: Path) -> None:
@@ -328,7 +328,7 @@ def tighten(folder: Path) -> None:
     if status.st_mode & stat.S_ISVTX or status.st_uid != os.geteuid():
         return
     folder.chmod(_PRIVATE_FOLDER)
-    made = [*folder.glob(f"{FILE}*"), *(folder / name for name in _MADE)]
+    made = [*folder.glob(f"{FILE}*"), *(folder / name for name in MADE)]
     inside = [path for top in made if top.is_dir() for path in top.rglob("*")]
     for path in [*made, *inside]:
         if path.is_symlink() or not path.exists() or path.is_socket():
