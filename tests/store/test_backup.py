@@ -261,6 +261,24 @@ def test_a_backup_of_an_earlier_program_is_migrated(tmp_path: Path) -> None:
     assert not (tmp_path / "third").exists()
 
 
+def test_a_link_in_the_archive_is_not_followed(
+    tmp_path: Path, opened: Callable[..., Keeper]
+) -> None:
+    keeper = opened(tmp_path / "data")
+    write_telemetry(tmp_path / "data" / "telemetry")
+    (tmp_path / "secret.parquet").write_text("secret")
+    day = tmp_path / "data" / "telemetry" / "2026-06-21"
+    day.mkdir()
+    (day / "1.parquet").symlink_to(tmp_path / "secret.parquet")
+    (tmp_path / "data" / "telemetry" / "2026-06-22").symlink_to(tmp_path)
+    backups.backup(keeper.database, tmp_path / "backup", NOW, tmp_path / "data" / "telemetry")
+    copied = [
+        p.read_bytes() for p in (tmp_path / "backup" / "telemetry").rglob("*.*") if p.is_file()
+    ]
+    assert copied
+    assert b"secret" not in copied
+
+
 def test_one_state_while_the_plant_writes(keeper: Keeper, tmp_path: Path) -> None:
     """Two records that belong together are both in a backup, or neither is."""
     stop = threading.Event()
@@ -343,6 +361,23 @@ class TestRefusals:
         path.write_text("[]" if wanted.startswith("this") else json.dumps(manifest))
         with pytest.raises(FormatError, match=wanted):
             backups.restore(made, tmp_path / "new", NOW)
+
+    @pytest.mark.parametrize("what", ["file", "folder", "store"])
+    def test_a_link_in_a_backup(self, made: Path, tmp_path: Path, what: str) -> None:
+        """Restored by root, it would carry any file of the machine into the plant's folder."""
+        other = tmp_path / "other"
+        other.mkdir()
+        (other / "secret.parquet").write_text("secret")
+        if what == "store":
+            (made / "store.sqlite").rename(other / "store.sqlite")
+            (made / "store.sqlite").symlink_to(other / "store.sqlite")
+        else:
+            (made / "telemetry").mkdir()
+            to = other if what == "folder" else other / "secret.parquet"
+            (made / "telemetry" / "2026-06-21").symlink_to(to)
+        with pytest.raises(FormatError, match="it is a link, which no backup has"):
+            backups.restore(made, tmp_path / "new", NOW, tmp_path / "archive")
+        assert not (tmp_path / "archive").exists()
 
     def test_no_backup_and_no_store(self, tmp_path: Path) -> None:
         with pytest.raises(FormatError, match="give the folder of a backup"):

@@ -168,6 +168,10 @@ def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
         if checksum(file) != sum_:
             raise FormatError(file, "its checksum differs; use another backup")
         size += file.stat().st_size
+    for link in place.rglob("*"):
+        if link.is_symlink():
+            # Its content is another place's: no checksum speaks for it.
+            raise FormatError(link, "it is a link, which no backup has; remove it")
     for file in _files(place):
         if str(file.relative_to(place)) not in {*checksums, MANIFEST, SIGNATURE}:
             raise FormatError(
@@ -448,6 +452,8 @@ def _copy_telemetry(source: Path, target: Path) -> None:
     target.mkdir(mode=0o700)
     for _ in range(2):
         for path in sorted(source.glob("????-??-??/*.*")):
+            if path.is_symlink() or path.parent.is_symlink():
+                continue  # the archive has none
             copy = target / path.parent.name / path.name
             if path.suffix in (".parquet", ".part") and not copy.exists():
                 copy.parent.mkdir(mode=0o700, exist_ok=True)
