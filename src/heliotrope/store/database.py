@@ -134,7 +134,7 @@ class Database:
             return
         path = self.file.with_name(self.file.name + ".lock")
         try:
-            self._lock = os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE)
+            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.close()
@@ -329,6 +329,7 @@ def tighten(folder: Path) -> None:
         return
     folder.chmod(_PRIVATE_FOLDER)
     made = [*folder.glob(f"{FILE}*"), *(folder / name for name in MADE)]
+    made = [path for path in made if not path.is_symlink()]
     inside = [path for top in made if top.is_dir() for path in top.rglob("*")]
     for path in [*made, *inside]:
         if path.is_symlink() or not path.exists() or path.is_socket():
