@@ -15,7 +15,7 @@ OPTIONS ?=
 BOARD ?= rp2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run notebook quick test soak mutants lint docs lock bench house firmware clean
+.PHONY: help setup run notebook quick test soak mutants lint docs lock audit bench house firmware clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort | expand -t 12
@@ -61,6 +61,11 @@ docs: $(STAMP)  ## build the documentation into site/
 lock:  ## fetch the hashes of the packages that constraints.txt pins
 	@$(BIN)/uv pip compile constraints.txt --generate-hashes --no-deps --universal --no-annotate --quiet \
 		--python-version 3.11.5 --custom-compile-command "make lock" --output-file requirements.lock
+
+audit: $(STAMP)  ## check pins, licences and known vulnerabilities; write the bill of materials into out/
+	@$(BIN)/python scripts/audit.py
+	@mkdir -p out && $(BIN)/python scripts/audit.py --sbom > out/heliotrope.cdx.json
+	@$(BIN)/python scripts/audit.py --vulnerabilities
 
 bench: $(STAMP)  ## run all benchmarks and keep their results in benchmarks/results/
 	@$(BIN)/python -m benchmarks all

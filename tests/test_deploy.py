@@ -358,7 +358,7 @@ def test_the_packages_are_pinned_and_have_a_licence() -> None:
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "known vulnerabilities were not looked up" in done.stdout
+    assert "--vulnerabilities looks up known ones" in done.stdout
 
 
 _LOCKED = re.compile(
@@ -429,6 +429,21 @@ def test_the_bill_of_materials_names_every_package() -> None:
         assert known.issuperset(one["dependsOn"])
     ours = next(one for one in bill["dependencies"] if "pkg:pypi/heliotrope@" in one["ref"])
     assert numpy["purl"] in ours["dependsOn"]
+
+
+def test_a_vulnerability_is_named_and_a_package_that_nobody_knows_is_no_good_news() -> None:
+    judge_report = runpy.run_path(str(ROOT / "scripts" / "audit.py"))["judge_report"]
+    good = {"name": "good", "version": "1", "vulns": []}
+    flaw = {"id": "PYSEC-1", "fix_versions": ["1.2"], "aliases": []}
+    bad = {"name": "bad", "version": "1.1", "vulns": [flaw, {**flaw, "fix_versions": []}]}
+    unknown = {"name": "unknown", "skip_reason": "Dependency not found on PyPI"}
+    assert judge_report({"dependencies": [good, bad]}) == (
+        ["bad 1.1: PYSEC-1, mended in 1.2", "bad 1.1: PYSEC-1, mended in no version yet"],
+        "2 of 2 packages looked up, 2 vulnerabilities",
+    )
+    lines, text = judge_report({"dependencies": [unknown, unknown]})
+    assert not lines
+    assert text.startswith("0 of 2 packages looked up, 0 vulnerabilities; 2 could not be looked up")
 
 
 def test_the_audit_can_fail() -> None:

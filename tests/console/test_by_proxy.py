@@ -3,8 +3,10 @@
 import re
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import httpx
 import pytest
@@ -14,7 +16,7 @@ from heliotrope.console import _secrets
 from heliotrope.console.by_proxy import ByProxy
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import FormatError, InputError
-from support.live_console import LiveConsole
+from support.live_console import PASSWORD, LiveConsole
 
 DEPLOY = Path(__file__).parents[2] / "docs" / "how-to" / "deploy.md"
 WORD = "0123456789abcdef" * 4
@@ -177,6 +179,38 @@ def test_other_addresses_are_not_believed(console: LiveConsole, behind: httpx.Cl
     assert "set-cookie" not in behind.get("login").headers
     console.call(lambda: setattr(here, "settings", settings))
     assert "set-cookie" in behind.get("login").headers
+
+
+@pytest.mark.parametrize("name", ["PLANT/ada", "a/password", "50 % ? # &", "a" * 100])
+def test_an_account_of_any_name_is_disabled_and_has_no_factor_to_remove(
+    console: LiveConsole, behind: httpx.Client, name: str
+) -> None:
+    here = console.server.app.state.console
+    console.call(lambda: setattr(here, "settings", replace(here.settings, second_factor="")))
+    assert behind.get("login", headers={"X-Heliotrope-Person": name}).status_code == 303
+    path = f"accounts/{quote(name, safe='')}"
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        who = client.post("session", json={"name": "engineer", "password": PASSWORD}).json()
+        client.headers["X-CSRF-Token"] = who["csrf"]
+        own = {"own_password": PASSWORD}
+        assert client.patch(path, json={"disabled": True, **own}).json()["name"] == name
+        reset = client.post(f"{path}/password", json=own)
+        assert (reset.status_code, "signs in by the proxy" in reset.text) == (409, True)
+        factor = client.request("DELETE", f"{path}/factor", json=own)
+        assert "set up your own second factor first" in factor.json()["detail"]
+    account = console.keeper.people.account(name)
+    assert account is not None
+    assert account.disabled
+
+
+@pytest.mark.parametrize("name", [".", "..", "a" * 101])
+def test_a_name_that_no_path_can_name_gets_no_account(
+    console: LiveConsole, behind: httpx.Client, name: str
+) -> None:
+    answer = behind.get("login", headers={"X-Heliotrope-Person": name})
+    assert answer.status_code == 422
+    assert "give a name of 1 to 100" in answer.json()["detail"]
+    assert console.keeper.people.account(name) is None
 
 
 def test_a_disabled_account_stays_out(console: LiveConsole, behind: httpx.Client) -> None:

@@ -2,12 +2,19 @@
 
 import asyncio
 import contextlib
+import os
 import time
 from collections.abc import Callable
 from typing import Any
 
 import httpx
+import pytest
+from starlette.requests import HTTPConnection
 
+from heliotrope.cli._noted import note_use
+from heliotrope.console.auth import Console
+from heliotrope.local import ORDINARY, CallError, ask_once, name_here
+from heliotrope.plant.operations.security import MOST, SecurityEvent
 from heliotrope.store.records import Event
 from support.live_console import PASSWORD, LiveConsole
 
@@ -64,6 +71,24 @@ def test_expiry_leaves_a_trace(console: LiveConsole) -> None:
     recorded(console, "operator: token expired: old report")
 
 
+def test_sign_ins_of_one_person_leave_out_nobody_else(console: LiveConsole) -> None:
+    """The console sends the plant the sum of those that it leaves out."""
+    inside: Console = console.server.app.state.console
+    scope = {"type": "http", "headers": [], "client": ("10.0.0.9", 1)}
+
+    async def flood() -> None:
+        for _ in range(MOST + 3):
+            await inside.note(SecurityEvent.SIGNED_OUT, HTTPConnection(scope), "viewer")
+        await inside.note(SecurityEvent.SIGNED_OUT, HTTPConnection(scope), "engineer")
+        for kind, who, more in inside.counter.sums(time.monotonic(), all_=True):
+            await inside.plant.note(kind, who, more=more)
+
+    console.console_wait(flood())
+    recorded(console, "engineer: signed out (from 10.0.0.9)")
+    console.call(console.live.operations.security.close)
+    recorded(console, "viewer: signed out: 3 more in a minute")
+
+
 CHANGES: tuple[tuple[str, str, dict[str, Any], str], ...] = (
     (
         "POST",
@@ -88,6 +113,15 @@ def test_changes_of_accounts_leave_a_trace(console: LiveConsole, person: Ask) ->
     wrong = {"own_password": "not it"}
     assert person("engineer", "POST", "accounts/desk-8/password", wrong).status_code == 403
     recorded(console, "engineer: gave a wrong password for a change of accounts")
+
+
+def test_a_running_plant_records_what_people_do_with_its_records(console: LiveConsole) -> None:
+    note_use(str(console.interface.folder.parent), "BACKED_UP", "/var/backups/today")
+    me = name_here(os.geteuid())
+    assert recorded(console, f"{me}: made a backup: /var/backups/today").severity == "info"
+    folder, order = console.interface.folder, {"kind": "SIGNED_IN", "detail": "somebody else"}
+    with pytest.raises(CallError, match="kind"):
+        ask_once(folder / ORDINARY, {"user": True}, "note_use", order)
 
 
 def test_strangers_leave_a_trace(console: LiveConsole, signed_in: httpx.Client) -> None:

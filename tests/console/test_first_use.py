@@ -116,12 +116,12 @@ def test_ctl_says_so_and_changes_it(console: LiveConsole, newcomer: httpx.Client
     del newcomer
     run, at = CliRunner().invoke, ("ctl", "--url", console.address)
     token = (*at, "token", "job", "--name", "new")
-    refused = run(app, [*token, "--password", GIVEN])
+    refused = run(app, token, input=f"{GIVEN}\n")
     assert refused.exit_code != 0
     assert TEXT in str(refused.exception or refused.output)
     done = run(app, [*at, "password", "--name", "new"], input=f"{GIVEN}\n{OWN}\n{OWN}\n")
     assert done.exit_code == 0, done.output
-    assert run(app, [*token, "--password", OWN]).exit_code == 0
+    assert run(app, token, input=f"{OWN}\n").exit_code == 0
 
 
 def test_the_first_account_is_due(tmp_path: Path) -> None:

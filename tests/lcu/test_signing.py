@@ -230,6 +230,30 @@ def test_a_board_that_was_off_takes_no_recording() -> None:
     assert bench.controller.sun.fresh()
 
 
+def test_a_recording_from_before_a_rotation_is_worthless_after_a_reboot_too() -> None:
+    """Neither with the old key, while it still counts, nor when only the new one does."""
+    bench = keyed()
+    heard: list[bytes] = []
+    deliver = bench.deliver
+    bench.deliver = lambda data: (heard.append(data), deliver(data))[1]  # type: ignore[method-assign, func-returns-value]
+    bench.run(2.5)
+    assert bench.order("AIM", 0.0, 0.0, 50.0) == messages.DONE
+    del bench.deliver
+    recorded = list(heard)
+    assert set_key(bench, NEW_KEY) == messages.DONE
+    for rekeyed in (False, True):
+        if rekeyed:
+            bench.sender.sign = signer(NEW_KEY)
+            bench.run(1.5)
+            assert set_key(bench, NEW_KEY) == messages.DONE  # the old one ends
+        bench.start(bench.flash)
+        for data in recorded:
+            bench.deliver(data)
+        assert bench.controller.clock.second is None
+        assert not bench.controller.sun.fresh()
+        assert bench.controller.flags() & WANTED
+
+
 def test_numbers_drawn_never_come_twice_and_are_the_keys() -> None:
     drawn = set()
     for boots in (1, 2):

@@ -80,6 +80,16 @@ def test_other_content_is_refused_and_never_shown(text: str, problem: str, tmp_p
     assert "aabbcc" not in str(caught.value)
 
 
+def test_two_commands_at_once_lose_no_key(tmp_path: Path) -> None:
+    file = tmp_path / "bus.toml"
+    BusKeyFile(file).new()
+    one, two = BusKeyFile(file), BusKeyFile(file)
+    one.rotate()
+    with pytest.raises(InputError, match="another command has changed it meanwhile"):
+        two.rotate()
+    assert BusKeyFile(file).keys == one.keys
+
+
 def test_a_file_that_others_may_read_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "C1.bus.toml"
     BusKeyFile(file).new()

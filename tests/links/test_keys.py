@@ -1,9 +1,11 @@
 """Keys of links: made by a command, and replaced while the links run."""
 
 import asyncio
+import contextlib
 import os
 import stat
 import subprocess
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -100,6 +102,44 @@ def test_a_rotation_keeps_passwords_and_the_keys_of_others(tmp_path: Path) -> No
     assert Keys(path, HELIOSTATS).plant == (OLD,)
     with pytest.raises(InputError, match="it is a cluster's key file; make keys in the plant's"):
         KeyFile(path).new(["K1"])
+
+
+def test_two_commands_at_once_lose_no_key(tmp_path: Path) -> None:
+    """The second one would write the file without the key that the first has made."""
+    file = tmp_path / "keys.toml"
+    KeyFile(file).new(["C1", "C2"])
+    one, two = KeyFile(file), KeyFile(file)
+    one.rotate(["C1"])
+    with pytest.raises(InputError, match="another command has changed it meanwhile"):
+        two.rotate(["C2"])
+    assert [len(KeyFile(file).links[name]) for name in ("C1", "C2")] == [2, 1]
+    one.end(["C1"])  # it knows what it has written itself
+    two = KeyFile(file)
+    two.rotate(["C2"])
+    assert len(KeyFile(file).links["C2"]) == 2
+
+
+def test_of_many_commands_at_once_each_is_done_or_refused(tmp_path: Path) -> None:
+    file, names = tmp_path / "keys.toml", [f"C{i}" for i in range(8)]
+    KeyFile(file).new(names)
+    ready = [(name, KeyFile(file)) for name in names for _ in range(2)]
+    begin = threading.Barrier(len(ready))
+    done: list[str] = []
+
+    def rotate(name: str, keys: KeyFile) -> None:
+        begin.wait()
+        with contextlib.suppress(InputError):
+            keys.rotate([name])
+            done.append(name)
+
+    works = [threading.Thread(target=rotate, args=each) for each in ready]
+    for work in works:
+        work.start()
+    for work in works:
+        work.join()
+    links = KeyFile(file).links
+    assert done
+    assert {name for name in names if len(links[name]) == 2} == set(done)
 
 
 def test_a_third_key_is_refused_and_so_is_an_end_without_a_new_one(tmp_path: Path) -> None:

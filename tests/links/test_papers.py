@@ -60,6 +60,19 @@ def test_an_alarm_comes_each_day_of_the_last_thirty(tmp_path: Path) -> None:
     assert papers.lines()[0].endswith("in 258 days")
 
 
+def test_what_was_renewed_is_named_once(tmp_path: Path) -> None:
+    file, papers = tmp_path / "keys", Papers(Days(0.0))
+    papers.renew("key file", [file], lambda: None)
+    file.write_text("old")
+    papers.look()
+    assert papers.renewed() == []  # it is read at the start
+    file.write_text("a new one")
+    papers.look()
+    assert papers.renewed() == ["key file"]
+    papers.look()
+    assert papers.renewed() == []
+
+
 def test_alarms_come_while_a_block_runs_and_an_error_of_it_goes_on_as_it_came(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -68,11 +81,15 @@ def test_alarms_come_while_a_block_runs_and_an_error_of_it_goes_on_as_it_came(
     papers.watch_end(tmp_path / "x.pem")
 
     async def main() -> None:
-        async with papers.watched(heard.put_nowait):
+        renewed = asyncio.Queue[str]()
+        papers.renew("key file", [tmp_path / "keys"], lambda: None)
+        async with papers.watched(heard.put_nowait, renewed.put_nowait):
             async with asyncio.timeout(60.0):
                 assert (await heard.get()).active
                 certificate(tmp_path, 100.0)[0].rename(tmp_path / "x.pem")
                 assert not (await heard.get()).active
+                (tmp_path / "keys").touch()
+                assert await renewed.get() == "key file"
             raise KeyError("of the block")
 
     with pytest.raises(KeyError, match="of the block"):

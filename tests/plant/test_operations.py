@@ -6,7 +6,7 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -662,7 +662,7 @@ def test_a_restored_store_leaves_the_field_in_stow_until_an_engineer_confirms(
 
     live(take_out, settings_, records=keeper)
     keeper.close()
-    restore(tmp_path / "backup", tmp_path / "restored")
+    restore(tmp_path / "backup", tmp_path / "restored", datetime.now(UTC))
     again = Keeper(tmp_path / "restored", inline=True)
     for work in (stay, confirm):
         live(work, settings_, records=again)

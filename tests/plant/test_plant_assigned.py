@@ -1,5 +1,6 @@
 """Assigned aims and standby points: kept before they are sent, known after a restart."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -289,7 +290,7 @@ def test_after_a_restore_no_mirror_goes_to_a_standby_point_that_it_may_not_have(
 
     run_virtual(before)
     keeper.close()
-    restore(tmp_path / "backup", tmp_path / "restored")
+    restore(tmp_path / "backup", tmp_path / "restored", datetime.now(UTC))
     again = Keeper(tmp_path / "restored")
     run_virtual(after)
     again.close()

@@ -7,7 +7,15 @@ import pytest
 
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.operations import Logbook, SecurityEvent, SecurityLog, SecurityNote
-from heliotrope.plant.operations.security import MOST, ORDERS, ORDERS_SPAN, QUIET, SPAN, plain
+from heliotrope.plant.operations.security import (
+    MOST,
+    MOST_OF_ALL,
+    ORDERS,
+    ORDERS_SPAN,
+    QUIET,
+    SPAN,
+    plain,
+)
 
 
 def within(work: Callable[[Logbook, SecurityLog], object]) -> Logbook:
@@ -34,10 +42,67 @@ def test_a_flood_is_counted() -> None:
         log.note(SecurityEvent.SIGNED_IN, "anna", "10.0.0.3")
         assert len(texts(book)) == MOST + 1
         await asyncio.sleep(SPAN + 1.0)
+        log.look()
 
     book = within(flood)
-    assert texts(book)[0] == f"failed to sign in: at least {10_000 - MOST} more in a minute"
+    assert texts(book)[0] == f"failed to sign in: {10_000 - MOST} more in a minute"
     assert "signed in (from 10.0.0.3)" in texts(book)
+
+
+def test_a_flood_of_one_person_leaves_out_nobody_else() -> None:
+    def flood(book: Logbook, log: SecurityLog) -> None:
+        del book
+        for _ in range(MOST + 10):
+            log.note(SecurityEvent.SIGNED_IN, "ben", "10.0.0.9")
+        log.note(SecurityEvent.SIGNED_IN, "anna", "10.0.0.3")
+
+    rows = within(flood).events(1000)
+    assert [row.text for row in rows if row.who == "anna"] == ["signed in (from 10.0.0.3)"]
+    assert len([row for row in rows if row.who == "ben"]) == MOST
+
+
+def test_a_flood_of_many_persons_is_counted_for_each() -> None:
+    """The store must not fill, and yet each person is named."""
+
+    async def flood(book: Logbook, log: SecurityLog) -> None:
+        del book
+        for k in range(MOST_OF_ALL + 50):
+            log.note(SecurityEvent.SIGNED_IN, f"person {k // 10}", "10.0.0.9")
+        await asyncio.sleep(SPAN + 1.0)
+        log.look()
+
+    rows = [row for row in within(flood).events(1000) if row.kind == "security"]
+    assert len(rows) == MOST_OF_ALL + 5
+    assert {(row.who, row.text) for row in rows[:5]} == {
+        (f"person {k}", "signed in: 10 more in a minute") for k in range(30, 35)
+    }
+
+
+def test_what_was_counted_is_recorded_at_the_end() -> None:
+    def flood(book: Logbook, log: SecurityLog) -> None:
+        del book
+        for _ in range(MOST + 2):
+            log.note(SecurityEvent.SIGNED_IN, "ben", "10.0.0.9")
+        log.note(SecurityEvent.SIGNED_IN, "ben", more=40)
+        log.close()
+
+    assert texts(within(flood))[0] == "signed in: 42 more in a minute"
+
+
+def test_a_flood_goes_on_for_minutes() -> None:
+    """A span that follows another has the sum of both."""
+
+    async def flood(book: Logbook, log: SecurityLog) -> None:
+        del book
+        for _ in range(2):
+            for _ in range(MOST + 5):
+                log.note(SecurityEvent.TOKEN_REFUSED, "", "10.0.0.9")
+            await asyncio.sleep(SPAN + 1.0)
+        log.look()
+
+    found = texts(within(flood))
+    assert found[0] == "a token was refused: 10 more in a minute"
+    assert len(found) == 2 * MOST + 1
 
 
 def test_alarms_end_when_it_is_quiet() -> None:

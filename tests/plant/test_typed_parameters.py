@@ -13,14 +13,15 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import example_plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.links.messages import Parameters
+from heliotrope.links.messages import Ask, Parameters
 from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.plant.operations.typed_parameters import TypedParameters
 from heliotrope.plant.orders.audit import read
-from heliotrope.plant.orders.authority import RefusedError
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME = "P1A"
+VIEWER = Person("guest", Role.VIEWER)
 Scene = Callable[[Bench, int, TypedParameters], Awaitable[None]]
 
 
@@ -81,7 +82,7 @@ def test_what_is_set_is_stored_believed_and_kept_with_its_reason(tmp_path: Path)
             "levelled on 3 March",
         )
         assert record.provenance is Provenance.PERSON
-        view = await typed.view(NAME)
+        view = await typed.view(NAME, ENGINEER)
         assert (view.version, view.stored) == (1, "the same")
         (tilt,) = (one for one in view.parameters if one.name == "tilt_east")
         assert (tilt.file, tilt.value) == (0.0, 0.004)
@@ -93,13 +94,38 @@ def test_what_is_set_is_stored_believed_and_kept_with_its_reason(tmp_path: Path)
     assert kept.told == [f"PARAMETERS {NAME}: tilt_east 0.004 (levelled on 3 March)"]
 
 
+def test_a_viewer_asks_nothing_of_the_bus_and_an_operator_little(tmp_path: Path) -> None:
+    async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
+        del token
+        cluster = bench.cluster_of(NAME)
+
+        def questions() -> int:
+            return len([ask for ask in cluster.of(Ask) if ask.what == "stored"])
+
+        before = questions()
+        for _ in range(100):
+            assert (await typed.view(NAME, VIEWER)).stored == "the same"
+        assert questions() == before
+        for _ in range(100):
+            stored = (await typed.view(NAME, OPERATOR)).stored
+        assert questions() - before <= 20
+        assert stored == "the same (at the last comparison; it can be asked again in 5 s)"
+        await bench.wait(60.0)
+        item = next(iter(items_of(example_plant()[NAME].calibrated)))
+        cluster.stored[NAME][item] = bytes(len(cluster.stored[NAME][item]))
+        assert (await typed.view(NAME, OPERATOR)).stored.startswith("others: ")
+        assert "differ" in (await typed.view(NAME, VIEWER)).stored
+
+    play(tmp_path, scene)
+
+
 def test_an_earlier_version_is_listed_and_brought_back(tmp_path: Path) -> None:
     async def scene(bench: Bench, token: int, typed: TypedParameters) -> None:
         for value, why in ((0.004, "first"), (0.001, "second")):
             ticket = typed.change(ENGINEER, token, NAME, {"tilt_east": value}, why)
             assert await ticket.end(20.0), ticket.text
             bench.plant.authority.keep(ENGINEER, token)
-        (earlier,) = (await typed.view(NAME)).earlier
+        (earlier,) = (await typed.view(NAME, ENGINEER)).earlier
         assert (earlier.version, earlier.note, earlier.values["tilt_east"]) == (1, "first", 0.004)
         ticket = await typed.restore(ENGINEER, token, NAME, 1, "the level was wrong")
         assert await ticket.end(20.0), ticket.text

@@ -1,5 +1,6 @@
 """Backup, restore and migration, of SQLite and PostgreSQL, and from one to the other."""
 
+import hashlib
 import json
 import sqlite3
 import threading
@@ -18,7 +19,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import FormatError
 from heliotrope.safety import Alarm, Severity
 from heliotrope.store import backup as backups
-from heliotrope.store import tables
+from heliotrope.store import chain, tables
 from heliotrope.store.audit import begin, change_points, points
 from heliotrope.store.database import HEAD, Database
 from heliotrope.store.factors import KEY_FILE
@@ -124,7 +125,7 @@ def test_everything_comes_back_wherever_it_goes(
     write_telemetry(tmp_path / "live")
     made = backups.backup(keeper.database, tmp_path / "backup", NOW, tmp_path / "live")
     assert made.made == "2026-06-21T12:00:00+00:00"
-    found = backups.restore(tmp_path / "backup", other, tmp_path / "archive")
+    found = backups.restore(tmp_path / "backup", other, NOW, tmp_path / "archive")
     assert (found.revision, found.size) == (HEAD, made.size)
     # The secrets of second factors cannot be had from a backup.
     key = (tmp_path / KEY_FILE).read_bytes().strip()
@@ -136,6 +137,17 @@ def test_everything_comes_back_wherever_it_goes(
     before, after = content(keeper.database), content(restored)
     for changed in ("hold", "assigned_point"):
         assert set(before.pop(changed)) < set(after.pop(changed))
+    for changed in ("event", "event_link", "account_link"):
+        assert after.pop(changed)[:-1] == before.pop(changed)
+    # Nobody is signed in there.
+    for changed in ("session", "api_token"):
+        assert before.pop(changed)
+        assert not after.pop(changed)
+    (name, *_, used), (same, *_, later) = (
+        *before.pop("second_factor"),
+        *after.pop("second_factor"),
+    )
+    assert (name, used < later) == (same, True)
     assert after == before
     restored.close()
     assert query(tmp_path / "archive", "SELECT * FROM telemetry").num_rows == 3
@@ -151,7 +163,7 @@ def test_a_backup_knows_that_it_is_one(
     fill(keeper, seen, tmp_path / KEY_FILE)
     backups.backup(keeper.database, tmp_path / "backup", NOW)
     assert [hold.kind for hold in keeper.holds()] == ["heliostat"]
-    backups.restore(tmp_path / "backup", other)
+    backups.restore(tmp_path / "backup", other, NOW)
     again = Keeper(other)
     own, lock = sorted(again.holds(), key=lambda hold: hold.kind)
     assert own.who == "anna"
@@ -163,12 +175,107 @@ def test_a_backup_knows_that_it_is_one(
     later = NOW.replace(hour=13)
     backups.backup(again.database, tmp_path / "second", later)
     again.close()
-    backups.restore(tmp_path / "second", tmp_path / "third")
+    backups.restore(tmp_path / "second", tmp_path / "third", NOW)
     third = Keeper(tmp_path / "third")
     assert [hold.since for hold in third.holds() if hold.who == backups.OWNER] == [
         later.timestamp()
     ]
     third.close()
+
+
+def test_a_restore_lets_nobody_in_and_is_recorded(
+    keeper: Keeper, other: str | Path, tmp_path: Path
+) -> None:
+    people, at = keeper.people, NOW.timestamp()
+    people.add("anna", "hash", "engineer", at)
+    people.add("ben", "hash", "operator", at)
+    token = people.add_token("anna", "report", "viewer", at)[1]
+    session = people.open_session("ben", at, 36_000.0)
+    factors = people.factors(tmp_path / KEY_FILE)
+    secret = TOTP(factors.begin("anna", at - 600.0))
+    factors.confirm("anna", secret.at(int(at) - 600), at - 600.0)
+    backups.backup(keeper.database, tmp_path / "backup", NOW)
+    with Database(tmp_path / "backup" / "store.sqlite") as copied, copied.reading() as connection:
+        assert not connection.execute(select(tables.session)).all()
+        assert not connection.execute(select(tables.api_token)).all()
+    # After the backup the account is disabled, and a code used.
+    people.change("ben", at + 10.0, disabled=True)
+    hour = NOW.replace(hour=13)
+    code = secret.at(int(hour.timestamp()))
+    assert factors.check("anna", code, hour.timestamp()) is not None
+    backups.restore(tmp_path / "backup", other, hour, who="carl on this machine")
+    again = Keeper(other)
+    assert again.people.token(token, at + 20.0) is None
+    assert again.people.session(session, at + 20.0) is None
+    later = again.people.factors(tmp_path / KEY_FILE)
+    for seconds in (0.0, 30.0):
+        assert later.check("anna", code, hour.timestamp() + seconds) is None
+    new = hour.timestamp() + 90.0
+    assert later.check("anna", secret.at(int(new)), new) is not None
+    (event,) = [event for event in again.events() if event.source == "security"]
+    assert event.severity == "warning"
+    assert event.text == (
+        "carl on this machine: restored the backup of 2026-06-21T12:00:00+00:00: all sessions and "
+        "tokens ended, accounts and roles are as they were then; enabled: anna, ben"
+    )
+    with again.database.reading() as connection:
+        chain.verify(connection)
+    again.close()
+
+
+def test_a_backup_of_an_earlier_program_is_migrated(tmp_path: Path) -> None:
+    keeper = Keeper(tmp_path / "data", inline=True)
+    keeper.people.add("anna", "hash", "engineer", 1.0)
+    token = keeper.people.add_token("anna", "report", "viewer", 1.0)[1]
+    backups.backup(keeper.database, tmp_path / "backup", NOW)
+    keeper.close()
+    file = tmp_path / "backup" / "store.sqlite"
+    with closing(sqlite3.connect(file)) as raw:
+        raw.execute("DROP TABLE account_link")
+        raw.execute("UPDATE alembic_version SET version_num = '0011'")
+        row = (
+            hashlib.sha256(token.encode()).hexdigest(),
+            "anna",
+            "report",
+            "viewer",
+            1.0,
+            None,
+            None,
+        )
+        raw.execute("INSERT INTO api_token VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        raw.commit()
+    manifest = json.loads((tmp_path / "backup" / "manifest.json").read_text())
+    manifest |= {"revision": "0011", "files": {"store.sqlite": backups.checksum(file)}}
+    (tmp_path / "backup" / "manifest.json").write_text(json.dumps(manifest))
+    backups.restore(tmp_path / "backup", tmp_path / "new", NOW)
+    again = Keeper(tmp_path / "new", inline=True)
+    assert again.people.token(token, 2.0) is None
+    with again.database.reading() as connection:
+        chain.verify(connection)
+    again.close()
+    manifest["revision"] = "9999"
+    (tmp_path / "backup" / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(StoreError, match=f"revision 9999, this program knows {HEAD}; update"):
+        backups.restore(tmp_path / "backup", tmp_path / "third", NOW)
+    assert not (tmp_path / "third").exists()
+
+
+def test_a_link_in_the_archive_is_not_followed(
+    tmp_path: Path, opened: Callable[..., Keeper]
+) -> None:
+    keeper = opened(tmp_path / "data")
+    write_telemetry(tmp_path / "data" / "telemetry")
+    (tmp_path / "secret.parquet").write_text("secret")
+    day = tmp_path / "data" / "telemetry" / "2026-06-21"
+    day.mkdir()
+    (day / "1.parquet").symlink_to(tmp_path / "secret.parquet")
+    (tmp_path / "data" / "telemetry" / "2026-06-22").symlink_to(tmp_path)
+    backups.backup(keeper.database, tmp_path / "backup", NOW, tmp_path / "data" / "telemetry")
+    copied = [
+        p.read_bytes() for p in (tmp_path / "backup" / "telemetry").rglob("*.*") if p.is_file()
+    ]
+    assert copied
+    assert b"secret" not in copied
 
 
 def test_one_state_while_the_plant_writes(keeper: Keeper, tmp_path: Path) -> None:
@@ -218,20 +325,20 @@ class TestRefusals:
     def test_nothing_is_overwritten(self, made: Path, tmp_path: Path) -> None:
         with pytest.raises(StoreError, match=r"backup .*: it exists"):
             backups.backup(Database(tmp_path / "data"), made, NOW)
-        backups.restore(made, tmp_path / "new")
+        backups.restore(made, tmp_path / "new", NOW)
         with pytest.raises(StoreError, match="it exists already"):
-            backups.restore(made, tmp_path / "new")
+            backups.restore(made, tmp_path / "new", NOW)
 
     def test_not_under_a_plant_that_runs(self, made: Path, tmp_path: Path) -> None:
         with pytest.raises(StoreError, match="another process writes to it"):
-            backups.restore(made, tmp_path / "data")
+            backups.restore(made, tmp_path / "data", NOW)
 
     def test_a_damaged_backup(self, made: Path, tmp_path: Path) -> None:
         data = bytearray((made / "store.sqlite").read_bytes())
         data[len(data) // 2] ^= 1
         (made / "store.sqlite").write_bytes(data)
         with pytest.raises(FormatError, match=r"store\.sqlite: its checksum differs"):
-            backups.restore(made, tmp_path / "new")
+            backups.restore(made, tmp_path / "new", NOW)
         assert not (tmp_path / "new").exists()
 
     @pytest.mark.parametrize(
@@ -252,11 +359,28 @@ class TestRefusals:
         change(manifest)
         path.write_text("[]" if wanted.startswith("this") else json.dumps(manifest))
         with pytest.raises(FormatError, match=wanted):
-            backups.restore(made, tmp_path / "new")
+            backups.restore(made, tmp_path / "new", NOW)
+
+    @pytest.mark.parametrize("what", ["file", "folder", "store"])
+    def test_a_link_in_a_backup(self, made: Path, tmp_path: Path, what: str) -> None:
+        """Restored by root, it would carry any file of the machine into the plant's folder."""
+        other = tmp_path / "other"
+        other.mkdir()
+        (other / "secret.parquet").write_text("secret")
+        if what == "store":
+            (made / "store.sqlite").rename(other / "store.sqlite")
+            (made / "store.sqlite").symlink_to(other / "store.sqlite")
+        else:
+            (made / "telemetry").mkdir()
+            to = other if what == "folder" else other / "secret.parquet"
+            (made / "telemetry" / "2026-06-21").symlink_to(to)
+        with pytest.raises(FormatError, match="it is a link, which no backup has"):
+            backups.restore(made, tmp_path / "new", NOW, tmp_path / "archive")
+        assert not (tmp_path / "archive").exists()
 
     def test_no_backup_and_no_store(self, tmp_path: Path) -> None:
         with pytest.raises(FormatError, match="give the folder of a backup"):
-            backups.restore(tmp_path, tmp_path / "new")
+            backups.restore(tmp_path, tmp_path / "new", NOW)
         with pytest.raises(StoreError, match="no store here"):
             backups.backup(Database(tmp_path / "none"), tmp_path / "backup", NOW)
         assert not (tmp_path / "none").exists()
@@ -279,7 +403,7 @@ def test_hashes_are_not_for_everybody(
     keeper = opened(tmp_path / "data")
     fill(keeper, seen, tmp_path / KEY_FILE)
     backups.backup(keeper.database, tmp_path / "backup", NOW)
-    backups.restore(tmp_path / "backup", tmp_path / "new")
+    backups.restore(tmp_path / "backup", tmp_path / "new", NOW)
     files = [p for p in tmp_path.rglob("store.sqlite*") if p.is_file()]
     assert len(files) >= 5  # with the log of the open one, and locks
     assert [p for p in files if p.stat().st_mode & 0o007] == []

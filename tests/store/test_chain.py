@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from pyotp import TOTP
 from sqlalchemy import text
 from tests.store import old_store
 from typer.testing import CliRunner
@@ -22,7 +23,7 @@ ENTRY = AuditEntry("a0", "anna", "engineer", "TRACK", "t0", (1.5,), ("H1", "H2")
 
 
 def fill(keeper: Keeper) -> None:
-    """Record five events, one with figures, and three records of the audit, the last open."""
+    """Record five events, three commands, of which the last is open, two accounts and a token."""
     for i in range(5):
         values = {"wind": 3.0, "unknown": float("nan")} if i == 2 else {}
         keeper.record_event(Event(100.0 + i, "test", f"event {i}", Severity.WARNING, "H1", values))
@@ -30,9 +31,13 @@ def fill(keeper: Keeper) -> None:
         keeper.do(lambda c, i=i: audit.begin(c, replace(ENTRY, identity=f"a{i}", at=f"t{i}")))
     keeper.do(lambda c: audit.finish(c, "a0", "done", "t5"))
     keeper.do(lambda c: audit.finish(c, "a1", "done", "t6"))
+    people = keeper.people
+    people.add("mara", "hash", "engineer", 1.0)
+    people.add("ben", "hash", "viewer", 2.0, due=True)
+    people.add_token("ben", "report", "viewer", 3.0)
 
 
-def verified(keeper: Keeper, *heads: chain.Head) -> tuple[chain.Head, chain.Head]:
+def verified(keeper: Keeper, *heads: chain.Head) -> tuple[chain.Head, ...]:
     """Check a keeper's chains."""
     with keeper.database.reading() as connection:
         return chain.verify(connection, heads).heads
@@ -42,13 +47,14 @@ def test_what_nobody_touched_fits(
     keeper: Keeper, place: str | Path, opened: Callable[..., Keeper]
 ) -> None:
     fill(keeper)
-    events, records = verified(keeper)
-    assert (events.number, records.number) == (5, 5)
+    heads = verified(keeper)
+    assert [head.number for head in heads] == [5, 5, 3]
     keeper.close()
     again = opened(place)
     again.record_event(Event(200.0, "test", "after a restart"))
     again.do(lambda c: audit.finish_open(c, "stopped", "t9"))
-    assert [head.number for head in verified(again, events, records)] == [6, 6]
+    again.people.change("ben", 4.0, password_hash="new")  # ends the token too
+    assert [head.number for head in verified(again, *heads)] == [6, 6, 5]
 
 
 @pytest.mark.parametrize(
@@ -63,6 +69,19 @@ def test_what_nobody_touched_fits(
         ("DELETE FROM audit WHERE identity = 'a2'", "audit record a2 was removed"),
         ("UPDATE audit SET result = 'good' WHERE identity = 'a2'", "a2 .* is not linked"),
         ("DELETE FROM audit_link WHERE number = 2", "a2 .* does not fit"),
+        (
+            "INSERT INTO account VALUES ('eve', 'engineer', 'hash', FALSE, 1.0, 1.0)",
+            "account eve .engineer. was added, and not by the program",
+        ),
+        ("UPDATE account SET role = 'engineer' WHERE name = 'ben'", "account ben .* was altered"),
+        ("UPDATE account SET password_hash = 'x' WHERE name = 'mara'", "account mara .* altered"),
+        ("DELETE FROM password_due", "account ben .viewer. was altered"),
+        ("INSERT INTO recovery_code VALUES ('0', 'mara')", "account mara .engineer. was altered"),
+        ("UPDATE api_token SET role = 'engineer'", "token report of ben was altered"),
+        ("UPDATE api_token SET expires = 1e12", "token report of ben was altered"),
+        ("DELETE FROM api_token", "token report of ben was removed"),
+        ("UPDATE account_link SET state = before WHERE number = 2", "link 2 of the accounts"),
+        ("DELETE FROM account_link WHERE number = 1", "link 2 of the accounts .account ben"),
     ],
 )
 def test_the_first_record_that_does_not_fit_is_named(keeper: Keeper, sql: str, named: str) -> None:
@@ -91,6 +110,26 @@ def test_a_chain_that_was_made_anew_has_another_head(tmp_path: Path) -> None:
     again.close()
 
 
+def test_a_change_by_the_program_does_not_hide_one_by_hand(keeper: Keeper) -> None:
+    fill(keeper)
+    keeper.do(lambda c: c.execute(text("UPDATE account SET role = 'engineer' WHERE name = 'ben'")))
+    keeper.people.change("ben", 5.0, disabled=True)
+    with pytest.raises(StoreError, match=r"account ben .* altered before its change in link 4"):
+        verified(keeper)
+
+
+def test_second_factors_are_linked(keeper: Keeper, tmp_path: Path) -> None:
+    fill(keeper)
+    factors = keeper.people.factors(tmp_path / "key")
+    codes = factors.confirm("mara", TOTP(factors.begin("mara", 1e9)).at(10**9), 1e9)
+    assert factors.check("mara", codes[0], 1e9 + 100.0) is not None
+    assert [head.number for head in verified(keeper)] == [5, 5, 6]
+    keeper.do(lambda c: c.execute(text("UPDATE second_factor SET word = 'theirs'")))
+    with pytest.raises(StoreError, match=r"account mara .* was altered"):
+        verified(keeper)
+    factors.remove("mara")
+
+
 def test_old_events_leave_and_the_rest_fits(keeper: Keeper) -> None:
     fill(keeper)
     early = verified(keeper)
@@ -108,8 +147,8 @@ def test_old_events_leave_and_the_rest_fits(keeper: Keeper) -> None:
     verified(keeper, *later)
     with keeper.database.reading() as connection:
         found = chain.verify(connection, [*early, *later])
-    # The audit's heads are the same, and never leave.
-    assert (found.fitting, found.old) == ((early[1], *later), early[:1])
+    # The heads of audit and accounts are the same, and never leave.
+    assert (found.fitting, found.old) == ((*early[1:], *later), early[:1])
     assert found.since == 2000.0
 
 
@@ -150,6 +189,7 @@ def test_an_old_store_is_linked_when_it_is_migrated(tmp_path: Path) -> None:
     for sql in (
         "DROP TABLE event_link",
         "DROP TABLE audit_link",
+        "DROP TABLE account_link",
         *(f"DROP TABLE {name}" for name in reversed(old_store.LATER)),
         "DROP INDEX uq_hold_standing",
         "ALTER TABLE hold DROP COLUMN kind",
@@ -164,6 +204,7 @@ def test_an_old_store_is_linked_when_it_is_migrated(tmp_path: Path) -> None:
     again = Keeper(tmp_path, inline=True)
     found = verified(again)
     assert found[0] == wanted[0]
+    assert found[2].number == 5  # accounts and tokens, as they are
     again.record_event(Event(1.0, "test", "after the migration"))
     verified(again, *found)
     again.close()
@@ -196,17 +237,17 @@ def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
     keeper.record_event(Event(300.0, "test", "later"))
     chain.write_heads(out, verified(keeper), at)
     assert file.stat().st_mode & 0o777 == 0o600
-    # Three different heads: that of the audit has not changed. Syslog's lines hold them too.
-    assert len(chain.read_heads(file)) == 3
+    # Four different heads: only that of the events has changed. Syslog's lines hold them too.
+    assert len(chain.read_heads(file)) == 4
     keeper.close()
     command = ["store", "verify", str(tmp_path / "data"), "--head", str(file)]
     said = CliRunner().invoke(app, command)
     assert said.exit_code == 0, said.exception
-    assert "3 of 3 heads fit; events are kept since 1970-01-01T00:01:40Z\n" in said.output
+    assert "4 of 4 heads fit; events are kept since 1970-01-01T00:01:40Z\n" in said.output
     again = Keeper(tmp_path / "data", inline=True)
     again.forget_events(104.0)
     again.close()
-    assert "3 of 3 heads fit" in CliRunner().invoke(app, command).output
+    assert "4 of 4 heads fit" in CliRunner().invoke(app, command).output
     shutil.copytree(tmp_path / "data", tmp_path / "later")
     again = Keeper(tmp_path / "later", inline=True)
     again.record_event(Event(400.0, "test", "later still"))
@@ -214,7 +255,7 @@ def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
     again.close()
     later = [str(each).replace("/data", "/later") for each in command]
     told = CliRunner().invoke(app, later).output
-    assert "2 of 3 heads fit; events are kept since 1970-01-01T00:06:40Z, those of earlier" in told
+    assert "3 of 4 heads fit; events are kept since 1970-01-01T00:06:40Z, those of earlier" in told
     old = " ".join(str(head) for head in chain.read_heads(file)[:1])
     failed = CliRunner().invoke(app, [*later[:-1], old])
     assert failed.exit_code == 1

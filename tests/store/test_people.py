@@ -73,6 +73,7 @@ class TestAccounts:
             (" ", HASH, "viewer", "give a name of 1 to 100 printable"),
             ("x" * 101, HASH, "viewer", "give a name of 1 to 100 printable"),
             ("a\nb", HASH, "viewer", "give a name of 1 to 100 printable"),
+            ("..", HASH, "viewer", "not of dots alone"),
             ("carl", "", "viewer", "a password hash is needed"),
             ("carl", HASH, "boss", "no role 'boss'; known: viewer, operator, engineer"),
         ],

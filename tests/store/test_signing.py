@@ -61,7 +61,7 @@ def test_a_signed_backup_is_restored_and_has_no_key_in_it(
     made: Path, key: Path, tmp_path: Path
 ) -> None:
     assert stat.S_IMODE(key.stat().st_mode) == 0o600
-    found = backups.restore(made, tmp_path / "new", tmp_path / "old", signed_by=public(key))
+    found = backups.restore(made, tmp_path / "new", NOW, tmp_path / "old", signed_by=public(key))
     assert found.made == NOW.isoformat()
     assert (tmp_path / "old" / "2026-06-21" / "10.parquet").read_bytes() == b"telemetry"
     secret = key.read_bytes().splitlines()[1]
@@ -102,20 +102,20 @@ def test_what_the_key_has_not_signed_is_refused(
 ) -> None:
     change(made)
     with pytest.raises(FormatError, match=text):
-        backups.restore(made, tmp_path / "new", signed_by=public(key))
+        backups.restore(made, tmp_path / "new", NOW, signed_by=public(key))
     assert not (tmp_path / "new").exists()
 
 
 def test_another_key_is_refused(made: Path, tmp_path: Path) -> None:
     other = PublicKey(make_key(tmp_path / "other.key"))
     with pytest.raises(FormatError, match="its signature is not of the key"):
-        backups.restore(made, tmp_path / "new", signed_by=other)
+        backups.restore(made, tmp_path / "new", NOW, signed_by=other)
 
 
 def test_a_file_that_was_put_in_is_refused(made: Path, key: Path, tmp_path: Path) -> None:
     (made / "telemetry" / "2026-06-21" / "11.parquet").write_bytes(b"put in")
     with pytest.raises(FormatError, match="the manifest does not name it"):
-        backups.restore(made, tmp_path / "new", tmp_path / "old", signed_by=public(key))
+        backups.restore(made, tmp_path / "new", NOW, tmp_path / "old", signed_by=public(key))
 
 
 def test_keys_are_checked(key: Path, tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """``heliotrope store``: a thin shell, and one line for bad input."""
 
 import json
+import os
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from heliotrope.calibration.sightings import Sightings
+from heliotrope.cli._noted import note_use
 from heliotrope.cli._store import app
+from heliotrope.local import name_here
 from heliotrope.store.database import HEAD
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
@@ -60,6 +64,35 @@ def test_export_migrate_and_query(data: Path, tmp_path: Path) -> None:
     assert "up to date" in run("migrate", data).stdout
     done = run("query", data, "SELECT heliostat, state FROM telemetry ORDER BY 1")
     assert done.stdout.split()[-6:] == ["A", "STOWED", "B", "STOWED", "C", "STOWED"]
+
+
+def test_what_people_do_with_the_records_is_recorded(data: Path, tmp_path: Path) -> None:
+    run("backup", data, "--to", tmp_path / "b")
+    run("export", data, "--to", tmp_path / "csv", "--heliostat", "A")
+    run("query", data, "SELECT heliostat\n FROM telemetry")
+    run("restore", tmp_path / "b", tmp_path / "new", "--unsigned")
+    me = name_here(os.geteuid())
+    with closing(Keeper(data, inline=True)) as keeper:
+        assert [(e.source, e.text) for e in reversed(keeper.events())] == [
+            ("security", f"{me}: made a backup: {tmp_path / 'b'}"),
+            ("security", f"{me}: exported calibrations: 1 heliostats to {tmp_path / 'csv'}"),
+            ("security", f"{me}: queried the telemetry: SELECT heliostat FROM telemetry"),
+        ]
+    with closing(Keeper(tmp_path / "new", inline=True)) as keeper:
+        assert keeper.events()[0].text.startswith(f"{me}: restored the backup of ")
+
+
+def test_a_use_that_cannot_be_recorded_is_reported(
+    data: Path, tmp_path: Path, opened: Callable[..., Keeper], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A plant that holds its store does not answer; the backup is made all the same."""
+    opened(data)
+    note_use(str(data), "BACKED_UP", str(tmp_path))
+    assert "not recorded in the store: store" in capsys.readouterr().err
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("HELIOTROPE_PLANT", raising=False)
+        note_use("postgresql://nobody@127.0.0.1:1/none", "BACKED_UP", str(tmp_path))
+    assert "not recorded in the store" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["info", "migrate"])

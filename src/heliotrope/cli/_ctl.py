@@ -5,6 +5,7 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import quote
 
 import typer
 
@@ -126,12 +127,9 @@ def token(
             min=0.001, max=365, help="Validity in days: at most 365 for a viewer, 90 above."
         ),
     ] = 30.0,
-    password: Annotated[
-        str,
-        typer.Option(prompt=True, hide_input=True, help="Password of your account; prompted for."),
-    ] = "",
 ) -> None:
-    """Make an API token; it is printed once."""
+    """Make an API token; it is printed once. It asks for your password."""
+    password = typer.prompt("Password", hide_input=True, err=True)
     with _sign_in_client(context) as client:
         _sign_in(client, name, password)
         made = client.ask(
@@ -172,7 +170,7 @@ def factor(
         _sign_in(client, name, own)
         if remove or reset:
             code = typer.prompt("Next code of your second factor")
-            path = f"accounts/{reset}/factor" if reset else "session/factor"
+            path = f"{_account(reset)}/factor" if reset else "session/factor"
             client.ask("DELETE", path, {"own_password": own, "own_code": code})
             print(f"{reset or name} has no second factor")
         else:
@@ -190,6 +188,11 @@ def _set_up_factor(client: "Client", own: str) -> None:
     answer = client.ask("PUT", "session/factor", {"code": code})
     print("The second factor is in force. Recovery codes, shown only now, each good once:")
     print("\n".join(answer["codes"]))
+
+
+def _account(name: str) -> str:
+    """Return the path of an account, whatever its name has in it."""
+    return f"accounts/{quote(name, safe='')}"
 
 
 @app.command()
@@ -211,13 +214,13 @@ def account(
         _sign_in(client, by, own)
         again = {"own_password": own}
         if reset:
-            made = client.ask("POST", f"accounts/{name}/password", again)
+            made = client.ask("POST", f"{_account(name)}/password", again)
             print(
                 f"new password of {name}, shown only now, to be changed at first use: "
                 f"{made['password']}"
             )
         elif disable:
-            client.ask("PATCH", f"accounts/{name}", {"disabled": True, **again})
+            client.ask("PATCH", _account(name), {"disabled": True, **again})
         else:
             password = typer.prompt(
                 f"Password of {name}", hide_input=True, confirmation_prompt=True

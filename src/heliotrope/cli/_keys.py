@@ -119,6 +119,43 @@ def list_(
     print_table(["name", "key", "old key"], [[n, k[0], *k[1:], ""][:3] for n, k in shown.items()])
 
 
+@app.command()
+def tls(
+    folder: Annotated[Path, typer.Argument(help="Folder of the keys and certificates.")],
+    name: Annotated[
+        list[str], typer.Option(help="Host name or address that people type; repeat it.")
+    ],
+    days: Annotated[
+        int, typer.Option(min=1, max=825, help="Validity of the certificate, days.")
+    ] = 825,
+    request: Annotated[
+        bool, typer.Option("--request", help="Make a request to another authority instead.")
+    ] = False,
+) -> None:
+    """Make or renew the console's certificate, under a private authority that is made once."""
+    from heliotrope.cli._common import parse_time
+    from heliotrope.errors import InputError
+
+    try:
+        from heliotrope.links import certificates
+    except ImportError as error:
+        raise InputError(
+            f"keys: {error.name} is not installed; say pip install 'heliotrope[control]'"
+        ) from None
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder; make it, for its owner alone")
+    if request:
+        made = certificates.request(folder, name)
+        print(f"{made.certificate}: have it signed; the key {made.key} stays here")
+        return
+    made = certificates.certify(folder, name, parse_time("now"), days=days)
+    print(f"{made.certificate}, {made.key}: give them to heliotrope run as --certificate and --key")
+    print(
+        f"{made.authority}: put it into the browsers of your people; keep the authority's key, "
+        f"{certificates.AUTHORITY}.key, off this machine between renewals"
+    )
+
+
 def _bus(path: Path) -> "BusKeyFile":
     from heliotrope.errors import InputError
 

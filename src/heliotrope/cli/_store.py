@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from heliotrope.cli._common import parse_time, print_json, print_table
+from heliotrope.cli._noted import note_use, this_person
 
 app = typer.Typer(
     help="Look at, back up, restore and export the store of a plant.", no_args_is_help=True
@@ -72,6 +73,7 @@ def backup(
     with Database(place) as database:
         archive = None if without_telemetry else telemetry or _telemetry(database)
         made = backups.backup(database, to, parse_time("now"), archive, key=key)
+    note_use(place, "BACKED_UP", str(to))
     _tell(made, "made", as_json)
 
 
@@ -101,7 +103,9 @@ def restore(
     signed_by = None if key is None else PublicKey(key)
     file = Database(place).file
     archive = telemetry or (file.with_name(backups.TELEMETRY) if file is not None else None)
-    _tell(backups.restore(backup, place, archive, signed_by=signed_by), "restored", as_json)
+    who, now = this_person(), parse_time("now")
+    done = backups.restore(backup, place, now, archive, signed_by=signed_by, who=who)
+    _tell(done, "restored", as_json)
 
 
 @app.command()
@@ -128,6 +132,7 @@ def export(
 
     with Database(place) as database:
         written = exports.export(database, to, heliostat)
+    note_use(place, "EXPORTED", f"{len(written)} heliostats to {to}")
     print(f"{to}: {len(written)} heliostats")
 
 
@@ -146,8 +151,24 @@ def migrate(place: Place) -> None:
 
 
 @app.command()
+def purge(
+    folder: Annotated[Path, typer.Argument(help="Data folder of a plant that is stopped.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Overwrite and remove all that a plant keeps, for a machine that leaves service."""
+    from heliotrope.store.purge import purge as remove
+
+    if not yes:
+        typer.confirm(f"{folder}: remove all records, accounts and keys for good?", abort=True)
+    count, left = remove(folder)
+    print(f"{folder}: {count} files overwritten and removed")
+    if left:
+        print(f"left, since no plant made it: {', '.join(path.name for path in left)}")
+
+
+@app.command()
 def head(place: Place) -> None:
-    """Print the heads of the chains of events and audit: note them on another machine."""
+    """Print the heads of the hash chains: note them on another machine."""
     if place.endswith(_LINES):
         from heliotrope.plant.orders import audit
 
@@ -173,7 +194,7 @@ def verify(
         ),
     ] = None,
 ) -> None:
-    """Check that no event and no record of the audit was altered or removed."""
+    """Check that nobody added, altered or removed events, audit, accounts or tokens."""
     from heliotrope.store import chain
     from heliotrope.store.database import Database
     from heliotrope.store.digests import Head
@@ -211,6 +232,8 @@ def query(
 
     inside = place / TELEMETRY
     answer = telemetry_query.query(inside if inside.is_dir() else place, sql)
+    if inside.is_dir():
+        note_use(str(place), "QUERIED", sql)
     rows = answer.to_pylist()
     if as_json:
         print_json(rows)

@@ -92,7 +92,10 @@ async def _run(installation: "Installation", every: float) -> None:
         print(f"{installation.config.name}: {alarm.text}", flush=True)
         cluster.take_alarm(alarm)
 
-    async with running(bus, link, time), running(cluster), papers.watched(tell):
+    def note(name: str) -> None:
+        print(f"{installation.config.name}: {name} renewed", flush=True)
+
+    async with running(bus, link, time), running(cluster), papers.watched(tell, note):
         await _log(cluster, ending, every)
     kept.close()
     print(f"{installation.config.name}: ended, DEFOCUS sent", flush=True)

@@ -4,6 +4,7 @@ import secrets
 
 import argon2
 
+from heliotrope.console._guessable import weakness
 from heliotrope.errors import InputError
 
 #: Shortest and longest password; a longer one would cost the server too much to hash.
@@ -13,16 +14,18 @@ _HASHER = argon2.PasswordHasher()
 _NOBODY = _HASHER.hash(secrets.token_hex(16))
 
 
-def check_password(password: str) -> str:
-    """Return a password if it is acceptable.
+def check_password(password: str, name: str = "") -> str:
+    """Return a new password of an account if it is acceptable.
 
     Raises
     ------
     InputError
-        If it is too short or too long.
+        If it is too short or too long, or guessed early.
     """
     if not SHORTEST <= len(password) <= LONGEST:
         raise InputError(f"password: {len(password)} characters; give {SHORTEST} to {LONGEST}")
+    if reason := weakness(password, name):
+        raise InputError(f"password: {reason}; give another one, as three words that do not belong")
     return password
 
 
@@ -32,12 +35,16 @@ def hash_password(password: str) -> str:
 
 
 def verify_password(kept: str | None, password: str) -> bool:
-    """Return whether a password matches a hash; takes the same time without one."""
+    """Return whether a password matches a hash.
+
+    It takes the same time without an account, and for one that has no password.
+    """
+    known = kept if kept is not None and kept.startswith("$argon2") else None
     try:
-        good = _HASHER.verify(kept if kept is not None else _NOBODY, password)
+        good = _HASHER.verify(known or _NOBODY, password)
     except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
         return False
-    return bool(good) and kept is not None
+    return bool(good) and known is not None
 
 
 def new_password() -> str:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from fastapi import APIRouter, HTTPException, Request, Response
 
 from heliotrope.console import _secrets, models
-from heliotrope.console.api import REFUSALS, Named
+from heliotrope.console.api import REFUSALS, AccountNamed, Named
 from heliotrope.console.auth import (
     Anyone,
     AppConsole,
@@ -18,9 +18,8 @@ from heliotrope.console.auth import (
     signed_in,
 )
 from heliotrope.console.hashing import CrowdError, GoneError
-from heliotrope.console.headers import COOKIE
 from heliotrope.console.people import ROLES
-from heliotrope.console.sign_in import confirm, log_in, set_cookie
+from heliotrope.console.sign_in import confirm, drop_cookie, log_in, set_cookie
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.orders.authority import Role
 from heliotrope.store.people import Account
@@ -74,8 +73,20 @@ async def sign_out(console: AppConsole, who: Anyone, request: Request, response:
     if who.by == "session":
         await console.ask(lambda: console.people.close_session(who.secret))
         console.roster.forget()
-        response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+        drop_cookie(console, response)
         await console.note(SecurityEvent.SIGNED_OUT, request, who.person.name)
+
+
+@router.put("/session/presence", status_code=204, tags=["people"])
+async def confirm_presence(
+    console: AppConsole, who: Anyone, request: Request, body: models.Confirmed
+) -> None:
+    """Confirm by your own password that you are there; a page that was left alone asks for it.
+
+    An order from a session that has ordered nothing for a while is refused by 423 until then.
+    """
+    await confirm(console, who, request, body.own_password)
+    console.presence.seen(who.secret)
 
 
 @router.put(
@@ -92,14 +103,15 @@ async def own_password(
         await confirm(console, who, request, body.old)
     if body.new == body.old:
         raise HTTPException(422, "this is your password already; give another one")
+    _secrets.check_password(body.new, who.person.name)
     await _set_password(console, who, request, who.person.name, body.new)
-    response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+    drop_cookie(console, response)
     await console.note(SecurityEvent.PASSWORD_CHANGED, request, who.person.name)
 
 
-@router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
+@router.post("/accounts/{name:path}/password", response_model=models.GivenPassword, tags=["people"])
 async def reset_password(
-    console: AppConsole, who: Engineer, request: Request, name: Named, body: models.Confirmed
+    console: AppConsole, who: Engineer, request: Request, name: AccountNamed, body: models.Confirmed
 ) -> models.GivenPassword:
     """Give a person a new password, shown once; all their sessions and tokens end.
 
@@ -128,6 +140,7 @@ async def new_account(
 ) -> models.AccountState:
     """Create an account; its password must be changed at first use."""
     await confirm(console, who, request, body.own_password)
+    _secrets.check_password(body.password, body.name)
     kept = await _hashed(console, who, request, body.password)
     made = await console.ask(
         lambda: console.people.add(body.name, kept, body.role, console.now(), due=True)
@@ -137,9 +150,13 @@ async def new_account(
     return _account(made)
 
 
-@router.patch("/accounts/{name}", response_model=models.AccountState, tags=["people"])
+@router.patch("/accounts/{name:path}", response_model=models.AccountState, tags=["people"])
 async def change_account(
-    console: AppConsole, who: Engineer, request: Request, name: Named, body: models.AccountChange
+    console: AppConsole,
+    who: Engineer,
+    request: Request,
+    name: AccountNamed,
+    body: models.AccountChange,
 ) -> models.AccountState:
     """Change the role or password of an account, or disable it; not yours."""
     await confirm(console, who, request, body.own_password)
@@ -150,6 +167,7 @@ async def change_account(
     await _find(console, name, password=body.password is not None)
     kept = None
     if body.password is not None:
+        _secrets.check_password(body.password, name)
         kept = await _hashed(console, who, request, body.password)
     made = await console.ask(
         lambda: console.people.change(

@@ -40,6 +40,7 @@ from heliotrope.local.frames import REQUEST_BLOB
 from heliotrope.plant.interface import CALLS, BusyError, Call, WithBlob, orders
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.orders.authority import OPERATOR_COMMANDS, Role
+from heliotrope.store.people import LONGEST_NAME
 
 #: Answers that any route behind the sign-in may give.
 REFUSALS: dict[int | str, dict[str, Any]] = {
@@ -48,12 +49,16 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
     404: {"model": models.Problem, "description": "Unknown name"},
     409: {"model": models.Problem, "description": "Not accepted now; nothing was sent"},
     422: {"model": models.Problem, "description": "The request cannot be used"},
+    423: {"model": models.Problem, "description": "Give your password again, see session/presence"},
+    429: {"model": models.Problem, "description": "Too many requests; nothing was sent"},
     503: {"model": models.Problem, "description": "It cannot be recorded now; nothing was sent"},
 }
 MOST_SHARED = 100
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 Named = Annotated[str, Path(max_length=64)]
+#: Name of an account, whatever it is: the path of its route takes a slash too.
+AccountNamed = Annotated[str, Path(max_length=LONGEST_NAME)]
 
 
 def answer(value: Any) -> JSONResponse:
@@ -91,11 +96,11 @@ async def health(console: AppConsole) -> dict[str, Any]:
 
 
 async def photograph(console: AppConsole, request: Request, who: Anyone, name: Named) -> Response:
-    """Send a photograph only where the browser does not have it."""
+    """Send a photograph only where the page does not show it; no browser keeps one."""
     known = request.headers.get("if-none-match", "").strip('"')
     version = int(known) if known.isdecimal() and len(known) < 16 else -1
     view, jpeg = await console.plant.fetch("photograph", who.person, name=name, known=version)
-    headers = {"ETag": f'"{view["version"]}"', "Cache-Control": "private, no-cache"}
+    headers = {"ETag": f'"{view["version"]}"'}
     if not jpeg:
         unchanged = view["version"] == version
         return Response(status_code=304 if unchanged and version else 204, headers=headers)
@@ -136,8 +141,7 @@ def _endpoint(name: str, call: Call) -> Callable[..., Any]:
             return Response(status_code=204)
         if call.answer is not WithBlob:
             return answer(value)
-        kept = f"private, max-age={call.fresh:.0f}, immutable" if call.fresh else "no-store"
-        return Response(data, media_type="image/jpeg", headers={"Cache-Control": kept})
+        return Response(data, media_type="image/jpeg")
 
     fixed = {"console": AppConsole, "request": Request, "who": _AT_LEAST[call.role]}
     own = [_argument(key, hint) for key, hint in fixed.items()]

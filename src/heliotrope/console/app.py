@@ -25,6 +25,7 @@ from heliotrope.console.edge import Edge
 from heliotrope.console.guard import Guard
 from heliotrope.console.headers import network_of
 from heliotrope.console.live import Stream
+from heliotrope.console.presence import Presence
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.roster import Key, Roster
 from heliotrope.console.routes import Routes
@@ -75,7 +76,8 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
                 attempts.meet(one.name, network_of(one.note))
         return found
 
-    console = Console(plant, people, chosen, stream, attempts, Roster(read))
+    presence = Presence(chosen.idle_s, time.monotonic)
+    console = Console(plant, people, chosen, stream, attempts, Roster(read), presence)
     if chosen.people_by_proxy is not None:
         console.by_proxy = ByProxy.read(chosen.people_by_proxy)
 
@@ -176,7 +178,10 @@ def _pages(app: FastAPI) -> None:
             answer = RedirectResponse("/", 303)
             set_cookie(console, answer, await enter(console, person, request))
             return answer
-        return HTMLResponse(page("login"))
+        notice, text = escape(console.settings.notice), page("login")
+        if notice:
+            text = text.replace('id="notice" hidden>', f'id="notice">{notice}')
+        return HTMLResponse(text)
 
     async def follow_link(request: Request) -> Response:
         console: Console = request.scope["heliotrope"]

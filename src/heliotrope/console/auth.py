@@ -8,10 +8,9 @@ elsewhere cannot read. Programs have a token (``Authorization: Bearer``).
 import asyncio
 import contextlib
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeVar, cast
 
 from fastapi import Depends, HTTPException
@@ -25,17 +24,16 @@ from heliotrope.console.hashing import Hashing
 from heliotrope.console.headers import address_of, host_known, parts_of, secret_of
 from heliotrope.console.live import Stream
 from heliotrope.console.people import ROLES, person_of
+from heliotrope.console.presence import Presence
 from heliotrope.console.remote import RemotePeople, RemotePlant
 from heliotrope.console.roster import Roster
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
-from heliotrope.plant.operations.security import SPAN, SecurityEvent, plain
+from heliotrope.plant.operations.security import EventCounter, SecurityEvent, plain
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.people import Account, ApiToken, Session
 
 T = TypeVar("T")
-#: Security events of one kind that are sent to the plant within a minute.
-MOST_NOTED = 100
 #: The shared answer that never changes.
 FIXED = "field"
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -54,6 +52,11 @@ DUES: dict[str, tuple[str, frozenset[tuple[str, str]]]] = {
         frozenset({("POST", f"{_API}/session/factor"), ("PUT", f"{_API}/session/factor")}),
     ),
 }
+#: What a page sends by itself, or what gives command back: no sign that a person is there, and
+#: nothing that needs one.
+_BY_ITSELF = frozenset({("PUT", f"{_API}/authority"), ("DELETE", f"{_API}/authority")})
+#: Settles that a person has been away.
+_THERE = ("PUT", f"{_API}/session/presence")
 
 
 @dataclass
@@ -66,6 +69,7 @@ class Console:
     stream: Stream
     attempts: SignInFailures
     roster: Roster[Session | ApiToken]
+    presence: Presence
     #: Turns for checks of passwords.
     hashing: Hashing = field(default_factory=Hashing)
 
@@ -80,8 +84,8 @@ class Console:
         default_factory=lambda: ThreadPoolExecutor(4, "console store")
     )
 
-    #: When the last security events of each kind were sent to the plant, s.
-    noted: dict[SecurityEvent, deque[float]] = field(default_factory=dict)
+    #: Counts the security events that are not sent to the plant one by one.
+    counter: EventCounter = field(default_factory=EventCounter)
 
     #: Answers that all viewers ask for, with the time: made at most twice a second.
     shared: dict[str, tuple[float, bytes, bytes | None]] = field(default_factory=dict)
@@ -89,15 +93,20 @@ class Console:
     async def forget_expired(self) -> None:
         """Remove expired sessions and tokens from the store, and record that they have ended.
 
-        Sessions end by the machine's time.
+        Sessions end by the machine's time. Security events that were only counted are recorded too.
         """
         while True:
+            for kind, name, more in self.counter.sums(time.monotonic()):
+                try:
+                    await self.plant.note(kind, name, more=more)
+                except HeliotropeError:
+                    self.counter.count(kind, name, time.monotonic(), more)
             with contextlib.suppress(HeliotropeError):  # others report a full store
                 for expired in await self.ask(lambda: self.people.forget_expired(self.now())):
                     ended = (
                         SecurityEvent.TOKEN_ENDED if expired.token else SecurityEvent.SESSION_ENDED
                     )
-                    await self.plant.note(ended, expired.name, "", expired.label)
+                    await self.plant.note(ended, expired.name, detail=expired.label)
             await asyncio.sleep(60.0)
 
     async def note(
@@ -105,17 +114,15 @@ class Console:
     ) -> None:
         """Record a security event that a request has caused.
 
-        The plant counts floods; strangers who cause one must not cost it a call each.
+        A flood must not cost the plant a call for each: events are counted here as there, and
+        `forget_expired` sends the sums.
         """
-        times = self.noted.setdefault(kind, deque(maxlen=MOST_NOTED))
-        now = time.monotonic()
-        if len(times) < MOST_NOTED or now - times[0] >= SPAN:
-            times.append(now)
+        if self.counter.admits(kind, who, time.monotonic()):
             address = self.address(connection)
             nearest = connection.client.host if connection.client else ""
             # What a proxy says of an address is no more certain than the proxy.
-            seen = address if address == nearest else f"{address} via {nearest}"
-            await self.plant.note(kind, who, seen, plain(detail))
+            origin = address if address == nearest else f"{address} via {nearest}"
+            await self.plant.note(kind, who, origin, plain(detail))
 
     def address(self, connection: HTTPConnection) -> str:
         """Return the address that a request comes from, see `address_of`.
@@ -189,6 +196,8 @@ class Caller:
     factor: bool = False
     by_proxy: bool = False
     no_password: bool = False
+    #: Whether this order needs the password again, see `presence`.
+    away: bool = False
 
     @property
     def csrf(self) -> str:
@@ -220,7 +229,7 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
     HeliotropeError
         If the store cannot say.
     """
-    presented = secret_of(connection)
+    presented = secret_of(console.settings, connection)
     if presented is None:
         return None
     emergency = _is_emergency(connection)
@@ -313,19 +322,38 @@ async def caller(connection: HTTPConnection, console: AppConsole) -> Caller:
         if not same_origin(console, connection) or not _words.same(word, who.csrf):
             await console.note(SecurityEvent.ORIGIN_REFUSED, connection, who.person.name)
             raise HTTPException(403, "the header X-CSRF-Token is missing or not this session's")
+        who = _attended(console, connection, who)
     if (connection.scope.get("method", "GET"), connection.scope["path"]) not in _ALWAYS:
         settle(who, connection)
     return who
 
 
+def _attended(console: Console, connection: HTTPConnection, who: Caller) -> Caller:
+    """Return the caller of a session, away or not; whoever is there counts as seen."""
+    request = (connection.scope.get("method", "GET"), connection.scope["path"])
+    # Those without a password here cannot give it again; the proxy asks them in its own time.
+    if request in _BY_ITSELF or who.by_proxy or who.no_password:
+        return who
+    if console.presence.away(who.secret):
+        return replace(who, away=request != _THERE)
+    console.presence.seen(who.secret)
+    return who
+
+
 def settle(who: Caller, connection: HTTPConnection) -> None:
-    """Admit a caller who owes nothing, or whose request settles it.
+    """Admit a caller who is there and owes nothing, or whose request settles it.
 
     Raises
     ------
     HTTPException
-        403 for any other request.
+        423 for a person who must confirm that they are there; 403 for any other request.
     """
+    if who.away:
+        raise HTTPException(
+            423,
+            "nothing was ordered here for a while: give your password again; EMERGENCY, DEFOCUS "
+            "and STOW are accepted all the same",
+        )
     if who.owes:
         text, requests = DUES[who.owes]
         if (connection.scope.get("method", "GET"), connection.scope["path"]) not in requests:

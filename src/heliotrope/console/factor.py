@@ -3,7 +3,7 @@
 from fastapi import APIRouter, HTTPException, Request
 
 from heliotrope.console import models
-from heliotrope.console.api import REFUSALS, Named
+from heliotrope.console.api import REFUSALS, AccountNamed
 from heliotrope.console.auth import Anyone, AppConsole, Engineer
 from heliotrope.console.sign_in import confirm
 from heliotrope.plant.operations.security import SecurityEvent
@@ -53,9 +53,13 @@ async def remove_own_factor(
     await console.note(SecurityEvent.FACTOR_CHANGED, request, name, "removed")
 
 
-@router.delete("/accounts/{name}/factor", status_code=204, tags=["people"])
+@router.delete("/accounts/{name:path}/factor", status_code=204, tags=["people"])
 async def remove_factor(
-    console: AppConsole, who: Engineer, request: Request, name: Named, body: models.ConfirmedTwice
+    console: AppConsole,
+    who: Engineer,
+    request: Request,
+    name: AccountNamed,
+    body: models.ConfirmedTwice,
 ) -> None:
     """Remove the second factor of another person, whose sessions end; needs one of your own."""
     if not who.factor:

@@ -7,7 +7,7 @@ from starlette.requests import HTTPConnection
 
 from heliotrope.console.settings import ConsoleSettings
 
-COOKIE = "heliotrope_session"
+_COOKIE = "heliotrope_session"
 #: A longer word is no session's or token's secret, characters.
 LONGEST_SECRET = 200
 #: Requests of strangers: from one address, and from all; 1/s, and at once.
@@ -59,7 +59,16 @@ def network_of(address: str) -> str:
     return str(ipaddress.IPv6Network((int(ip) >> 64 << 64, 64)))
 
 
-def secret_of(connection: HTTPConnection) -> tuple[str, str] | None:
+def cookie_of(settings: ConsoleSettings) -> str:
+    """Return the name of the session's cookie.
+
+    A browser takes ``__Host-`` from this host alone, by TLS: neither a program on another port nor
+    another machine of the domain can put one in its place.
+    """
+    return f"__Host-{_COOKIE}" if settings.secure else _COOKIE
+
+
+def secret_of(settings: ConsoleSettings, connection: HTTPConnection) -> tuple[str, str] | None:
     """Return kind and secret of the caller's token or session, whether valid or not; None for none.
 
     A request with a token is never taken for one of a session.
@@ -69,5 +78,5 @@ def secret_of(connection: HTTPConnection) -> tuple[str, str] | None:
         kind, _, word = bearer.partition(" ")
         by, secret = "token", word.strip() if kind.lower() == "bearer" else ""
     else:
-        by, secret = "session", connection.cookies.get(COOKIE, "")
+        by, secret = "session", connection.cookies.get(cookie_of(settings), "")
     return (by, secret) if 0 < len(secret) <= LONGEST_SECRET else None

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel, Field, create_model
 
 from heliotrope.plant.interface.orders import Name, Strict
+from heliotrope.store.people import LONGEST_NAME
 
 _MADE: dict[type, type[BaseModel]] = {}
 
@@ -56,13 +57,16 @@ def json_type(hint: Any) -> Any:
     return Any
 
 
+AccountName = Annotated[
+    str, Field(min_length=1, max_length=LONGEST_NAME, pattern=r"^[^\x00-\x1f\x7f]+$")
+]
 Code = Annotated[str, Field(max_length=40)]
 
 
 class LogIn(Strict):
     """Name and password, and the code of a second factor if the account has one."""
 
-    name: Name
+    name: AccountName
     password: Annotated[str, Field(min_length=1, max_length=200)]
     code: Code = ""
 
@@ -117,7 +121,7 @@ class RecoveryCodes(BaseModel):
 class NewAccount(Confirmed):
     """A new account."""
 
-    name: Name
+    name: AccountName
     role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")]
     password: Annotated[str, Field(min_length=10, max_length=200)]
 

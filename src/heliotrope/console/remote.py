@@ -79,9 +79,12 @@ class RemotePlant:
         sessions = {("session", one["key"]): Session(**one) for one in found["sessions"]}
         return sessions | {("token", one["key"]): ApiToken(**one) for one in found["tokens"]}
 
-    async def note(self, kind: SecurityEvent, who: str, address: str, detail: str) -> None:
+    async def note(
+        self, kind: SecurityEvent, who: str, address: str = "", detail: str = "", more: int = 0
+    ) -> None:
         """Record a security event in the plant; see `SecurityLog.note`."""
-        await self.ask("note", None, kind=kind.name, who=who, address=address, detail=detail)
+        given = {"who": who, "address": address, "detail": detail, "more": more}
+        await self.ask("note", None, kind=kind.name, **given)
 
 
 class RemotePeople:

@@ -40,6 +40,10 @@ class ConsoleSettings:
         Least role that needs a second factor; "" for none.
     emergency_port
         Port that serves EMERGENCY alone; None: the next one, or a free one if that is taken.
+    idle_s
+        Time without an order after which a page's next one needs the password again, s; 0: never.
+    notice
+        Text for everybody who is about to sign in; "" for none.
 
     Raises
     ------
@@ -61,6 +65,8 @@ class ConsoleSettings:
     people_by_proxy: Path | None = None
     second_factor: str = ""
     emergency_port: int | None = None
+    idle_s: float = 1800.0
+    notice: str = ""
 
     def __post_init__(self) -> None:
         for port in (self.port, self.emergency_port or 0):
@@ -117,6 +123,11 @@ class ConsoleSettings:
         return self.certificate is not None
 
     @property
+    def secure(self) -> bool:
+        """Whether browsers reach it by TLS: its own, or that of a proxy."""
+        return self.tls or self.plain
+
+    @property
     def local(self) -> bool:
         """Whether only this machine can connect."""
         return self.host == "localhost" or is_loopback(self.host)
@@ -128,13 +139,14 @@ class ConsoleSettings:
         There is no TLS, no proxy that hides where a request comes from, and no second factor is
         due.
         """
-        asks = self.tls or self.plain or self.proxies or self.second_factor
+        asks = self.secure or self.proxies or self.second_factor
         return self.local and not asks
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Host names that a request may carry."""
-        return frozenset({"127.0.0.1", "localhost", "[::1]", "::1", self.host, *self.names})
+        """Host names that a request may carry, in small letters."""
+        own = {"127.0.0.1", "localhost", "[::1]", "::1"}
+        return frozenset(own.union(name.lower() for name in (self.host, *self.names)))
 
     def address(self, port: int) -> str:
         """Return the address for a browser."""

@@ -11,7 +11,7 @@ from heliotrope.console import _secrets
 from heliotrope.console.auth import Caller, Console
 from heliotrope.console.by_proxy import Introduced, check_account
 from heliotrope.console.hashing import CrowdError, GoneError
-from heliotrope.console.headers import COOKIE, network_of
+from heliotrope.console.headers import cookie_of, network_of
 from heliotrope.console.settings import is_loopback
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import BY_PROXY, Account
@@ -100,13 +100,24 @@ async def _begin(
 def set_cookie(console: Console, response: Response, secret: str) -> None:
     """Give a browser its session."""
     response.set_cookie(
-        COOKIE,
+        cookie_of(console.settings),
         secret,
         max_age=int(console.settings.session_s),
         path="/",
         httponly=True,
         samesite="strict",
-        secure=console.settings.tls or console.settings.plain,
+        secure=console.settings.secure,
+    )
+
+
+def drop_cookie(console: Console, response: Response) -> None:
+    """Take the session from a browser."""
+    response.delete_cookie(
+        cookie_of(console.settings),
+        path="/",
+        httponly=True,
+        samesite="strict",
+        secure=console.settings.secure,
     )
 
 

@@ -113,7 +113,7 @@ class EmergencyWay:
             answer["Access-Control-Allow-Origin"] = origin
             answer["Access-Control-Allow-Credentials"] = "true"
             answer["Vary"] = "Origin"
-        by, secret = secret_of(connection) or ("", "")
+        by, secret = secret_of(self._settings, connection) or ("", "")
         who = scope[FOUND] = await self._caller(connection, by, secret)
         if who is None:
             raise HTTPException(401, "sign in, or send a valid token")

@@ -51,11 +51,32 @@ def _environment(package: str) -> "Environment":
     )
 
 
+def as_written(figure: "Figure") -> None:
+    """Let a figure show its texts as they are: a name with "$" is no formula.
+
+    As one it may be unreadable, and end the whole report. Only the powers of ten on logarithmic
+    axes are formulas.
+    """
+    from matplotlib.text import Text
+
+    powers = {
+        id(text)
+        for axes in figure.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        if axis.get_scale() == "log"
+        for text in (*axis.get_ticklabels(), *axis.get_ticklabels(minor=True))
+    }
+    for text in figure.findobj(Text):
+        if id(text) not in powers:
+            text.set_parse_math(False)
+
+
 def picture(figure: "Figure", alt: str, dpi: int = 80) -> "Markup":
     """Return a figure as an image inside a page; ``alt`` describes it for a screen reader."""
     from markupsafe import Markup
 
     data = io.BytesIO()
+    as_written(figure)
     figure.savefig(data, dpi=dpi, format="png")
     code = base64.b64encode(data.getvalue()).decode("ascii")
     image = Markup('<img loading="lazy" src="data:image/png;base64,{}" alt="{}">')

@@ -13,7 +13,7 @@ import tomli_w
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_toml
 from heliotrope.lcu.signing import KEY_SIZE, NO_KEY
-from heliotrope.links.keys import LinkKeys, refuse_others, write_private
+from heliotrope.links.keys import LinkKeys, content_of, refuse_others, replace_private
 
 _MOST = 2
 
@@ -73,6 +73,7 @@ class BusKeyFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._read_as = content_of(path)
         self.keys: LinkKeys = read_bus_keys(path) if path.exists() else ()
 
     def new(self) -> None:
@@ -124,5 +125,6 @@ class BusKeyFile:
         self._write()
 
     def _write(self, *keys: bytes) -> None:
-        write_private(self.path, tomli_w.dumps({"keys": [key.hex() for key in keys]}))
+        text = tomli_w.dumps({"keys": [key.hex() for key in keys]})
+        self._read_as = replace_private(self.path, self._read_as, text)
         self.keys = keys

@@ -10,6 +10,7 @@ table of keys, as hexadecimal text. Where there are two keys, they stand in a li
 first.
 """
 
+import fcntl
 import hashlib
 import os
 import secrets
@@ -202,6 +203,7 @@ class KeyFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._read_as = content_of(path)
         self._held: Keys | None = None
         filled = path.exists() and path.stat().st_size > 0
         self._table = HELIOSTATS if filled and HELIOSTATS in read_toml(path, "a key file") else ""
@@ -316,7 +318,7 @@ class KeyFile:
         if members:
             named = {name: _texts(keys) for name, keys in members.items()}
             document[self._table or CLUSTERS] = named
-        write_private(self.path, tomli_w.dumps(document))
+        self._read_as = replace_private(self.path, self._read_as, tomli_w.dumps(document))
         self._held = Keys(self.path, self._table or CLUSTERS)
 
 
@@ -353,6 +355,36 @@ def carry(folder: Path, keys: Mapping[str, bytes]) -> list[Path]:
     for path, key in zip(files, keys.values(), strict=True):
         write_private(path, tomli_w.dumps({"plant": key.hex()}), new=True)
     return files
+
+
+def content_of(path: Path) -> bytes:
+    """Return the content of a key file; empty if there is none."""
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
+
+
+def replace_private(path: Path, before: bytes, text: str) -> bytes:
+    """Replace the content of a key file that is still as it was read; return the new content.
+
+    Two commands at once would otherwise drop a key that one of them has made, and that a cluster
+    may have taken already.
+
+    Raises
+    ------
+    InputError
+        If another command has changed it since, or it cannot be written.
+    """
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        if content_of(path) != before:
+            raise InputError(f"{path}: another command has changed it meanwhile; give yours again")
+        write_private(path, text)
+    finally:
+        os.close(folder)
+    return text.encode()
 
 
 def write_private(path: Path, text: str, *, new: bool = False) -> None:

@@ -26,11 +26,18 @@ _State = tuple[int, ...] | None
 
 
 class _Renewal:
-    """Files that are read again when they change."""
+    """Files that are read again when they change.
+
+    Attributes
+    ----------
+    count
+        How often they have been taken.
+    """
 
     def __init__(self, files: Sequence[Path], take: Callable[[], None]) -> None:
         self._files, self._take = tuple(files), take
         self._last_state: tuple[_State, ...] | None = None
+        self.count = 0
 
     def look(self) -> str:
         """Take changed files; return why they cannot be used, or an empty text.
@@ -46,6 +53,7 @@ class _Renewal:
             self._last_state = None
             return str(error)
         self._last_state = current
+        self.count += 1
         return ""
 
 
@@ -99,6 +107,7 @@ class Papers:
         self._renewals: dict[str, _Renewal] = {}
         self._certificates: list[_Certificate] = []
         self._problems: dict[str, str] = {}
+        self._counts: dict[str, int] = {}
         self._reported: dict[Path, tuple[int | None, str]] = {}
 
     def renew(self, name: str, files: Sequence[Path], take: Callable[[], None]) -> None:
@@ -117,11 +126,13 @@ class Papers:
         return [certificate.line(now) for certificate in self._certificates]
 
     @contextlib.asynccontextmanager
-    async def watched(self, on_alarm: Callable[[Alarm], None]) -> AsyncIterator[None]:
-        """Look at the files during a block, and raise and end alarms."""
+    async def watched(
+        self, on_alarm: Callable[[Alarm], None], on_renewed: Callable[[str], None] | None = None
+    ) -> AsyncIterator[None]:
+        """Look at the files during a block, raise and end alarms, and name what was renewed."""
         failure: Exception | None = None
         async with asyncio.TaskGroup() as group:
-            task = group.create_task(self._run(on_alarm))
+            task = group.create_task(self._run(on_alarm, on_renewed))
             try:
                 yield
             except Exception as error:  # noqa: BLE001 (it goes on as it came, not in a group)
@@ -130,10 +141,15 @@ class Papers:
         if failure is not None:
             raise failure
 
-    async def _run(self, on_alarm: Callable[[Alarm], None]) -> None:
+    async def _run(
+        self, on_alarm: Callable[[Alarm], None], on_renewed: Callable[[str], None] | None
+    ) -> None:
         while True:
             for alarm in await asyncio.to_thread(self.look):
                 on_alarm(alarm)
+            for name in self.renewed():
+                if on_renewed is not None:
+                    on_renewed(name)
             await asyncio.sleep(LOOKED)
 
     def look(self) -> list[Alarm]:
@@ -150,6 +166,11 @@ class Papers:
             certificate.look()
             changes += self._end_of(certificate, now)
         return changes
+
+    def renewed(self) -> list[str]:
+        """Return what was taken again since the last call; its first taking is not counted."""
+        before, self._counts = self._counts, {n: r.count for n, r in self._renewals.items()}
+        return [n for n, count in self._counts.items() if count > max(1, before.get(n, 0))]
 
     def _end_of(self, certificate: _Certificate, now: datetime) -> list[Alarm]:
         kind, days, path = alarms.CERTIFICATE, certificate.days(now), certificate.path

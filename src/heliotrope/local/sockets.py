@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import pwd
 import socket
 import stat
 import struct
@@ -27,6 +28,14 @@ _CREDENTIALS = struct.Struct("3i")
 def socket_folder(data: Path) -> Path:
     """Return the folder of the sockets in a plant's data folder."""
     return data / _FOLDER
+
+
+def name_here(user: int) -> str:
+    """Return how a user of this machine is named in records; by number if it has no name."""
+    try:
+        return f"{pwd.getpwuid(user).pw_name} on this machine"
+    except KeyError:
+        return f"user {user} on this machine"
 
 
 def make_folder(folder: Path) -> None:

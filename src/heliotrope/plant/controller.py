@@ -886,6 +886,11 @@ class PlantController:
             raise UnknownNameError("cluster", cluster, self._clusters.ends)
         return await self._clusters.answer(cluster, what, timeout)
 
+    def compared(self, heliostat: str) -> str:
+        """Return in words how the last comparison of the stored parameters of a heliostat ended."""
+        self.field.place(heliostat)
+        return self._sync.compared(heliostat)
+
     async def stored(self, heliostat: str, timeout: float = 15.0) -> dict[str, int]:
         """Return the checksums of the items that a local controller stores, by item.
 

@@ -7,7 +7,9 @@ restore needs an empty place: nothing is ever overwritten.
 
 The store in a backup knows that it is one, however it comes to a plant: it holds a lock on the
 tower, and none of its assigned points counts as taken. What has been locked or assigned since it
-was made is not in it, so a person confirms both before a heliostat leaves stow.
+was made is not in it, so a person confirms both before a heliostat leaves stow. Nor does it let
+anybody in: it has no session and no token, and the codes of second factors that were shown by then
+are used up. A restore does the same again for its own time, and is recorded in the store.
 """
 
 import hashlib
@@ -16,8 +18,9 @@ import math
 import os
 import shutil
 import sqlite3
+import tempfile
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -28,10 +31,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from heliotrope import __version__
 from heliotrope.errors import FormatError
+from heliotrope.safety import Severity
 from heliotrope.store import _rows as rows
-from heliotrope.store import audit, tables
+from heliotrope.store import audit, chain, tables
 from heliotrope.store.database import FILE, HEAD, PRIVATE, Database, cause, make_private
-from heliotrope.store.records import Kind, Lockout, StoreError
+from heliotrope.store.factors import NEAR, STEP
+from heliotrope.store.records import Event, Kind, Lockout, StoreError
 from heliotrope.store.signing import PublicKey, SigningKey
 
 MANIFEST, SIGNATURE = "manifest.json", "manifest.sig"
@@ -91,8 +96,9 @@ def backup(
             _copy_file(database.file, beside / FILE)
         else:
             _copy_tables(database, Database(beside / FILE))
-        with Database(beside / FILE) as copy:
-            _lock(copy, now)
+        with Database(beside / FILE) as copy, _changing(copy) as connection:
+            _lock(connection, now)
+            _end_access(connection, now)
         _close_log(beside / FILE)
         if telemetry is not None:
             _copy_telemetry(Path(telemetry), beside / TELEMETRY)
@@ -162,6 +168,10 @@ def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
         if checksum(file) != sum_:
             raise FormatError(file, "its checksum differs; use another backup")
         size += file.stat().st_size
+    for link in place.rglob("*"):
+        if link.is_symlink():
+            # Its content is another place's: no checksum speaks for it.
+            raise FormatError(link, "it is a link, which no backup has; remove it")
     for file in _files(place):
         if str(file.relative_to(place)) not in {*checksums, MANIFEST, SIGNATURE}:
             raise FormatError(
@@ -183,11 +193,15 @@ def _check_signature(place: Path, manifest: bytes, key: PublicKey) -> None:
 def restore(
     folder: str | Path,
     place: str | Path,
+    now: datetime,
     telemetry: str | Path | None = None,
     *,
     signed_by: PublicKey | None = None,
+    who: str = "",
 ) -> Backup:
-    """Restore a backup into an empty place.
+    """Restore a backup into an empty place; one of an earlier program is migrated.
+
+    Nobody is signed in there, no token is valid, and an event says who restored what.
 
     Parameters
     ----------
@@ -195,19 +209,29 @@ def restore(
         Folder of the backup.
     place
         As in `Database`; there must be no store yet.
+    now
+        Time of the restore.
     telemetry
         Destination of its telemetry, if it has any; None: left out.
     signed_by
         As in `check`.
+    who
+        Who restores it, for the event.
 
     Raises
     ------
     FormatError
         If the backup is damaged, or not signed by that key.
     StoreError
-        If there is a store already, another process holds it, or it cannot be written.
+        If there is a store already, another process holds it, it cannot be written, or the backup
+        is of a later program.
     """
     restored = check(folder, signed_by=signed_by)
+    if restored.revision > HEAD:
+        raise StoreError(
+            f"backup {restored.folder}: its tables have revision {restored.revision}, this program "
+            f"knows {HEAD}; update the program"
+        )
     database = Database(place)
     try:
         if database.file is not None:
@@ -221,23 +245,45 @@ def restore(
             if Path(telemetry).exists() and any(Path(telemetry).iterdir()):
                 raise StoreError(f"telemetry {telemetry}: it is not empty; move it away")
             shutil.copytree(restored.folder / TELEMETRY, telemetry, dirs_exist_ok=True)
-        if database.file is not None:
-            beside = database.file.with_name(f".{database.file.name}.{os.getpid()}.part")
-            try:
-                shutil.copyfile(restored.folder / FILE, beside)
-                beside.chmod(PRIVATE)
-                _sync(beside)
-                beside.rename(database.file)
+        with tempfile.TemporaryDirectory(
+            prefix=".restoring-", dir=None if database.file is None else database.file.parent
+        ) as beside:
+            copy = Path(beside) / FILE
+            shutil.copyfile(restored.folder / FILE, copy)
+            _begin_anew(copy, now, restored, who)
+            if database.file is None:
+                _copy_tables(Database(copy), database)
+            else:
+                copy.chmod(PRIVATE)
+                _sync(copy)
+                copy.rename(database.file)
                 _sync(database.file.parent)
-            finally:
-                beside.unlink(missing_ok=True)
-        else:
-            _copy_tables(Database(restored.folder / FILE), database)
     except OSError as error:
         raise StoreError(f"store {database.name}: {error.strerror}") from None
     finally:
         database.close()
     return restored
+
+
+def _begin_anew(copy: Path, now: datetime, restored: Backup, who: str) -> None:
+    """Let nobody into a store that was restored, and record who did that."""
+    at = now.timestamp()
+    with Database(copy) as database:
+        if restored.revision < HEAD:
+            database.migrate()
+        with _changing(database) as connection:
+            _end_access(connection, now)
+            account = tables.account.c
+            enabled = select(account.name).where(~account.disabled).order_by(account.name)
+            names = ", ".join(connection.scalars(enabled)) or "none"
+            text = (
+                f"{who or 'somebody'}: restored the backup of {restored.made}: all sessions and "
+                f"tokens ended, accounts and roles are as they were then; enabled: {names}"
+            )
+            number = (connection.scalar(select(func.max(tables.event.c.number))) or 0) + 1
+            event = Event(at, "security", text, Severity.WARNING)
+            chain.add_event(connection, rows.row_of(tables.event, event, number=number))
+    _close_log(copy)
 
 
 def summary(database: Database) -> dict[str, Any]:
@@ -334,26 +380,41 @@ def _copy_file(source: Path, target: Path) -> None:
         raise StoreError(f"store {source}: it is damaged ({state}); restore a backup")
 
 
-def _lock(copy: Database, now: datetime) -> None:
+@contextmanager
+def _changing(copy: Database) -> Iterator[Connection]:
+    """Yield a connection to change a copy in one transaction."""
+    try:
+        with copy.connect() as connection, connection.begin():
+            yield connection
+    except SQLAlchemyError as error:
+        raise StoreError(f"store {copy.name}: cannot be written ({cause(error)})") from None
+
+
+def _end_access(connection: Connection, now: datetime) -> None:
+    """End all sessions and tokens, and use up the codes of second factors shown until a time."""
+    factor, last = tables.second_factor, int(now.timestamp() // STEP) + NEAR
+    with chain.changing_accounts(connection, None):
+        for table in (tables.session, tables.api_token):
+            connection.execute(delete(table))
+        connection.execute(factor.update().where(factor.c.used < last).values(used=last))
+
+
+def _lock(connection: Connection, now: datetime) -> None:
     """Lock the tower in a backup made at a time, and doubt its assigned points."""
     hold = Lockout(
         Kind.TOWER,
         "tower",
         OWNER,
-        f"this store is a backup of {now:%d %b %Y %H:%M} UTC: locks taken and points assigned "
-        "since then are not in it",
+        f"this store is a backup of {now:%d %b %Y %H:%M} UTC: locks taken, points assigned and "
+        "accounts disabled since then are not in it",
         now.timestamp(),
     )
     own = (tables.hold.c.who == OWNER) & tables.hold.c.ended.is_(None)
-    try:
-        with copy.connect() as connection, connection.begin():
-            connection.execute(delete(tables.hold).where(own))
-            number = connection.scalar(select(func.max(tables.hold.c.number))) or 0
-            row = rows.row_of(tables.hold, hold, number=number + 1, ended=None, ended_by="")
-            rows.insert(connection, tables.hold, [row])
-            audit.doubt_points(connection)
-    except SQLAlchemyError as error:
-        raise StoreError(f"store {copy.name}: cannot be written ({cause(error)})") from None
+    connection.execute(delete(tables.hold).where(own))
+    number = connection.scalar(select(func.max(tables.hold.c.number))) or 0
+    row = rows.row_of(tables.hold, hold, number=number + 1, ended=None, ended_by="")
+    rows.insert(connection, tables.hold, [row])
+    audit.doubt_points(connection)
 
 
 def _close_log(file: Path) -> None:
@@ -391,6 +452,8 @@ def _copy_telemetry(source: Path, target: Path) -> None:
     target.mkdir(mode=0o700)
     for _ in range(2):
         for path in sorted(source.glob("????-??-??/*.*")):
+            if path.is_symlink() or path.parent.is_symlink():
+                continue  # the archive has none
             copy = target / path.parent.name / path.name
             if path.suffix in (".parquet", ".part") and not copy.exists():
                 copy.parent.mkdir(mode=0o700, exist_ok=True)

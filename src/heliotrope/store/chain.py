@@ -1,9 +1,9 @@
-"""Hash chains over events and audit: a record that was altered or removed no longer fits.
+"""Hash chains over events, audit and accounts: what was altered or removed no longer fits.
 
 Each link has the SHA-256 of the content of a record and of the digest before it. An event has one
-link; a record of the audit has two, when it is accepted and when it has its result. The one writer
-makes them in the transaction of the record, so they cost no further sync, and a killed plant leaves
-chains that fit.
+link; a record of the audit has two, when it is accepted and when it has its result; an account or
+token has one for each change, with its state before and after. The one writer makes them in the
+transaction of the record, so they cost no further sync, and a killed plant leaves chains that fit.
 
 Whoever can write the database can make all digests anew, or remove the newest records. So the
 heads (`heads`) go to another machine, and `verify` compares them. Old events leave: what remains of
@@ -11,10 +11,13 @@ them is the anchor, number and digest of the last that has left. A head of that 
 with it; one of an older event can be compared with nothing.
 """
 
+import hashlib
+import json
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -27,14 +30,16 @@ from heliotrope.files.times import format_time
 from heliotrope.safety import Severity
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
-from heliotrope.store.digests import AUDIT, EVENT, GENESIS, Head, digest_of
+from heliotrope.store.digests import ACCOUNT, AUDIT, CHAINS, EVENT, GENESIS, Head, digest_of
 from heliotrope.store.records import AuditEntry, StoreError
 
 ACCEPTED, RESULT = "accepted", "result"
 #: Rows of the table ``about`` with digest and number of the last event that has left.
 ANCHOR, ANCHOR_NUMBER = "event_anchor", "event_anchor_number"
 _EVENT, _AUDIT = tables.event, tables.audit
-_LINKS = {EVENT: tables.event_link, AUDIT: tables.audit_link}
+_LINKS = {EVENT: tables.event_link, AUDIT: tables.audit_link, ACCOUNT: tables.account_link}
+#: An account or a token: its kind, and its name or key.
+Key = tuple[str, str]
 
 
 def _event(row: Mapping[str, Any] | RowMapping) -> list[Any]:
@@ -74,11 +79,63 @@ def add_result(connection: Connection, identity: str, result: str, finished: str
 
 
 def _add_link(connection: Connection, identity: str, part: str, content: list[Any]) -> None:
-    number, before = _last(connection, AUDIT)
+    _append(connection, AUDIT, {"identity": identity, "part": part}, content)
+
+
+@contextmanager
+def changing_accounts(connection: Connection, names: Iterable[str] | None) -> Iterator[None]:
+    """Link what a block changes of the accounts of some persons (None: all), and their tokens."""
+    chosen = None if names is None else sorted(set(names))
+    before = _states(connection, chosen)
+    yield
+    after = _states(connection, chosen)
+    for key in sorted({*before, *after}):
+        link = dict(zip(("kind", "key"), key, strict=True))
+        link |= {"before": before.get(key, ""), "state": after.get(key, "")}
+        if link["before"] != link["state"]:
+            _append(connection, ACCOUNT, link, list(link.values()))
+
+
+def _states(connection: Connection, names: list[str] | None) -> dict[Key, str]:
+    """Return the states of accounts and tokens as JSON: all but passing figures and secrets."""
+
+    def rows_of(table: Any) -> list[RowMapping]:
+        of = table.c.name
+        query = select(table).order_by(*table.primary_key)
+        chosen = query if names is None else query.where(of.in_(names))
+        return list(connection.execute(chosen).mappings())
+
+    due = {row["name"] for row in rows_of(tables.password_due)}
+    factors = {
+        row["name"]: [row["word"], float(row["since"]), bool(row["confirmed"])]
+        for row in rows_of(tables.second_factor)
+    }
+    codes: dict[str, list[str]] = {}
+    for row in rows_of(tables.recovery_code):
+        codes.setdefault(row["name"], []).append(row["digest"])
+    states: dict[Key, list[Any]] = {}
+    for row in rows_of(tables.account):
+        name, kept = row["name"], hashlib.sha256(row["password_hash"].encode()).hexdigest()
+        times = [float(row["created"]), float(row["changed"])]
+        of_factor = [factors.get(name), sorted(codes.get(name, ()))]
+        state = [row["role"], kept, bool(row["disabled"]), *times, name in due, *of_factor]
+        states["account", name] = state
+    for row in rows_of(tables.api_token):
+        ends = None if row["expires"] is None else float(row["expires"])
+        about = [row["name"], row["label"], row["role"], float(row["created"]), ends]
+        states["token", row["key"]] = about
+    return {key: json.dumps(state, ensure_ascii=False) for key, state in states.items()}
+
+
+def _append(
+    connection: Connection, chain: str, link: Mapping[str, str], content: list[Any]
+) -> None:
+    """Add a link to a chain whose links have numbers of their own."""
+    number, before = _last(connection, chain)
     digest = digest_of(before, content)
-    row = {"number": number + 1, "identity": identity, "part": part, "digest": digest}
-    connection.execute(_LINKS[AUDIT].insert().values(row))
-    connection.info[AUDIT] = number + 1, digest
+    row = {"number": number + 1, **link, "digest": digest}
+    connection.execute(_LINKS[chain].insert().values(row))
+    connection.info[chain] = number + 1, digest
 
 
 def _last(connection: Connection, chain: str) -> tuple[int, str]:
@@ -97,7 +154,7 @@ def _read_last(connection: Connection, chain: str) -> tuple[int, str]:
 
 
 def _anchor(connection: Connection, chain: str) -> str:
-    return GENESIS if chain == AUDIT else _about(connection, ANCHOR) or GENESIS
+    return _about(connection, ANCHOR) or GENESIS if chain == EVENT else GENESIS
 
 
 def _about(connection: Connection, name: str) -> str | None:
@@ -174,7 +231,8 @@ def read_heads(path: Path) -> list[Head]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     listed = [
-        Head.read(match) for match in re.findall(r"\b(?:event|audit):\d+:[0-9a-f]{64}\b", text)
+        Head.read(match)
+        for match in re.findall(rf"\b(?:{'|'.join(CHAINS)}):\d+:[0-9a-f]{{64}}\b", text)
     ]
     if not listed:
         raise InputError(f"{path}: holds no head; give a file that --heads or syslog wrote")
@@ -184,10 +242,9 @@ def read_heads(path: Path) -> list[Head]:
 # -- checking ----------------------------------------------------------------------------
 
 
-def heads(connection: Connection) -> tuple[Head, Head]:
-    """Return the heads of both chains."""
-    event, record = (_read_last(connection, chain) for chain in (EVENT, AUDIT))
-    return Head(EVENT, *event), Head(AUDIT, *record)
+def heads(connection: Connection) -> tuple[Head, ...]:
+    """Return the heads of the `CHAINS`."""
+    return tuple(Head(chain, *_read_last(connection, chain)) for chain in CHAINS)
 
 
 @dataclass(frozen=True)
@@ -197,7 +254,7 @@ class Verified:
     Attributes
     ----------
     heads
-        The heads of both chains.
+        The heads of the `CHAINS`.
     fitting
         Heads that were noted before and are in the chains, or fit the anchor.
     old
@@ -206,14 +263,14 @@ class Verified:
         Time of the oldest event that is kept, POSIX s; None without any.
     """
 
-    heads: tuple[Head, Head]
+    heads: tuple[Head, ...]
     fitting: tuple[Head, ...]
     old: tuple[Head, ...]
     since: float | None
 
 
 def verify(connection: Connection, known: Iterable[Head] = ()) -> Verified:
-    """Check both chains, and that heads that were noted before are in them.
+    """Check the chains, and that heads that were noted before are in them.
 
     Raises
     ------
@@ -223,6 +280,7 @@ def verify(connection: Connection, known: Iterable[Head] = ()) -> Verified:
     """
     _verify_events(connection)
     _verify_audit(connection)
+    _verify_accounts(connection)
     fitting, old = list[Head](), list[Head]()
     for head in known:
         (fitting if _verify_head(connection, head) else old).append(head)
@@ -286,6 +344,46 @@ def _verify_audit(connection: Connection) -> None:
         parts = (ACCEPTED, RESULT) if entry.result else (ACCEPTED,)
         if any((name, part) not in linked for part in parts):
             raise StoreError(f"audit record {name} ({entry.what} by {entry.who}) is not linked")
+
+
+def _verify_accounts(connection: Connection) -> None:
+    links, last = _LINKS[ACCOUNT], GENESIS
+    states: dict[Key, str] = {}
+    for row in connection.execute(select(links).order_by(links.c.number)).mappings():
+        key, before, state = (row["kind"], row["key"]), row["before"], row["state"]
+        last = digest_of(last, [*key, before, state])
+        if last != row["digest"]:
+            raise StoreError(
+                f"link {row['number']} of the accounts ({key[0]} {key[1][:40]}) does not "
+                "fit: it was altered, or links before it were removed"
+            )
+        _compare(key, states.pop(key, ""), before, f" before its change in link {row['number']}")
+        if state:
+            states[key] = state
+    found = _states(connection, None)
+    for key in sorted({*states, *found}):
+        _compare(key, states.get(key, ""), found.get(key, ""), "")
+
+
+def _compare(key: Key, linked: str, found: str, when: str) -> None:
+    """Check that an account or token was as its last link says; "": there was none."""
+    if linked != found:
+        what = "altered" if linked and found else "removed" if linked else "added"
+        raise StoreError(
+            f"{_named(key, found or linked)} was {what}{when}, and not by the program; disable it, "
+            "and ask its engineers"
+        )
+
+
+def _named(key: Key, state: str) -> str:
+    """Return an account or a token in words."""
+    kind, name = key
+    values = json.loads(state)
+    return (
+        f"account {name} ({values[0]})"
+        if kind == "account"
+        else f"token {values[1]} of {values[0]}"
+    )
 
 
 def _verify_head(connection: Connection, head: Head) -> bool:

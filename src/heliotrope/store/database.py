@@ -20,7 +20,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from heliotrope.store.records import StoreError
 
 #: Revision of the tables that this program knows.
-HEAD = "0011"
+HEAD = "0012"
 FILE = "store.sqlite"
 #: Modes of the folders and files of a plant: for its user alone.
 _PRIVATE_FOLDER, PRIVATE = 0o700, 0o600
@@ -134,7 +134,7 @@ class Database:
             return
         path = self.file.with_name(self.file.name + ".lock")
         try:
-            self._lock = os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE)
+            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.close()
@@ -316,7 +316,7 @@ def make_private(folder: Path) -> None:
 
 
 #: What a plant makes in its data folder, beside the store.
-_MADE = ("telemetry", "targets", "interface", "first-password")
+MADE = ("telemetry", "targets", "marks", "photographs", "interface", "first-password")
 
 
 def tighten(folder: Path) -> None:
@@ -328,7 +328,8 @@ def tighten(folder: Path) -> None:
     if status.st_mode & stat.S_ISVTX or status.st_uid != os.geteuid():
         return
     folder.chmod(_PRIVATE_FOLDER)
-    made = [*folder.glob(f"{FILE}*"), *(folder / name for name in _MADE)]
+    made = [*folder.glob(f"{FILE}*"), *(folder / name for name in MADE)]
+    made = [path for path in made if not path.is_symlink()]
     inside = [path for top in made if top.is_dir() for path in top.rglob("*")]
     for path in [*made, *inside]:
         if path.is_symlink() or not path.exists() or path.is_socket():

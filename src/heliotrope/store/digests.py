@@ -10,12 +10,12 @@ from heliotrope.errors import InputError
 
 #: Digest before the first record.
 GENESIS = "0" * 64
-EVENT, AUDIT = "event", "audit"
+EVENT, AUDIT, ACCOUNT = CHAINS = "event", "audit", "account"
 
 
 @dataclass(frozen=True)
 class Head:
-    """Number and digest of the last link of a chain, `EVENT` or `AUDIT`."""
+    """Number and digest of the last link of a chain, one of `CHAINS`."""
 
     chain: str
     number: int
@@ -35,7 +35,7 @@ class Head:
         """
         chain, _, rest = text.partition(":")
         number, _, digest = rest.partition(":")
-        if chain not in (EVENT, AUDIT) or not number.isdigit() or len(digest) != len(GENESIS):
+        if chain not in CHAINS or not number.isdigit() or len(digest) != len(GENESIS):
             raise InputError(f"head {text!r}: give one as `heliotrope store head` prints it")
         return cls(chain, int(number), digest)
 

@@ -12,15 +12,17 @@ import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from sqlalchemy import Connection, select
 
 from heliotrope.errors import InputError
-from heliotrope.store import tables
+from heliotrope.store import chain, tables
 from heliotrope.store.database import PRIVATE, Database
 from heliotrope.store.records import StoreError
-from heliotrope.store.writer import Writer
+from heliotrope.store.writer import Work, Writer
 
+T = TypeVar("T")
 #: Name of the key file in the plant's data folder.
 KEY_FILE = "second-factor.key"
 #: Recovery codes of an account.
@@ -82,7 +84,7 @@ class Factors:
             row = {"name": name, "word": word, "since": now, "confirmed": False, "used": 0}
             connection.execute(_FACTOR.insert().values(row))
 
-        self._writer.do(work)
+        self._change(name, work)
         return made
 
     def confirm(self, name: str, code: str, now: float) -> tuple[str, ...]:
@@ -112,7 +114,7 @@ class Factors:
             ]
             connection.execute(_RECOVERY.insert(), rows)
 
-        self._writer.do(work)
+        self._change(name, work)
         return codes
 
     def check(self, name: str, code: str, now: float) -> Used | None:
@@ -140,7 +142,7 @@ class Factors:
             remaining = connection.execute(select(_RECOVERY.c.digest).where(mine)).all()
             return Used(recovery, len(remaining))
 
-        return self._writer.do(work)
+        return self._change(name, work)
 
     def remove(self, name: str) -> bool:
         """Remove the second factor of an account; return whether there was one."""
@@ -149,7 +151,16 @@ class Factors:
             connection.execute(_RECOVERY.delete().where(_RECOVERY.c.name == name))
             return connection.execute(_FACTOR.delete().where(_FACTOR.c.name == name)).rowcount > 0
 
-        return self._writer.do(work)
+        return self._change(name, work)
+
+    def _change(self, name: str, work: Work[T]) -> T:
+        """Change the factor of an account; the change is linked, see `chain`."""
+
+        def linked(connection: Connection) -> T:
+            with chain.changing_accounts(connection, (name,)):
+                return work(connection)
+
+        return self._writer.do(linked)
 
     # -- codes ---------------------------------------------------------------------------
 

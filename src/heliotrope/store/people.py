@@ -8,11 +8,11 @@ use them. Times are POSIX seconds and always arguments.
 import hashlib
 import secrets
 import unicodedata
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import (
     ColumnElement,
@@ -28,12 +28,13 @@ from sqlalchemy import (
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store import _rows as rows
-from heliotrope.store import tables
+from heliotrope.store import chain, tables
 from heliotrope.store.database import Database
 from heliotrope.store.factors import Factors
 from heliotrope.store.records import StoreError
-from heliotrope.store.writer import Writer
+from heliotrope.store.writer import Work, Writer
 
+T = TypeVar("T")
 _ACCOUNT, _SESSION, _TOKEN = tables.account, tables.session, tables.api_token
 _DUE, _FACTOR = tables.password_due, tables.second_factor
 #: In the place of a password's hash: a trusted proxy signs that person in.
@@ -47,6 +48,8 @@ _STATE = (
     (_ACCOUNT.c.password_hash == UNSET).label("no_password"),
 )
 ROLES = ("viewer", "operator", "engineer")
+#: Longest name of an account, characters.
+LONGEST_NAME = 100
 
 
 @dataclass(frozen=True)
@@ -232,8 +235,11 @@ class People:
             If it could not be written.
         """
         _check_role(role)
-        if not name.strip() or len(name) > 100 or not name.isprintable():
-            raise InputError(f"account {name!r}: give a name of 1 to 100 printable characters")
+        if not name.strip(" .") or len(name) > LONGEST_NAME or not name.isprintable():
+            raise InputError(
+                f"account {name[:LONGEST_NAME]!r}: give a name of 1 to {LONGEST_NAME} printable "
+                "characters, not of dots alone"
+            )
         if not password_hash:
             raise InputError(f"account {name}: a password hash is needed to sign in")
         made = Account(name, role, password_hash, False, now, now, due)
@@ -251,7 +257,7 @@ class People:
             connection.execute(_ACCOUNT.insert().values(rows.row_of(_ACCOUNT, made)))
             _set_due(connection, name, due=due)
 
-        self._writer.do(work)
+        self._change((name,), work)
         return made
 
     def change(
@@ -296,7 +302,7 @@ class People:
                     connection.execute(table.delete().where(table.c.name == name))
             return _need(connection, name)
 
-        return self._writer.do(work)
+        return self._change((name,), work)
 
     def remove(self, name: str) -> None:
         """Remove an account with its sessions and tokens.
@@ -317,7 +323,16 @@ class People:
                 connection.execute(table.delete().where(table.c.name == name))
             _check_engineers(connection, name)
 
-        self._writer.do(work)
+        self._change((name,), work)
+
+    def _change(self, names: Iterable[str], work: Work[T]) -> T:
+        """Change the accounts and tokens of some persons; the change is linked, see `chain`."""
+
+        def linked(connection: Connection) -> T:
+            with chain.changing_accounts(connection, names):
+                return work(connection)
+
+        return self._writer.do(linked)
 
     def factors(self, file: Path) -> Factors:
         """Return the second factors of the accounts; ``file`` has the key of their secrets."""
@@ -417,7 +432,7 @@ class People:
                 )
             connection.execute(_TOKEN.insert().values(asdict(made)))
 
-        self._writer.do(work)
+        self._change((name,), work)
         return made, secret
 
     def token(self, secret: str, now: float) -> ApiToken | None:
@@ -451,7 +466,8 @@ class People:
 
     def revoke_token(self, key: str) -> None:
         """Remove a token by its key, if it exists."""
-        self._writer.do(lambda c: _delete(c, _TOKEN, _TOKEN.c.key == key))
+        owners = {token.name for token in self.tokens() if token.key == key}
+        self._change(owners, lambda c: _delete(c, _TOKEN, _TOKEN.c.key == key))
 
     def forget_expired(self, now: float) -> tuple[Expired, ...]:
         """Remove expired sessions and tokens; return them.
@@ -474,7 +490,7 @@ class People:
                 _delete(connection, table, table.c.key == key)
 
         if keys:
-            self._writer.do(work)
+            self._change({ended.name for ended in expired if ended.token}, work)
         return tuple(expired)
 
     def _secret(self) -> str:

@@ -414,10 +414,17 @@ audit = Table(
     _text("finished"),
 )
 
-#: A link for each event, and two for each record of the audit: accepted, and result; see `chain`.
+#: A link for each event, two for each record of the audit (accepted, and result), and one for each
+#: change of an account or token; see `chain`.
 event_link = Table("event_link", metadata, _number(), _text("digest"))
 audit_link = Table(
     "audit_link", metadata, _number(), _text("identity"), _text("part"), _text("digest")
+)
+account_link = Table(
+    "account_link",
+    metadata,
+    _number(),
+    *(_text(name) for name in ("kind", "key", "before", "state", "digest")),
 )
 
 assigned_point = Table(

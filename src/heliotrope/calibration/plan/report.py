@@ -13,6 +13,7 @@ from heliotrope.calibration.plan.campaign import CalibrationCampaign
 from heliotrope.calibration.plan.fleets import Fleet
 from heliotrope.calibration.plan.planning import CandidateSightings, SightingPlan
 from heliotrope.errors import InputError
+from heliotrope.files.html import as_written
 from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, azimuth_elevation
 
@@ -148,6 +149,7 @@ def write_picture(path: str | Path, figure: "Figure") -> None:
     suffix = check_picture(path)
 
     def draw(stream: BinaryIO) -> None:
+        as_written(figure)
         figure.savefig(stream, dpi=110, format=suffix.removeprefix("."))
 
     write_file(path, draw)

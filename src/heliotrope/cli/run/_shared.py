@@ -27,6 +27,7 @@ from heliotrope.cli.run._evidence import Evidence, leaving
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.plant import Plant
 from heliotrope.files.disk import DiskBusyError, DiskThread
+from heliotrope.files.text import read_text
 from heliotrope.geometry import as_float
 from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
@@ -56,6 +57,8 @@ AT_ONCE, _INTERRUPTED = 2.0, 130
 #: the young ones every 700 was most of the longest beats, and a full collection holds the loop for
 #: up to 0.08 s and finds next to nothing.
 _COLLECTED = (50_000, 10, 1000)
+#: Longest notice, bytes.
+_NOTICE = 4096
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 #: Span of the pace that a line shows, s, and the least difference from real time that it shows.
 _SLOWER = 0.05
@@ -92,6 +95,8 @@ class Shown:
     people_by_proxy: Path | None = None
     second_factor: str = ""
     emergency_port: int | None = None
+    idle_s: float = 1800.0
+    notice: Path | None = None
     console: bool = True
     browser: bool = True
     data: Path | None = None
@@ -142,6 +147,8 @@ class Shown:
             people_by_proxy=self.people_by_proxy,
             second_factor=self.second_factor,
             emergency_port=self.emergency_port,
+            idle_s=self.idle_s,
+            notice="" if self.notice is None else read_text(self.notice, "a notice", _NOTICE),
         )
 
 

@@ -204,6 +204,23 @@ def run(
             rich_help_panel=_CONSOLE,
         ),
     ] = "",
+    idle_lock: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=600.0,
+            help="Minutes without an order after which a page's next one needs the password again; "
+            "0: never.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = 30.0,
+    notice: Annotated[
+        Path | None,
+        typer.Option(
+            help="File with a text for everybody who is about to sign in.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = None,
     emergency_port: Annotated[
         int | None,
         typer.Option(
@@ -304,6 +321,8 @@ def run(
         people_by_proxy=people_by_proxy,
         second_factor=second_factor,
         emergency_port=emergency_port,
+        idle_s=60.0 * idle_lock,
+        notice=notice,
         console=not no_console,
         browser=not no_browser,
         data=data,

@@ -40,6 +40,7 @@ from heliotrope.plant.io.followed_clock import ClockReader, FollowedLoop
 from heliotrope.plant.io.receiver_flux import check_reference, flux_by
 from heliotrope.plant.io.sensors import AllSensors, Sensors
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.orders.audit import Forgetful
 from heliotrope.plant.orders.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.ports import Ports
@@ -344,5 +345,12 @@ async def _run(
                 name = f"key of the bus of {local.installation.config.name}"
                 papers.renew(name, [file], local.installation.take_bus_keys)
         speed = 1.0 if outside.reader is None else outside.reader.state.asked
-        async with papers.watched(live.logbook.take_alarm):
+        if shown.console and shown.certificate is not None:
+            # The console takes it; here its change is only noted.
+            papers.renew("certificate of the console", [shown.certificate], lambda: None)
+
+        def note(name: str) -> None:
+            live.operations.security.note(SecurityEvent.KEYS_RENEWED, detail=name)
+
+        async with papers.watched(live.logbook.take_alarm, note):
             await at_work(live, keeper, shown, folder, ending, stows=real, speed=speed)

@@ -119,6 +119,12 @@ part("theme").onclick = () => {
   localStorage.setItem(THEME, classList.toggle("light") ? "light" : "dark");
   store.emit("theme");
 };
+store.confirm = async () => {
+  const given = await ask("Nothing was ordered here for a while. The view stays; give your password to go on.",
+    [{ name: "own_password", label: "Your own password", type: "password" }], "Go on");
+  if (given) await api("PUT", "session/presence", given);
+  return Boolean(given);
+};
 menu(part("menu"));
 bar(part("bar"));
 store.begun.then(() => {

@@ -18,6 +18,7 @@ class Store extends EventTarget {
   focus = -1; // the row that is looked at
   live = false;
   early = []; // messages that came before the field
+  confirm = async () => false; // asks the person for their password; whether they gave it
 
   emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
 
@@ -126,6 +127,8 @@ export async function api(method, path, body) {
     options.headers["Content-Type"] = "application/json";
   }
   const answer = await fetch(`/api/v1/${path}`, options);
+  // The page was left alone for long: the person confirms, and the order goes again.
+  if (answer.status === 423 && await store.confirm()) return api(method, path, body);
   if (answer.status === 401) { location.assign("/login"); throw new ApiError(401, "signed out"); }
   const data = answer.status === 204 ? null : await answer.json();
   if (!answer.ok) {

@@ -44,8 +44,6 @@ VIEWER, OPERATOR, ENGINEER = Role
 FRESH = 0.5
 #: The same of a view that never changes.
 ALWAYS = float("inf")
-#: Time for which a browser keeps a photograph, s.
-DAY = 86_400.0
 _LINK = re.compile(r"\[([^\]]+)\]\([^)]+\)")
 
 
@@ -94,7 +92,7 @@ class Call:
     bare
         Whether a request may come without a body.
     fresh
-        Time for which all callers share an answer, or a browser keeps a picture, s; 0: none.
+        Time for which all callers share an answer, s; 0: none.
     urgent
         Whether it belongs to the socket for EMERGENCY, DEFOCUS and STOW.
     console
@@ -310,7 +308,14 @@ async def bus_frames(desk: Desk, who: Person, order: orders.Named) -> tuple[view
 def note(desk: Desk, order: orders.Note) -> None:
     """Record a security event."""
     kind = SecurityEvent[order.kind]
-    desk.operations.security.note(kind, order.who, order.address, order.detail)
+    desk.operations.security.note(kind, order.who, order.address, order.detail, order.more)
+
+
+@_call()
+def note_use(desk: Desk, who: Person, order: orders.Use) -> None:
+    """Record what a person on this machine did with the records; see `cli._noted`."""
+    kind = SecurityEvent[order.kind]
+    desk.operations.security.note(kind, who.name, detail=order.detail)
 
 
 # -- the command authority -----------------------------------------------------------------------
@@ -540,13 +545,13 @@ def retries(desk: Desk) -> tuple[Retry, ...]:
 
 
 @_call("GET heliostats/{name}/parameters", "calibration")
-async def parameters(desk: Desk, order: orders.Named) -> ParametersView:
+async def parameters(desk: Desk, who: Person, order: orders.Named) -> ParametersView:
     """Return the error parameters of a heliostat.
 
-    It gives those of the plant file, those in use with σ, whether its local controller stores them,
-    and earlier versions.
+    It gives those of the plant file, those in use with σ, whether its local controller stores them
+    (asked now for an operator, else as last compared), and earlier versions.
     """
-    return await desk.operations.parameters.view(order.name)
+    return await desk.operations.parameters.view(order.name, who)
 
 
 @_call("POST parameters", "calibration", ENGINEER)
@@ -596,7 +601,7 @@ async def kept_photographs(desk: Desk, order: orders.KeptOf) -> tuple[views.Pict
     return tuple(await desk.kept(order.heliostat, order.limit))
 
 
-@_call("GET photographs/{identity}", "calibration", fresh=DAY)
+@_call("GET photographs/{identity}", "calibration")
 async def kept_photograph(desk: Desk, order: orders.KeptOne) -> WithBlob:
     """Return a kept photograph, annotated with the findings of the software."""
     return WithBlob({"identity": order.identity}, await desk.kept_picture(order.identity))

@@ -217,11 +217,22 @@ class KeptOne(Strict):
 
 
 class Note(Strict):
-    """A security event: its name, the person, the address of the caller, and details."""
+    """A security event: its name, the person, the address of the caller, and details.
+
+    Or the sum of events that the console has counted, ``more``.
+    """
 
     kind: Annotated[str, Field(pattern=f"^({'|'.join(SecurityEvent.__members__)})$")]
     who: Words
     address: Words
+    detail: Words
+    more: Annotated[int, Field(ge=0, le=2**53)] = 0
+
+
+class Use(Strict):
+    """What a person on this machine did with the records: the name of its event, and details."""
+
+    kind: Annotated[str, Field(pattern="^(BACKED_UP|EXPORTED|QUERIED)$")]
     detail: Words
 
 

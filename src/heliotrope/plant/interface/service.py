@@ -12,7 +12,6 @@ import hashlib
 import hmac
 import logging
 import math
-import pwd
 import secrets
 import threading
 import time
@@ -26,7 +25,7 @@ from pydantic import ValidationError
 
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.local import EMERGENCY, ORDINARY, Frame, LocalLimits, LocalServer, socket_folder
-from heliotrope.local.sockets import make_folder
+from heliotrope.local.sockets import make_folder, name_here
 from heliotrope.plant import refusals
 from heliotrope.plant.interface.admission import Admission
 from heliotrope.plant.interface.calls import CALLS, Call, Later, WithBlob, asked
@@ -188,7 +187,7 @@ class PlantInterface:
         """
         key, token = hello.get("key"), hello.get("token")
         if hello == {"user": True}:
-            return LocalCaller(Person(f"{_user_name(user)} on this machine", _WITHOUT[socket]))
+            return LocalCaller(Person(name_here(user), _WITHOUT[socket]))
         if isinstance(key, str) and hmac.compare_digest(key.encode(), self.key.encode()):
             return LocalCaller(None)
         person = await self._person(token) if isinstance(token, str) else None
@@ -416,14 +415,6 @@ def _checked(model: Any, given: dict[str, Any]) -> Any:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(map(str, first["loc"]))
         raise InputError(f"{place}: {first['msg']}") from None
-
-
-def _user_name(user: int) -> str:
-    """Return the name of a user of this machine; its number if it has none."""
-    try:
-        return pwd.getpwuid(user).pw_name
-    except KeyError:
-        return f"user {user}"
 
 
 def _on_behalf(given: Any) -> Person:

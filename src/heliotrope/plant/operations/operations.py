@@ -150,6 +150,7 @@ class Operations:
             for task in beside:
                 task.cancel()
         self.errands.end("the plant's program has ended")
+        self.security.close()
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations end")
 
     async def _look(self) -> None:

@@ -1,10 +1,10 @@
 """Security events of a plant: recorded as events, sent on, and watched for patterns.
 
-A stranger can cause any number of some kinds, so each kind is recorded at most `MOST` times in a
-`SPAN`; the rest are counted, and one event says how many there were.
+Anybody can cause any number of some kinds, so those of one kind and person are recorded at most
+`MOST` times in a `SPAN`; the rest are counted, and one event says how many there were. One person's
+events never leave out another's.
 """
 
-import asyncio
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,8 +16,12 @@ from heliotrope.safety import AlarmKind, Severity, alarms
 
 #: Kind of these events in the store and in the page.
 KIND = "security"
-#: Most events of one kind that are recorded singly in a span, s.
-MOST, SPAN = 30, 60.0
+#: Most events of one kind and person that are recorded singly in a span.
+MOST = 30
+#: The same of all persons together.
+MOST_OF_ALL = 300
+#: That span, s.
+SPAN = 60.0
 #: Refused orders within a span, s, that raise an alarm.
 ORDERS, ORDERS_SPAN = 5, 300.0
 #: An alarm ends after this time without a cause, s.
@@ -47,6 +51,10 @@ class SecurityEvent(Enum):
     HOST_REFUSED = ("request for an unknown host name refused", Severity.WARNING)
     ORIGIN_REFUSED = ("request from another site refused", Severity.WARNING)
     LINK_REFUSED = ("link refused", Severity.WARNING)
+    BACKED_UP = ("made a backup", Severity.INFO)
+    EXPORTED = ("exported calibrations", Severity.INFO)
+    QUERIED = ("queried the telemetry", Severity.INFO)
+    KEYS_RENEWED = ("keys or certificates renewed", Severity.WARNING)
     CHAIN_HEAD = ("head of the records' chains", Severity.INFO)
 
     @property
@@ -77,6 +85,48 @@ class SecurityNote:
         return f"{self.kind.words}{about}" + (f" (from {self.address})" if self.address else "")
 
 
+@dataclass
+class _Span:
+    """A span: when it began, s, the events that were recorded in it, and the others."""
+
+    begun: float
+    recorded: int = 0
+    more: int = 0
+
+
+class EventCounter:
+    """Says which security events are recorded singly, and counts the others by kind and person."""
+
+    def __init__(self) -> None:
+        self._spans: dict[tuple[SecurityEvent, str | None], _Span] = {}
+
+    def admits(self, kind: SecurityEvent, who: str, now: float, count: int = 1) -> bool:
+        """Whether an event, or a sum of ``count``, is recorded by itself; if not, it is counted."""
+        person, everybody = self._span((kind, who), now), self._span((kind, None), now)
+        if person.recorded < MOST and everybody.recorded < MOST_OF_ALL:
+            person.recorded += 1
+            everybody.recorded += 1
+            return True
+        self.count(kind, who, now, count)
+        return False
+
+    def count(self, kind: SecurityEvent, who: str, now: float, count: int) -> None:
+        """Count events for the sum of their kind and person."""
+        self._span((kind, who), now).more += count
+
+    def sums(self, now: float, *, all_: bool = False) -> list[tuple[SecurityEvent, str, int]]:
+        """Return kind, person and number of the events counted in spans that are over, or all."""
+        over = [key for key, span in self._spans.items() if all_ or now - span.begun >= SPAN]
+        spans = [(*key, self._spans.pop(key).more) for key in over]
+        return [(kind, who, more) for kind, who, more in spans if who is not None and more]
+
+    def _span(self, key: tuple[SecurityEvent, str | None], now: float) -> _Span:
+        span = self._spans.setdefault(key, _Span(now))
+        if now - span.begun >= SPAN:
+            span.begun, span.recorded = now, 0
+        return span
+
+
 class SecurityLog:
     """Records security events, and raises alarms about patterns of them; used in the plant's loop.
 
@@ -96,8 +146,7 @@ class SecurityLog:
     def __init__(self, logbook: Logbook, clock: Clock) -> None:
         self._log, self._clock = logbook, clock
         self.forward: Callable[[SecurityNote], None] | None = None
-        self._recorded: dict[SecurityEvent, deque[float]] = {}
-        self._more: dict[SecurityEvent, int] = {}
+        self._counter = EventCounter()
         self._orders: deque[float] = deque(maxlen=ORDERS)
         self._until: dict[AlarmKind, float] = {}
         self._link = ""
@@ -105,23 +154,27 @@ class SecurityLog:
     def _utc(self) -> float:
         return self._clock.utc().timestamp()
 
-    def note(self, kind: SecurityEvent, who: str = "", address: str = "", detail: str = "") -> None:
-        """Record an event of a kind, unless there were too many of it lately."""
-        made = SecurityNote(kind, self._utc(), plain(who), plain(address), plain(detail))
+    def note(
+        self, kind: SecurityEvent, who: str = "", address: str = "", detail: str = "", more: int = 0
+    ) -> None:
+        """Record an event of a kind, unless there were too many of it lately.
+
+        A console gives the events that it has counted in their sum, ``more``.
+        """
+        text = _sum_of(more) if more else plain(detail)
+        made = SecurityNote(kind, self._utc(), plain(who), plain(address), text)
         now = self._clock.monotonic()
         self._watch(made, now)
-        times = self._recorded.setdefault(kind, deque(maxlen=MOST))
-        if len(times) == MOST and now - times[0] < SPAN:
-            if not self._more.get(kind):
-                asyncio.get_running_loop().call_later(SPAN, self._sum_up, kind)
-            self._more[kind] = self._more.get(kind, 0) + 1
-            return
-        times.append(now)
-        self._record(made)
+        if self._counter.admits(kind, made.who, now, more or 1):
+            self._record(made)
 
-    def _sum_up(self, kind: SecurityEvent) -> None:
-        count = self._more.pop(kind, 0)
-        self._record(SecurityNote(kind, self._utc(), "", "", f"at least {count} more in a minute"))
+    def close(self) -> None:
+        """Record how many events were counted until now."""
+        self._sum_up(all_=True)
+
+    def _sum_up(self, *, all_: bool = False) -> None:
+        for kind, who, more in self._counter.sums(self._clock.monotonic(), all_=all_):
+            self._record(SecurityNote(kind, self._utc(), who, "", _sum_of(more)))
 
     def _record(self, made: SecurityNote) -> None:
         self._log.event(KIND, made.who, made.text, made.kind.severity)
@@ -129,7 +182,11 @@ class SecurityLog:
             self.forward(made)
 
     def look(self, refused_link: str = "") -> None:
-        """End alarms whose causes have ceased; note a link that was refused since the last look."""
+        """End alarms whose causes have ceased; note a link that was refused since the last look.
+
+        Sums of events that were not recorded singly are recorded once their minute is over.
+        """
+        self._sum_up()
         now = self._clock.monotonic()
         for kind in [kind for kind, until in self._until.items() if now >= until]:
             del self._until[kind]
@@ -151,6 +208,10 @@ class SecurityLog:
         if kind not in self._until:
             self._log.take_alarm(kind.raised(who=who, address=address or "this machine"))
         self._until[kind] = now + QUIET
+
+
+def _sum_of(more: int) -> str:
+    return f"{more} more in a minute"
 
 
 def plain(text: str) -> str:

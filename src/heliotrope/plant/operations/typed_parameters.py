@@ -8,22 +8,26 @@ replaces them. Earlier versions come from the store.
 import asyncio
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from math import ceil
 
 import numpy as np
 
 from heliotrope.calibration.record import HeliostatCalibration, Provenance
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.local import Buckets
 from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.plant.orders.authority import Person, RefusedError
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
 
 #: Wait for the answer of a local controller, s.
 _PATIENCE = 5.0
+#: Questions of a person to local controllers: 1/s, and at once.
+ASKED = (0.2, 5.0)
 
 
 @dataclass(frozen=True)
@@ -94,13 +98,18 @@ class TypedParameters:
         most: float = CycleSettings().most,
     ) -> None:
         self._plant, self._log, self._records, self._most = plant, log, records, most
+        self._asked = Buckets(*ASKED, plant.clock.monotonic)
 
     # -- looking ---------------------------------------------------------------------------
 
-    async def view(self, heliostat: str) -> ParametersView:
-        """Return the parameters of a heliostat, and what its local controller stores."""
+    async def view(self, heliostat: str, who: Person) -> ParametersView:
+        """Return the parameters of a heliostat, and what its local controller stores.
+
+        An operator asks the local controller, at most as often as `ASKED` says, since one question
+        is some twenty messages on the bus. Everybody else gets the plant's own last comparison.
+        """
         record, group = self._plant.beliefs.record(heliostat), self._plant.design.find(heliostat)[0]
-        stored = await self._stored(heliostat)
+        stored = await self._stored(heliostat, who)
         now = self._now(heliostat)
         in_file = self._file(heliostat)
         states = []
@@ -120,7 +129,12 @@ class TypedParameters:
         ]
         return ParametersView(heliostat, version, stored, tuple(states), tuple(earlier[::-1]))
 
-    async def _stored(self, heliostat: str) -> str:
+    async def _stored(self, heliostat: str, who: Person) -> str:
+        if who.role < Role.OPERATOR:
+            return self._plant.compared(heliostat)
+        if wait := self._asked.take(who.name):
+            known = self._plant.compared(heliostat)
+            return f"{known} (at the last comparison; it can be asked again in {ceil(wait)} s)"
         try:
             sums = await self._plant.stored(heliostat, _PATIENCE)
         except RefusedError as error:

@@ -186,6 +186,12 @@ class ParameterSync(Part):
             return refusals.PARAMETERS_DIFFER.text.format(items=listed)
         return refusals.NOT_COMPARED.text if heliostat in self._strange else None
 
+    def compared(self, heliostat: str) -> str:
+        """Return in words how the last comparison of a heliostat ended; nothing is sent."""
+        if heliostat not in self._wanted.items:
+            return "not compared: this plant does not write parameters"
+        return self.differing(heliostat) or "the same"
+
     def check(self, heliostat: str, items: Mapping[str, bytes]) -> None:
         """Check that the beam of a heliostat is safe if items are written now.
 

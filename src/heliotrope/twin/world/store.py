@@ -72,7 +72,7 @@ class PlantStore:
         self.keeper.close()
         self._count += 1
         place = self._folder / f"{self._count}.sqlite"
-        backup.restore(folder, place)
+        backup.restore(folder, place, self._clock.utc())
         self.keeper = Keeper(place, inline=True)
         self.points = KeptPoints(self.keeper)
         self._persons.restored(words, self._clock.monotonic())

@@ -1,0 +1,66 @@
+"""What people do with the records of a plant is recorded there: backups, exports, queries.
+
+A plant that runs records it itself, by its local interface; into the store of one that is stopped
+the command writes.
+"""
+
+import os
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+from heliotrope.errors import HeliotropeError
+from heliotrope.local import ORDINARY, AwayError, ask_once, name_here, socket_folder
+
+#: Data folder of a plant whose store is in PostgreSQL, as `heliotrope ctl` reads it.
+_PLANT = "HELIOTROPE_PLANT"
+#: Longest detail that a plant takes.
+_LONGEST = 400
+
+
+def this_person() -> str:
+    """Return how the user of this process is named in records."""
+    return name_here(os.geteuid())
+
+
+def note_use(place: str, kind: str, detail: str) -> None:
+    """Record in a store what this person did with it; say so if that is not possible.
+
+    Parameters
+    ----------
+    place
+        Data folder of a plant, or the URL of its database.
+    kind, detail
+        Name of a `SecurityEvent`, and what was done.
+    """
+    detail = " ".join(detail.split())[:_LONGEST]
+    try:
+        try:
+            _ask_plant(place, kind, detail)
+        except AwayError:
+            _write(place, kind, detail)
+    except HeliotropeError as error:
+        sys.stderr.write(f"heliotrope: not recorded in the store: {error}\n")
+
+
+def _ask_plant(place: str, kind: str, detail: str) -> None:
+    folder = os.environ.get(_PLANT, "") if "://" in place else place
+    if not folder:
+        raise AwayError(f"no folder of a running plant is given; set {_PLANT} to it")
+    socket = socket_folder(Path(folder)) / ORDINARY
+    ask_once(socket, {"user": True}, "note_use", {"kind": kind, "detail": detail})
+
+
+def _write(place: str, kind: str, detail: str) -> None:
+    from heliotrope.plant.operations.security import KIND, SecurityEvent, SecurityNote, plain
+    from heliotrope.store.database import Database
+    from heliotrope.store.keeper import Keeper
+    from heliotrope.store.records import Event
+
+    with Database(place) as database:
+        database.require()  # a keeper would make a store where there is none
+    known = SecurityEvent[kind]
+    note = SecurityNote(known, time.time(), this_person(), "", plain(detail))
+    with closing(Keeper(place)) as keeper:
+        keeper.record_event(Event(note.at, KIND, f"{note.who}: {note.text}", known.severity))

@@ -1,0 +1,93 @@
+"""Passwords that are guessed first: common ones and their variations, runs, and the own name.
+
+NIST SP 800-63B, section 3.1.1.2, asks for such a list. A longer one is of little use here: a
+password has ten characters or more, and guessing is slowed down (see `_attempts`).
+"""
+
+import itertools
+import re
+
+#: Common passwords without the digits and signs that people put around them.
+_WORDS = """
+abc abcd abcdef access admin administrator alexander america asdfasdf asdfghjkl baseball
+basketball batman benutzer bienvenue blink butterfly changeme charlie chocolate computer
+contrasena contraseña control controlroom cookie dallas default dragon einstein elephant engineer
+enter field firstpassword flower football freedom geheim guest hallo heliostat heliotrope hello
+hockey iloveu iloveyou internet jennifer jordan justdoit kennwort killer letmein liverpool login
+lovely maintenance manager master mercedes michael michelle monkey motdepasse mustang mypassword
+ninja nothing operator pass passphrase passw passwd password passwort peace plant please pokemon
+princess qazwsx qazwsxedc qwert qwerty qwertyuiop qwertz qwertzuiop rockyou root samsung scada
+secret security service shadow solar solarfield solarplant solartower sommer spring starwars
+summer sunflower sunshine super superman superuser support system techsupport temporary temppass
+test testing testtest tower trustno user username viewer welcome whatever winter world zaq zaqxsw
+zxcvbn zxcvbnm
+"""
+_COMMON = frozenset(_WORDS.split())
+_LETTERS = str.maketrans("4@831!0$5", "aabeiioss")
+_ROWS = ("abcdefghijklmnopqrstuvwxyz", "01234567890", "qwertyuiop", "qwertzuiop", "asdfghjkl",
+         "zxcvbnm", "yxcvbnm", "qazwsxedcrfvtgbyhnujmikolp", "1qaz2wsx3edc4rfv5tgb6yhn7ujm8ik9ol",
+         "1q2w3e4r5t6y7u8i9o0p")  # fmt: skip
+#: So many different characters at least, and at most this share of them in runs.
+_DIFFERENT, _RUNNING = 5, 0.75
+_LEAST_RUN = 4
+
+
+def weakness(password: str, name: str = "") -> str | None:
+    """Return why a password is guessed early, None if it is not known to be.
+
+    Parameters
+    ----------
+    password
+        As typed.
+    name
+        Name of the account.
+    """
+    small = password.casefold()
+    if len(set(small)) < _DIFFERENT:
+        return f"it has fewer than {_DIFFERENT} different characters"
+    if _repeated(small):
+        return "it repeats a part"
+    if _running(small) > _RUNNING * len(small):
+        return "it follows the keyboard or the alphabet"
+    read = {_bare(small), _bare(small.translate(_LETTERS)), _bare(small).translate(_LETTERS)}
+    if any(_is_common(word) for word in read):
+        return "it is a common password, or varies one"
+    own = name.casefold()
+    if len(own) > 2 and own in small and len(small) - len(own) < 8:
+        return "it is the name of the account with little beside it"
+    return None
+
+
+def _repeated(text: str) -> bool:
+    """Whether a text is one part over and over."""
+    return (text + text).find(text, 1) < len(text)
+
+
+def _running(text: str) -> int:
+    """Return the characters of a text that stand in runs of a row, forwards or backwards."""
+    rows, count, place = [*_ROWS, *(row[::-1] for row in _ROWS)], 0, 0
+    while place < len(text):
+        longest = max(_common_run(text, place, row) for row in rows)
+        count += longest if longest >= _LEAST_RUN else 0
+        place += longest if longest >= _LEAST_RUN else 1
+    return count
+
+
+def _common_run(text: str, place: int, row: str) -> int:
+    """Return the length of the run that begins at a place and follows a row."""
+    begin = row.find(text[place])
+    if begin < 0:
+        return 0
+    pairs = zip(text[place:], row[begin:], strict=False)
+    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+def _is_common(word: str) -> bool:
+    """Whether a word is common, or two common words with digits and signs between them."""
+    pairs = ((_bare(word[:k]), _bare(word[k:])) for k in range(1, len(word)))
+    return word in _COMMON or any(a in _COMMON and b in _COMMON for a, b in pairs)
+
+
+def _bare(word: str) -> str:
+    """Return a word without the digits and signs around it."""
+    return re.sub(r"^[\W\d_]+|[\W\d_]+$", "", word)

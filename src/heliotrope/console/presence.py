@@ -1,0 +1,40 @@
+"""Whether the person of a session is still there: the lock of a page that was left open.
+
+A page that has ordered nothing for a while goes on showing the field, but its next order needs the
+person's password again. EMERGENCY, DEFOCUS and STOW never do. What a page sends by itself does not
+count: it renews the command authority every few seconds.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+#: Sessions that are remembered; the longest unused are dropped first, and count as new.
+_MOST = 2000
+
+
+class Presence:
+    """The last orders of sessions.
+
+    Parameters
+    ----------
+    idle_s
+        Time after which a person must confirm, s; 0: never.
+    monotonic
+        Returns the time, s.
+    """
+
+    def __init__(self, idle_s: float, monotonic: Callable[[], float]) -> None:
+        self._idle, self._now = idle_s, monotonic
+        self._last: OrderedDict[str, float] = OrderedDict()
+
+    def away(self, secret: str) -> bool:
+        """Whether a session has ordered nothing for too long; a new one begins now."""
+        now = self._now()
+        return 0.0 < self._idle <= now - self._last.setdefault(secret, now)
+
+    def seen(self, secret: str) -> None:
+        """Note that the person of a session is there."""
+        self._last[secret] = self._now()
+        self._last.move_to_end(secret)
+        if len(self._last) > _MOST:
+            self._last.popitem(last=False)
