@@ -213,7 +213,7 @@ def by_page(target: Target) -> float:
         print("  the emergency before could not be withdrawn")
         return math.inf
     since, done, word = time.time(), threading.Event(), f"{time.time()}"
-    headers = {"Authorization": f"Bearer {target.token}"}
+    headers = {"Authorization": f"Bearer {target.operator}"}
 
     def one(port: int) -> None:
         with contextlib.suppress(httpx.HTTPError):
