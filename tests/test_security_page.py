@@ -41,6 +41,16 @@ def test_each_attack_that_is_named_exists() -> None:
     assert known - named == {"nothing"}
 
 
+def test_each_requirement_of_level_2_is_met_or_says_what_is_missing() -> None:
+    found = rows("IEC 62443-3-3, SL 2 by requirement")
+    asked = "1.7 1.11 1.12 2.5 2.6 2.8 2.9 2.10 3.4 3.8 3.9 4.2 6.2 7.1 7.2 7.3 7.4"
+    assert " ".join(row[0].split()[1] for row in found) == asked
+    for _, state, how, proof in found:
+        assert state in ("met", "partly", "not met")
+        assert how
+        assert re.search(r"`tests/[\w/]+\.py`", proof)
+
+
 def test_the_seven_requirements_are_answered() -> None:
     found = rows("IEC 62443-3-3")
     assert [row[0].split()[0] for row in found] == [f"FR{k}" for k in range(1, 8)]
