@@ -9,7 +9,8 @@ from heliotrope.console.app import ROUTERS
 from heliotrope.console.routes import least_role
 from heliotrope.plant.interface import CALLS
 
-PAGE = Path(__file__).parents[1] / "docs" / "reference" / "api-http.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "reference" / "api-http.md"
 _HEAD = "| route | least role | |\n|---|---|---|\n"
 _PLACES = {"none": 0, "viewer": 1, "operator": 2, "engineer": 3}
 
@@ -22,6 +23,7 @@ def _rows() -> list[tuple[str, str, str, str]]:
         if isinstance(route, APIRoute):
             (method,) = route.methods
             path, role = route.path.removeprefix("/api/v1/"), least_role(route.dependant)
+            path = path.replace(":path}", "}")
             text = texts.get(f"{method} {path}") or " ".join(route.description.split())
             text = text.removesuffix(".").removeprefix("Return " if method == "GET" else "")
             text = text[:1].lower() + text[1:]
@@ -29,12 +31,9 @@ def _rows() -> list[tuple[str, str, str, str]]:
     return sorted(found, key=lambda row: (_PLACES[row[0]], *row[1:]))
 
 
-def page() -> str:
-    """Return the page's text."""
+def pages() -> dict[str, str]:
+    """Return the page's text by its path."""
     rows = [f"| `{method} {path}` | {role} | {text} |\n" for role, path, method, text in _rows()]
     text = PAGE.read_text(encoding="utf-8")
-    return re.sub(re.escape(_HEAD) + r"(\|.*\n)+", lambda _: _HEAD + "".join(rows), text, count=1)
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    made = re.sub(re.escape(_HEAD) + r"(\|.*\n)+", lambda _: _HEAD + "".join(rows), text, count=1)
+    return {str(PAGE.relative_to(ROOT)): made}
