@@ -12,8 +12,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 MODULES = (
-    "alarms_page", "api_page", "house", "library_pages", "limits_page", "parameters_page", "safety_table",
-    "state_table", "wire_table", "wiring",
+    "alarms_page", "api_page", "house", "library_pages", "limits_page", "parameters_page",
+    "safety_table", "state_table", "wire_table", "wiring",
 )  # fmt: skip
 
 
