@@ -13,7 +13,7 @@ import pytest
 from heliotrope.console._secrets import verify_password
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.store.keeper import Keeper
-from heliotrope.store.people import UNSET
+from heliotrope.store.people import UNSET, ApiToken, Session
 from support.live_console import PASSWORD, LiveConsole
 from support.pages import NEEDS_BROWSER, menu, said, until
 
@@ -79,7 +79,13 @@ def test_first_start(field: LiveConsole, browser: Any, tmp_path: Path) -> None:
     password = first_start(keeper.people, time.time())
     console = field.server.app.state.console
     before = field.call(lambda: console.people)
+
+    async def valid(used: list[str]) -> dict[tuple[str, str], Session | ApiToken]:
+        found = keeper.people.valid(time.time(), used)
+        return {("session", one.key): one for one in found.sessions}
+
     field.call(lambda: setattr(console, "people", keeper.people))
+    field.call(lambda: setattr(console.plant, "valid", valid))
     page = browser.new_page()
     try:
         page.goto(f"{field.address}login")
@@ -101,6 +107,7 @@ def test_first_start(field: LiveConsole, browser: Any, tmp_path: Path) -> None:
     finally:
         page.close()
         field.call(lambda: setattr(console, "people", before))
+        field.call(lambda: delattr(console.plant, "valid"))
         keeper.close()
 
 
