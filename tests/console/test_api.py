@@ -55,6 +55,7 @@ NEEDED = {
     ("PUT", "timetable"): "operator",
     ("DELETE", "emergency"): "operator",
     ("PUT", "session/password"): "viewer",
+    ("PUT", "session/presence"): "viewer",
     **{(method, "session/factor"): "viewer" for method in ("POST", "PUT", "DELETE")},
     ("DELETE", "accounts/{name}/factor"): "engineer",
     ("POST", "accounts/{name}/password"): "engineer",

@@ -78,15 +78,15 @@ def test_sign_ins_of_one_person_leave_out_nobody_else(console: LiveConsole) -> N
 
     async def flood() -> None:
         for _ in range(MOST + 3):
-            await inside.note(SecurityEvent.SIGNED_OUT, HTTPConnection(scope), "viewer")
-        await inside.note(SecurityEvent.SIGNED_OUT, HTTPConnection(scope), "engineer")
+            await inside.note(SecurityEvent.SIGNED_OUT, HTTPConnection(scope), "visitor")
+        await inside.note(SecurityEvent.SIGNED_OUT, HTTPConnection(scope), "guide")
         for kind, who, more in inside.counter.sums(time.monotonic(), all_=True):
             await inside.plant.note(kind, who, more=more)
 
     console.console_wait(flood())
-    recorded(console, "engineer: signed out (from 10.0.0.9)")
+    recorded(console, "guide: signed out (from 10.0.0.9)")
     console.call(console.live.operations.security.close)
-    recorded(console, "viewer: signed out: 3 more in a minute")
+    recorded(console, "visitor: signed out: 3 more in a minute")
 
 
 CHANGES: tuple[tuple[str, str, dict[str, Any], str], ...] = (
