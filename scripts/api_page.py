@@ -22,12 +22,7 @@ def _rows() -> list[tuple[str, str, str, str]]:
     for route in (each for router in ROUTERS for each in router.routes):
         if isinstance(route, APIRoute):
             (method,) = route.methods
-<<<<<<< HEAD
-            path, role = route.path.removeprefix("/api/v1/"), least_role(route.dependant)
-            path = path.replace(":path}", "}")
-=======
             path, role = route.path_format.removeprefix("/api/v1/"), least_role(route.dependant)
->>>>>>> secb
             text = texts.get(f"{method} {path}") or " ".join(route.description.split())
             text = text.removesuffix(".").removeprefix("Return " if method == "GET" else "")
             text = text[:1].lower() + text[1:]
