@@ -69,7 +69,6 @@ NEEDED = {
     ("GET", "pictures-to-mark/{identity}"): "engineer",
     ("GET", "heliostats/{name}/why"): "viewer",
     ("GET", "journal"): "viewer",
-    ("PUT", "session/presence"): "viewer",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",
     ("PATCH", "accounts/{name}"): "engineer",
