@@ -188,7 +188,7 @@ def test_the_emergency_comes_first() -> None:
 # -- commands of the pages -----------------------------------------------------------------
 
 PAGES = ("tutorial/first-hour.md", "how-to/handbook.md", "how-to/integrate.md", "how-to/deploy.md")
-GROUPS = ("ctl", "store", "field", "camera", "drone")
+GROUPS = ("keys", "ctl", "store", "field", "camera", "drone")
 
 
 def commands() -> list[str]:
