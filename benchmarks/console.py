@@ -81,10 +81,14 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     loop = asyncio.get_running_loop()
     keeper, heard = Keeper(folder / "store.sqlite"), Heard(heliostats)
     now, people = time.time(), keeper.people
-    people.add(NAME, _secrets.hash_password(PASSWORD), "engineer", now)
-    tokens = [
-        people.add_token(NAME, f"load {i}", "operator", now)[1] for i in range(VIEWERS + OPERATORS)
-    ]
+    password = _secrets.hash_password(PASSWORD)
+    people.add(NAME, password, "engineer", now)
+    tokens = []
+    for i in range(VIEWERS + OPERATORS):  # a person has only so many tokens and streams
+        name = f"{NAME}-{i // 10}"
+        if i % 10 == 0:
+            people.add(name, password, "operator", now)
+        tokens.append(people.add_token(name, f"load {i}", "operator", now)[1])
     design = malan_plant(heliostats)
     world = World(design, VirtualClock(loop.time))
     settings = AssemblySettings(

@@ -27,7 +27,8 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks._run import BenchmarkError, Neighbours, Result, Row
-from heliotrope.console.headers import COOKIE
+from heliotrope.console.headers import cookie_of
+from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.stream import LiveMessage, read_message
 from heliotrope.plant.io.followed_clock import ClockReader
 
@@ -225,7 +226,9 @@ class Page:
         self._url = link[: link.index("enter")]
         self._http = httpx.Client(base_url=self._url, timeout=PATIENCE, trust_env=False)
         answer = self._http.get(link, follow_redirects=True)
-        if answer.status_code != 200 or COOKIE not in self._http.cookies:
+        # The console of a run of one's own is plain HTTP on this machine.
+        self._cookie = cookie_of(ConsoleSettings())
+        if answer.status_code != 200 or self._cookie not in self._http.cookies:
             raise BenchmarkError(f"the one-time link answers {answer.status_code}")
 
     def get(self, path: str) -> Any:
@@ -244,7 +247,7 @@ class Page:
         """Follow the live stream until a wall time, s."""
         from websockets.sync.client import connect
 
-        headers = {"Cookie": f"{COOKIE}={self._http.cookies[COOKIE]}"}
+        headers = {"Cookie": f"{self._cookie}={self._http.cookies[self._cookie]}"}
         url = f"ws{self._url.removeprefix('http')}api/v1/live"
         with connect(url, additional_headers=headers, proxy=None, max_size=None) as socket:
             while (left := until - time.monotonic()) > 0.0:

@@ -77,6 +77,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "keys tls": ("none", "--name", "a.example.org"),
     "ctl command": ("GOTO", "A1"),
     "ctl aim": ("0,0,10", "A1"),
+    "ctl journal": (),
     "ctl calibrate": ("A1",),
     "ctl parameters": ("A1",),
     "ctl photographs": ("A1",),
@@ -183,6 +184,7 @@ def outcome(line: list[str], place: Path, monkeypatch: pytest.MonkeyPatch) -> st
     """Run a command line; return its fault, "" if it ends as it should."""
     monkeypatch.chdir(place)
     monkeypatch.setattr(sys, "argv", ["heliotrope", *line])
+    monkeypatch.setattr("getpass.getpass", lambda *_, **__: "the password of a person")
     out, err = io.StringIO(), io.StringIO()
     signal.signal(signal.SIGALRM, _stop)
     signal.alarm(LONGEST)
@@ -264,6 +266,7 @@ def test_the_line_names_option_value_and_limits(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["heliotrope", *line])
+    monkeypatch.setattr("getpass.getpass", lambda *_, **__: "the password of a person")
     with pytest.raises(SystemExit) as leaving:
         main()
     captured = capsys.readouterr()

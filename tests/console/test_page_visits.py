@@ -70,14 +70,14 @@ def test_an_emergency_in_a_joint_visit_leaves_nothing_locked(
     page.wait_for_selector(".hx-alert.on:has-text('done 12')")
     page.click(".hx-alert >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
-    page.wait_for_selector(".hx-alert >> text=acknowledge its alarms")
+    page.wait_for_selector(".hx-alert >> text=Resume ends it")
     field.calm()
-    until(page, "!document.querySelector('.hx-alert.on')")
+    page.wait_for_selector(".hx-alert >> text=wait for a person's Resume")
     page.click(".hx-tabs >> text=Calibration")
     page.wait_for_selector(".hx-calibration >> text=no heliostat is given to automatic control")
-    page.select_option(".hx-to select", "field")
-    page.click(".hx-orders >> text=Automatic")
-    page.click("dialog >> text='Give to automatic control'")
+    page.click(".hx-alert button >> text=Resume")
+    page.click("dialog >> text='Resume'")
+    until(page, "!document.querySelector('.hx-alert.on')")
 
     def up() -> bool:
         states = field.live.operations.summary().states

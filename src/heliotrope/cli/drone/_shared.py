@@ -93,6 +93,10 @@ def rendered_camera(size: str, focal_px: float = 0.0) -> "LedCamera":
     if not match:
         raise InputError(f"--size {size!r}: write WIDTHxHEIGHT in pixels, such as 4000x3000")
     width, height = int(match[1]), int(match[2])
+    if 0.0 < focal_px < 1.0:
+        raise InputError(
+            f"--focal-px {focal_px:g}: give 1 or more pixels, or 0 for 3/4 of the width"
+        )
     f = focal_px or 0.75 * width
     matrix = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
     return LedCamera((width, height), matrix, np.array([-0.08, 0.06, 3e-4, -2e-4, -0.01]))
