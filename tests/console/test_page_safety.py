@@ -304,6 +304,12 @@ def _take_command(page: Any) -> None:
     page.wait_for_selector(".hx-authority:has-text('You have command')")
 
 
+def _release(page: Any) -> None:
+    """Release it, and wait until that has arrived: a page that closes takes its request along."""
+    page.click(".hx-authority >> text=Release")
+    page.wait_for_selector(".hx-authority >> text=Take command")
+
+
 def _sent(page: Any, *paths: str) -> list[Any]:
     """Answer some requests in place of the plant; return the list of them."""
     bodies: list[Any] = []
@@ -334,7 +340,7 @@ def test_the_scope_follows_the_selection(field: LiveConsole, enter: Callable[...
             page.wait_for_selector("dialog", state="detached")
     page.wait_for_timeout(500)
     assert [one["heliostats"] for one in sent] == [[name]] * 3
-    page.click(".hx-authority >> text=Release")
+    _release(page)
 
 
 def test_motion_of_the_whole_field_asks_once_and_safe_orders_never(
@@ -355,4 +361,4 @@ def test_motion_of_the_whole_field_asks_once_and_safe_orders_never(
         page.wait_for_timeout(300)
         assert not page.locator("dialog").count()
     assert sent == [{"heliostats": []}] * 2
-    page.click(".hx-authority >> text=Release")
+    _release(page)
