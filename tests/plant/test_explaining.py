@@ -13,6 +13,13 @@ from support.live import LivePlant, live
 ENGINEER, OPERATOR = Person("Egon", Role.ENGINEER), Person("Olga", Role.OPERATOR)
 
 
+async def _cut(plant: LivePlant, cluster: str) -> None:
+    """Take a cluster's link away for 20 s."""
+    plant.links[cluster].plugged = False
+    await asyncio.sleep(20.0)
+    plant.links[cluster].plugged = True
+
+
 def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() -> None:
     async def work(plant: LivePlant) -> None:
         shown, (name, other, *_) = plant.operations, plant.operations.names
@@ -84,9 +91,7 @@ def test_a_field_that_waits_for_a_person_says_so() -> None:
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.operations.names[-1]
         await asyncio.sleep(200.0)
-        plant.links["C2"].plugged = False
-        await asyncio.sleep(20.0)
-        plant.links["C2"].plugged = True
+        await _cut(plant, "C2")
         await asyncio.sleep(120.0)
         why = shown.why(name)
         assert "left the receiver without an order" in why.text
@@ -102,9 +107,7 @@ def test_work_that_is_tried_again_is_shown_with_its_end() -> None:
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.operations.names[-1]
         await asyncio.sleep(200.0)
-        plant.links["C2"].plugged = False
-        await asyncio.sleep(20.0)
-        plant.links["C2"].plugged = True
+        await _cut(plant, "C2")
         await asyncio.sleep(10.0)
         why = shown.why(name)
         assert "1 of 5 tries have failed (left the receiver without an order)" in why.follows, why
