@@ -66,10 +66,11 @@ export function heliostats(box) {
     kept.value = "";
   };
   const keep = async () => {
-    if (!store.selection.size) { say("Save: nothing is selected", true); return; }
-    const given = await ask(`Save these ${count(store.selection.size)} heliostats under a name? It stays in this browser; an empty selection of that name is replaced.`, [{ name: "name", label: "Name" }], "Save");
+    const names = store.selected(); // as the question counts them
+    if (!names.length) { say("Save: nothing is selected", true); return; }
+    const given = await ask(`Save these ${count(names.length)} heliostats under a name? It stays in this browser; an empty selection of that name is replaced.`, [{ name: "name", label: "Name" }], "Save");
     if (!given) return;
-    localStorage.setItem(SAVED, JSON.stringify({ ...saved(), [given.name]: store.selected() }));
+    localStorage.setItem(SAVED, JSON.stringify({ ...saved(), [given.name]: names }));
     list();
   };
   const csv = () => saveCsv("heliostats.csv", COLUMNS.map(([title]) => title), rows.map((row) => COLUMNS.map(([, text]) => text(row))));
