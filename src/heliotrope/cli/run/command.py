@@ -1,5 +1,6 @@
 """``heliotrope run``: a plant at work with its console until Ctrl-C, simulated or real."""
 
+import contextlib
 from enum import StrEnum
 from itertools import groupby
 from pathlib import Path
@@ -10,6 +11,8 @@ from typer.core import TyperCommand
 
 from heliotrope.cli._common import open_plant
 from heliotrope.cli._plants import design_of, one_plant, start_of
+from heliotrope.cli.run.twin_process import twin_process
+from heliotrope.errors import InputError
 
 _TWIN, _REAL, _WORK = "Simulation", "A real plant", "Work"
 _CONSOLE, _KEPT = "Console", "Records"
@@ -303,63 +306,65 @@ def run(
     heliostat after another, and every calibration is pushed to its local controller. The console
     shows it all. Ctrl-C ends it. With --clusters the heliostats are real, and it stows them first.
     """
-    from heliotrope.cli.run._evidence import Evidence
-    from heliotrope.cli.run._shared import Shown
-    from heliotrope.errors import InputError
-    from heliotrope.plant.operations.pictures import PictureSettings
-    from heliotrope.plant.settings import PlantSettings
-
     one_plant("run", field, heliostats, prototype=prototype)
-    shown = Shown(
-        host=host,
-        port=port,
-        names=tuple(name or ()),
-        certificate=certificate,
-        key=key,
-        plain=plain,
-        proxies=tuple(proxy or ()),
-        people_by_proxy=people_by_proxy,
-        second_factor=second_factor,
-        emergency_port=emergency_port,
-        idle_s=60.0 * idle_lock,
-        notice=notice,
-        console=not no_console,
-        browser=not no_browser,
-        data=data,
-        database=database,
-        minutes=minutes,
-        every=every,
-        plant=PlantSettings(stow_rate=stow_rate),
-        evidence=Evidence(syslog, syslog_authority, heads, heads_every),
-        photographs=PictureSettings(
-            min(30.0, photographs_days), photographs_days, 1e9 * photographs_gb
-        ),
-    )
-    from heliotrope.cli.run.plant import PlantChoice, run_plant
-
-    if clusters is None:
-        if configure or check:
-            raise InputError("run: --configure and --check need a real plant; give --clusters")
-        from heliotrope.cli.run.twin_process import twin_process
+    with contextlib.ExitStack() as stack:
+        twin = None
+        if clusters is None:
+            if configure or check:
+                raise InputError("run: --configure and --check need a real plant; give --clusters")
+            design = design_of(field, heliostats, prototype=prototype)
+            begins = start_of("run", start, design)
+            up = begin is not Begin.STOW and not prototype
+            options = _options(field, heliostats, prototype=prototype)
+            options += ["--speed", str(speed), "--start", begins.isoformat(), *["--up"] * up]
+            new = begin is Begin.NEW or prototype
+            measured = 0 if new else min(_MEASURED, len(design) * 3 // 20)
+            # It begins while the plant's program is loaded.
+            twin = stack.enter_context(twin_process(options, seed, measured))
+        from heliotrope.cli.run._evidence import Evidence
+        from heliotrope.cli.run._shared import Shown
+        from heliotrope.cli.run.plant import PlantChoice, run_plant
+        from heliotrope.plant.operations.pictures import PictureSettings
+        from heliotrope.plant.settings import PlantSettings
         from heliotrope.twin.program import LINKS, PLANT
 
-        design = design_of(field, heliostats, prototype=prototype)
-        begins = start_of("run", start, design)
-        options = _options(field, heliostats, prototype=prototype)
-        options += ["--speed", str(speed), "--start", begins.isoformat()]
-        up = begin is not Begin.STOW and not prototype
-        options += ["--up"] if up else []
-        measured = 0 if begin is Begin.NEW or prototype else min(_MEASURED, len(design) * 3 // 20)
-        with twin_process(options, seed, measured) as twin:
+        shown = Shown(
+            host=host,
+            port=port,
+            names=tuple(name or ()),
+            certificate=certificate,
+            key=key,
+            plain=plain,
+            proxies=tuple(proxy or ()),
+            people_by_proxy=people_by_proxy,
+            second_factor=second_factor,
+            emergency_port=emergency_port,
+            idle_s=60.0 * idle_lock,
+            notice=notice,
+            console=not no_console,
+            browser=not no_browser,
+            data=data,
+            database=database,
+            minutes=minutes,
+            every=every,
+            plant=PlantSettings(stow_rate=stow_rate),
+            evidence=Evidence(syslog, syslog_authority, heads, heads_every),
+            photographs=PictureSettings(
+                min(30.0, photographs_days), photographs_days, 1e9 * photographs_gb
+            ),
+        )
+        if twin is not None:
+            twin.wait()
             choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle), aimed=up)
             run_plant(open_plant(twin.folder / PLANT), choice, shown, twin.begin)
-        return
-    if field is None:
-        raise InputError("run: --clusters needs the plant file; give it before")
-    _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed))
-    folder = field if field.is_dir() else field.parent
-    choice = PlantChoice(folder, clusters, idle is not False, configure, check)
-    run_plant(open_plant(field), choice, shown)
+            return
+        assert clusters is not None
+        if field is None:
+            raise InputError("run: --clusters needs the plant file; give it before")
+        _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed))
+        folder = field if field.is_dir() else field.parent
+        choice = PlantChoice(folder, clusters, idle is not False, configure, check)
+        run_plant(open_plant(field), choice, shown)
 
 
 def _options(field: Path | None, heliostats: int | None, *, prototype: bool) -> list[str]:
@@ -373,8 +378,6 @@ def _options(field: Path | None, heliostats: int | None, *, prototype: bool) -> 
 
 def _only_real(**simulated: bool) -> None:
     """Refuse options of a simulation, by name, for a real plant."""
-    from heliotrope.errors import InputError
-
     options = ", ".join(f"--{name}" for name, used in simulated.items() if used)
     if options:
         raise InputError(

@@ -10,14 +10,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from heliotrope.cli.twin import READY
 from heliotrope.errors import InputError
-from heliotrope.field.plant import Plant
-from heliotrope.store.keeper import Keeper
-from heliotrope.twin.live.live import WorldOptions, true_mechanisms
-from heliotrope.twin.program.boards import BOARDS, write_boards
-from heliotrope.twin.yesterday import begin_second_day
+
+if TYPE_CHECKING:
+    from heliotrope.field.plant import Plant
+    from heliotrope.store.keeper import Keeper
 
 #: Time that it gets to end, s.
 _ENDING = 1.0
@@ -26,21 +26,36 @@ _MAIN = "from heliotrope.cli import main; main()"
 
 @dataclass(frozen=True)
 class TwinField:
-    """A simulated field that waits for what its local controllers store.
+    """A simulated field that begins, and then waits for what its local controllers store.
 
     Attributes
     ----------
     folder
         Of its plant file and links file.
+    process
+        The simulated field.
     seed, measured
         See `twin_process`.
     """
 
     folder: Path
+    process: subprocess.Popen[str]
     seed: int
     measured: int
 
-    async def begin(self, keeper: Keeper, design: Plant, start: datetime) -> None:
+    def wait(self) -> None:
+        """Wait until its files are written, and its clock can be read.
+
+        Raises
+        ------
+        InputError
+            If it does not begin.
+        """
+        assert self.process.stdout is not None
+        if self.process.stdout.readline().strip() != READY:
+            raise InputError("run: the simulated field has not begun; see the line before")
+
+    async def begin(self, keeper: "Keeper", design: "Plant", start: datetime) -> None:
         """Let the field store what the plant has kept; a new store gets yesterday's calibrations.
 
         Raises
@@ -48,6 +63,10 @@ class TwinField:
         StoreError
             If the store cannot be read or written.
         """
+        from heliotrope.twin.live.live import WorldOptions, true_mechanisms
+        from heliotrope.twin.program.boards import BOARDS, write_boards
+        from heliotrope.twin.yesterday import begin_second_day
+
         if self.measured:
             truth = true_mechanisms(design, WorldOptions(self.seed))
             await begin_second_day(
@@ -59,7 +78,7 @@ class TwinField:
 
 @contextlib.contextmanager
 def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["TwinField"]:
-    """Run a simulated field beside a block; yield it.
+    """Run a simulated field beside a block; yield it while it begins.
 
     Parameters
     ----------
@@ -69,11 +88,6 @@ def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["
         Of how the mirrors really stand.
     measured
         Number of mirrors that were measured yesterday, if the store has no calibration.
-
-    Raises
-    ------
-    InputError
-        If it does not begin.
     """
     home = Path(tempfile.mkdtemp(prefix="heliotrope-twin-"))
     folder = home / "field"
@@ -90,10 +104,7 @@ def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["
         start_new_session=True,
     )
     try:
-        assert process.stdout is not None
-        if process.stdout.readline().strip() != READY:
-            raise InputError("run: the simulated field has not begun; see the line before")
-        yield TwinField(folder, seed, measured)
+        yield TwinField(folder, process, seed, measured)
     finally:
         # It ends when its standard input ends.
         assert process.stdin is not None

@@ -199,9 +199,11 @@ class AutomaticControl:
         self._token, self._sun_at, self._resumed_at = 0, -math.inf, -math.inf
         self.truth = TrueErrors(plant, truth)
         cycle = CycleSettings() if visits is None else visits.cycle.settings
+        self._keeping = Keeping(plant.field.names, plant.beliefs, records)
+        if visits is not None:
+            self._keeping.recall()
         self.book = CalibrationBook(plant, "malan8" if visits is None else cycle.first_model)
         self.installed = self.book.installed()
-        self._keeping = Keeping(plant.field.names, plant.beliefs, records)
         self.service = Service(plant, self._keeping, logbook.take_alarm)
         self._parts = Attempts(PARTS, logbook.take_alarm)
         self._raising = Raising(
@@ -233,7 +235,6 @@ class AutomaticControl:
                 )
         self._stopped = False
         if visits is not None:
-            self._keeping.recall()
             self.book.recall(self._keeping.results(RESULTS))
             self.learning.recall()
             self.flights.recall()

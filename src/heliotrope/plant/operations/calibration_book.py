@@ -58,7 +58,9 @@ class CalibrationBook:
         self.results: deque[CalibrationEntry] = deque(maxlen=RESULTS)
         self.quality: deque[QualityPoint] = deque(maxlen=_POINTS)
         self.failed = 0
-        plant.beliefs.subscribe(self._believe)
+        # What is believed already is predicted at once: one by one it takes 20 times as long.
+        self._believe(*plant.beliefs)
+        plant.beliefs.subscribe(self._believe, held=False)
 
     @property
     def calibrated(self) -> int:
@@ -72,11 +74,12 @@ class CalibrationBook:
         group, _ = self._plant.design.find(name)
         return parameter_table.model(self._model, group.mechanism.parameters)
 
-    def _believe(self, record: HeliostatCalibration) -> None:
-        row = self._plant.field.place(record.heliostat)
-        self.calibrated_at[row] = record.at
-        self.sightings[row] = self._plant.beliefs.count(record.heliostat)
-        self._predict([record])
+    def _believe(self, *records: HeliostatCalibration) -> None:
+        for record in records:
+            row = self._plant.field.place(record.heliostat)
+            self.calibrated_at[row] = record.at
+            self.sightings[row] = self._plant.beliefs.count(record.heliostat)
+        self._predict(records)
 
     def conclude(self, entry: CalibrationEntry) -> None:
         """Take the result of a visit."""
@@ -110,8 +113,8 @@ class CalibrationBook:
         """Predict the errors of all calibrated heliostats for the present sun and aims."""
         self._predict(list(self._plant.beliefs))
 
-    def _predict(self, records: list[HeliostatCalibration]) -> None:
-        if self._dark:
+    def _predict(self, records: Sequence[HeliostatCalibration]) -> None:
+        if self._dark or not records:
             return
         rows = np.array([self._plant.field.place(r.heliostat) for r in records], dtype=np.intp)
         names = [record.heliostat for record in records]
