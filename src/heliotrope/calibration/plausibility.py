@@ -93,7 +93,7 @@ def judge(
     surfaces
         Targets and receivers of the plant: for the destinations of kind "camera_target".
     kinds
-        Kind of each sighting, (M,), "" if unknown.
+        Kind of each sighting, (M,), empty if unknown.
     now
         The computer's clock, Unix seconds: for times that are still to come.
     """

@@ -446,7 +446,7 @@ class Orders:
 
 
 async def stored(exchange: Exchange, node: ClusterNode, item: str, expires: float) -> bytes | None:
-    """Return a node's stored item, b"" if it has none; None if it does not answer."""
+    """Return a node's stored item, empty if it has none; None if it does not answer."""
     answer = await exchange.ask(
         node,
         "QUERY_STORED",

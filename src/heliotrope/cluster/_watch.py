@@ -50,7 +50,7 @@ class Verdict:
     acts
         All, for the status: "DEFOCUS plant_link_lost".
     forbidden
-        Why motion is forbidden, "" if it is allowed.
+        Why motion is forbidden, empty if it is allowed.
     """
 
     act: Act | None = None

@@ -184,7 +184,7 @@ class SerialBus:
     statistics
         See `BusStatistics`.
     problem
-        Why the port is not open, "" if it is.
+        Why the port is not open, empty if it is.
     """
 
     def __init__(self, url: str, clock: Clock, settings: BusSettings | None = None) -> None:
@@ -337,7 +337,7 @@ class SerialBus:
         Returns
         -------
         bytes
-            What came, whole or not; b"" if nothing did or the frame was not sent (see
+            What came, whole or not; empty if nothing did or the frame was not sent (see
             ``statistics``). Only the codec can decide whether it is an answer.
 
         Raises

@@ -65,7 +65,7 @@ class Time:
         The clock was set, forward or back, within the last seconds: intervals between times
         before and after are meaningless.
     note
-        What is wrong, in one line for the operator; "" if nothing is.
+        What is wrong, in one line for the operator; empty if nothing is.
     """
 
     utc_s: float

@@ -75,7 +75,7 @@ def read_document(
 def _missing(errors: Sequence[Any]) -> tuple[str, tuple[Any, ...]]:
     """Return one line on all keys that the table of the first error lacks, and the table.
 
-    "" if the first error is another one.
+    empty if the first error is another one.
     """
     if errors[0]["type"] != "missing":
         return "", ()

@@ -483,5 +483,5 @@ class Journal:
 
 
 def item_name(number: int) -> str:
-    """Return the name of an item by its number in QUERY_STORED, "" if there is none."""
+    """Return the name of an item by its number in QUERY_STORED, empty if there is none."""
     return ITEMS[number - 1][0] if 1 <= number <= len(ITEMS) else ""

@@ -198,7 +198,7 @@ def _start(number: int) -> int:
 
 
 def name_of(number: int) -> str:
-    """Return the name of a message number, "" if the table has none."""
+    """Return the name of a message number, empty if the table has none."""
     start = _start(number)
     return TABLE[start + 4 : TABLE.find(" ", start)] if start >= 0 else ""
 

@@ -108,7 +108,7 @@ class Node:
     controller, gate, journal, reader, timer
         The parts.
     trouble
-        The error of flash that has failed, "" if it has not.
+        The error of flash that has failed, empty if it has not.
     """
 
     def __init__(

@@ -259,7 +259,7 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """Name of the message, "" if unknown."""
+        """Name of the message, empty if unknown."""
         return messages.name_of(self.number)
 
     def values(self) -> "tuple[Any, ...] | None":

@@ -101,7 +101,7 @@ class PhotoReading:
     clipped
         Clipped pixels of each spot, (S,).
     notes
-        For each mirror why it gives no spot or no outline; "" if it gives both, (M,).
+        For each mirror why it gives no spot or no outline; empty if it gives both, (M,).
     """
 
     name: str

@@ -28,11 +28,12 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, HeliotropeError, InputError
 from heliotrope.files.disk import Work
 from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.lcu import messages
 from heliotrope.lcu.config import FAR
 
 #: Points of one kind (AIM, STANDBY) by name of the heliostat, ENU, m.
 Places = dict[str, tuple[float, ...]]
-KINDS = ("AIM", "STANDBY")
+KINDS = tuple(sorted(messages.POINTS))
 #: Points before the assigned one that a local controller may still have.
 BEFORE = 4
 #: Kinds under which they are stored, the latest first.

@@ -92,7 +92,7 @@ class Feed:
     newest
         The last frame, None before the first.
     problem
-        Why no frame comes, "" if nothing is wrong.
+        Why no frame comes, empty if nothing is wrong.
     """
 
     def __init__(self, source: Source) -> None:

@@ -137,7 +137,7 @@ class ReceiverFlux:
         return found
 
     async def _read(self, found: Readings) -> str | None:
-        """Take a reading; return why there is none, "" if there is, None if nothing is new."""
+        """Take a reading; return why there is none, empty if there is, None if nothing is new."""
         frame, who = self._newest(), f"camera {self._eye.name}"
         made = dated(frame, self._eye)
         age = (self._clock.utc() - made).total_seconds()

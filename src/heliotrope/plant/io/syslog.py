@@ -121,7 +121,7 @@ class Syslog:
     lost
         Number of messages that found no place in the queue.
     problem
-        Why messages cannot be sent now, "" if they can.
+        Why messages cannot be sent now, empty if they can.
     """
 
     def __init__(self, receiver: Receiver, now: Callable[[], float], most: int = _WAITING) -> None:

@@ -439,12 +439,12 @@ class AutomaticControl:
 
     @property
     def waits(self) -> str:
-        """Why it waits for a person's Resume, "" if it does not."""
+        """Why it waits for a person's Resume, empty if it does not."""
         return self._losses.reason
 
     @property
     def to_resume(self) -> str:
-        """What a person's Resume would do, "" if nothing waits for it."""
+        """What a person's Resume would do, empty if nothing waits for it."""
         left = 0 if self._plant.sentinel.on else int(self._raising.left.sum())
         after = f"The emergency is over: {left:,} heliostats wait for a person's Resume."
         return self.waits or (after if left else "")

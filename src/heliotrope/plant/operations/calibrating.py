@@ -226,7 +226,7 @@ class Calibrating:
 
     @property
     def receiver(self) -> str:
-        """Name of the receiver on which heliostats are measured; "" if none is."""
+        """Name of the receiver on which heliostats are measured; empty if none is."""
         return "" if self._receiver is None else self._receiver.surface
 
     def ask_together(self, heliostats: Sequence[str], surface: str) -> None:
@@ -433,7 +433,7 @@ class Calibrating:
         return self._plant.sentinel.on or grant is None or grant.token != token
 
     def _note_place(self, place: str, problem: str, token: int) -> None:
-        """Note whether a visit failed through no fault of a heliostat, "" if it did not."""
+        """Note whether a visit failed through no fault of a heliostat, empty if it did not."""
         if not problem:
             self._places.done(place)
         elif not self._interrupted(token):

@@ -45,7 +45,7 @@ class Losses:
     Attributes
     ----------
     reason
-        Why automatic control waits for a person, "" if it does not.
+        Why automatic control waits for a person, empty if it does not.
     """
 
     def __init__(

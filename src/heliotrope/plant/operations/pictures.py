@@ -119,7 +119,7 @@ class Pictures:
     Attributes
     ----------
     problem
-        Why the last picture was not kept, "" if it was.
+        Why the last picture was not kept, empty if it was.
     """
 
     def __init__(

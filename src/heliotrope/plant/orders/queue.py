@@ -116,7 +116,7 @@ class PlantOrders(Part):
     confirmed_at
         Last time that the audit confirmed that it can write, monotonic s.
     problem
-        Why it cannot write, "" if it can.
+        Why it cannot write, empty if it can.
     latest
         Ticket of the last command; None before the first.
     last

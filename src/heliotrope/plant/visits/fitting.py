@@ -64,7 +64,7 @@ class JudgedFit:
         Beam errors under the present and the fitted mechanism, weighted by the sightings, rad RMS.
         A fit that follows the drift need not explain the past: the last day's photographs count.
     outcome, problem
-        Why the fit is rejected, "" if it is not.
+        Why the fit is rejected, empty if it is not.
     name
         Of the heliostat.
     flown
