@@ -1,5 +1,6 @@
-"""Processes beside this one that end with it, however it ends."""
+"""Processes beside this one that end with it, however it ends, and leave it the machine."""
 
+import contextlib
 import os
 import threading
 from collections.abc import Callable
@@ -20,6 +21,13 @@ def pool(processes: int, begin: Callable[[], None] | None = None) -> ProcessPool
         initializer=_end_with_parent,
         initargs=(begin,),
     )
+
+
+def give_way(niceness: int) -> None:
+    """Let this process take what others leave of the machine, where the system allows that."""
+    # A unit of systemd may deny the call: then all are equal.
+    with contextlib.suppress(OSError):
+        os.nice(niceness)
 
 
 def end(pool: ProcessPoolExecutor) -> None:

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Protocol, TypeVar, TypeVarTuple
 
 from heliotrope.errors import HeliotropeError, InputError
-from heliotrope.processes import end, pool
+from heliotrope.processes import end, give_way, pool
 
 T = TypeVar("T")
 Given = TypeVarTuple("Given")
@@ -93,7 +93,7 @@ def _begin() -> None:
     """Prepare a process."""
     # Ctrl-C in the plant's terminal is the plant's.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(_NICE)
+    give_way(_NICE)
     os.environ["HELIOTROPE_THREADS"] = "1"
 
 

@@ -5,7 +5,6 @@ document and ends. It uses only the computing time that other processes leave.
 """
 
 import json
-import os
 import pickle
 import sys
 from typing import Any
@@ -18,6 +17,7 @@ from heliotrope.calibration.learn.group import (
     read_hyperparameters,
 )
 from heliotrope.errors import InputError
+from heliotrope.processes import give_way
 
 #: Threads of the process: the plant beside it has its own work.
 ENVIRONMENT = {"HELIOTROPE_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -66,7 +66,7 @@ def _answer(data: bytes) -> dict[str, Any]:
 
 def main() -> None:
     """Learn the group that the input has."""
-    os.nice(_LEAST_URGENT)
+    give_way(_LEAST_URGENT)
     sys.stdout.write(json.dumps(_answer(sys.stdin.buffer.read())))
 
 
