@@ -67,6 +67,22 @@ def test_a_mirror_that_a_visit_locks_is_not_lost(tmp_path: Path) -> None:
     play(tmp_path, scene)
 
 
+def test_a_mirror_that_was_idle_at_stow_is_not_lost(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        wanted = np.ones(len(bench.plant.field), dtype=np.bool_)
+        losses = Losses(bench.plant, Logbook(bench.clock), 0, None, lambda: None)
+        cluster = bench.cluster_of(NAME)
+        cluster.rows["flags"][cluster.names.index(NAME)] |= meanings.AT_STOW
+        await bench.wait(2.0)
+        for state in (states.IDLE, states.LOCKED, states.STOWED):
+            cluster.set(state, NAME)
+            await bench.wait(2.0)
+            assert not losses.look(wanted).any()
+        assert not losses.reason
+
+    play(tmp_path, scene)
+
+
 def test_only_what_cannot_go_on_is_sent_to_stow(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant, none = bench.plant, np.zeros(len(bench.plant.field), dtype=np.bool_)
@@ -81,6 +97,7 @@ def test_only_what_cannot_go_on_is_sent_to_stow(tmp_path: Path) -> None:
 
         assert await stuck() == []
         row = bench.cluster_of(NAME).names.index(NAME)
+        flags = int(bench.cluster_of(NAME).rows["flags"][row])
         bench.cluster_of(NAME).rows["flags"][row] = 0
         await bench.wait(2.0)
         assert await stuck((NAME,)) == []  # its visit sees to it
@@ -89,7 +106,16 @@ def test_only_what_cannot_go_on_is_sent_to_stow(tmp_path: Path) -> None:
         assert sorted(await stuck()) == sorted([NAME, OTHER])
         raising.want([NAME], wanted=False)
         assert await stuck() == [OTHER]
-        bench.cluster_of(OTHER).set(states.STOWED, OTHER)
+        # One whose path back to standby is blocked goes to stow if it is defocused.
+        raising.want([NAME], wanted=True)
+        bench.cluster_of(NAME).rows["flags"][row] = flags
+        raising._block({NAME: NoFreePath("it enters a house")}, states.DEFOCUSED)
+        assert await stuck() == [OTHER]
+        bench.cluster_of(NAME).set(states.DEFOCUSED, NAME)
+        await bench.wait(2.0)
+        assert sorted(await stuck()) == sorted([NAME, OTHER])
+        for name in (NAME, OTHER):
+            bench.cluster_of(name).set(states.STOWED, name)
         await bench.wait(2.0)
         assert await stuck() == []
 

@@ -380,7 +380,8 @@ BEAM_BLOCKED = AlarmKind(
     "The beam of a heliostat would enter a keep-out volume at its aim or on its way there, or "
     "cross a receiver on its way from stow.",
     "{subject}: {reason}",
-    "Automatic control leaves it where it is and tries again every five minutes.",
+    "Automatic control stows it if it is defocused, since the path from stow may be free; else it "
+    "leaves it where it is and tries again every five minutes.",
     "Wait where a receiver is in the way: the sun moves on. Else give it another aim point, or "
     "correct the volume in the plant file.",
     over="{subject}: it has left the blocked position",

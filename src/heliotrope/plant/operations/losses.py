@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import HeliotropeError
+from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
@@ -71,10 +72,12 @@ class Losses:
     def look(self, wanted: Mask, at_stow: Mask = _NONE) -> Mask:
         """Return a mask of the wanted heliostats (N,) lost since the last check, (N,).
 
-        Those that are diagnosed ``at_stow`` (N,) are IDLE there, and no loss.
+        One that is IDLE at its stow position is no loss when it reports that it is stowed; while it
+        is diagnosed ``at_stow`` (N,), it moves about that position.
         """
         field, now = self._plant.field, self._plant.now()
-        live, up = field.live(now), field.among(states.BEAM_OUT, now) & ~at_stow
+        there = field.among((states.IDLE,), now) & (field.rows["flags"] & meanings.AT_STOW != 0)
+        live, up = field.live(now), field.among(states.BEAM_OUT, now) & ~there & ~at_stow
         # Only an order locks a heliostat: a person's, or a visit's that writes parameters.
         held = field.among((states.LOCKED,), now)
         lost = live & ~up & ~held & self._up

@@ -224,12 +224,15 @@ class Raising:
 
         A heliostat that has not come to standby by that way since it booted, or since it was at
         stow, refuses to track; one that stores other parameters than the wanted ones may not move,
-        and they are written at stow. Those that recover by themselves are given a while.
+        and they are written at stow; the path back to standby of one that defocused may be blocked.
+        Those that recover by themselves are given a while.
         """
         plant, now = self._plant, self._plant.now()
         field = plant.field
         halted = self.wanted & ~resting & field.among((states.IDLE, states.DEFOCUSED), now)
-        halted &= ~self.able()
+        shut_in = np.zeros(len(halted), dtype=np.bool_)
+        shut_in[[field.place(name) for name in self._blocked]] = True
+        halted &= ~self.able() | shut_in & field.among((states.DEFOCUSED,), now)
         halted[[field.place(name) for name in visiting]] = False
         self._halted_at = np.where(halted, np.minimum(self._halted_at, now), math.inf)
         found = now - self._halted_at >= _HALTED

@@ -331,7 +331,10 @@ class Acts:
     def emergency(self, operations: Operations, person: Person, act: Act) -> None:
         """Raise an emergency: automatic control gives up all that it has."""
         self._watch.taken(self.names)
+        stand = {call.who: Act[call.act] for call in operations.plant.sentinel.calls}
         operations.emergency(person, act.name, "somebody is in the field")
+        if act <= stand.get(person.name, Act.ALARM):
+            return  # it merges with the person's own order, which says as much
         self.acted(f"EMERGENCY {act.name}", person)
         self._operator.raised(person, act)
         self._watch.emergency(on=True)
