@@ -153,9 +153,10 @@ class Mirrors:
         spread = np.broadcast_to(as_float(values.pop("pointing", 0.0)), (count, 2, 2))
         values |= {"width": size[0], "height": size[1]}
         numbers = {name: _numbers(name, value, count) for name, value in values.items()}
-        ordered = [numbers[name] for name in ("width", "height", "focal")]
-        rest = [numbers[name] for name in ("slope", "reflectivity", "clean")]
-        return cls(middle, n, x, np.cross(n, x), *ordered, ends, *rest, spread)
+        width, height, focal = (numbers[name] for name in ("width", "height", "focal"))
+        slope, mirror, clean = (numbers[name] for name in ("slope", "reflectivity", "clean"))
+        y = as_float(np.cross(n, x))
+        return cls(middle, n, x, y, width, height, focal, ends, slope, mirror, clean, spread)
 
     def __len__(self) -> int:
         return len(self.center)
