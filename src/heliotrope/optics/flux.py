@@ -11,8 +11,7 @@ a field of 10,000 beams is one product of two matrices. The power of a beam is
 
 $$P = A \, E \, ρ \, \sqrt{(1 + s·t)/2} \, (1 - l(d)),$$
 
-with the loss l in clear air after Vittitoe and Biggs as in DELSOL3 (Kistler 1986):
-$l = 0.006789 + 0.1046 d - 0.017 d^2 + 0.002845 d^3$, d in km. `predict_flux` says what is left out.
+with the loss l in clear air of `air_loss`. `predict_flux` says what is left out.
 """
 
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from heliotrope.field.target import Receiver
 from heliotrope.frames import Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
 from heliotrope.mechanism.tracking import track
+from heliotrope.optics.attenuation import air_loss
 from heliotrope.optics.beam import beam_sigma
 from heliotrope.optics.intercept import intercept_rectangle
 from heliotrope.sun import Times, vector
@@ -80,12 +80,6 @@ class FluxView(Value, Framed):
         }
         notes = {"receiver": self.receiver, "cells": "centres, m from that of the aperture"}
         return Labelled(rows, {"up": self.up, "right": self.right}, variables, notes=notes)
-
-
-def air_loss(distance: npt.ArrayLike) -> FloatArray:
-    """Return the share of the light that clear air absorbs and scatters over a distance in m."""
-    d = 1e-3 * as_float(distance)
-    return as_float(np.clip(0.006789 + 0.1046 * d - 0.017 * d**2 + 0.002845 * d**3, 0.0, 1.0))
 
 
 def predict_flux(
