@@ -72,16 +72,16 @@ def _along(i, mirrors, way, reach, slack, grid, found, count):
     da, db = way[major], way[1 - major]
     na, nb = shape[1 - major], shape[major]
     ends = (a0, a0 + length * da)
-    first = max(0, int(math.floor((min(ends) - wide) / step)))
-    last = min(na - 1, int(math.floor((max(ends) + wide) / step)))
+    first = max(0, math.floor((min(ends) - wide) / step))
+    last = min(na - 1, math.floor((max(ends) + wide) / step))
     slope = db / da if abs(da) > 1e-12 else 0.0
     thick = wide * math.sqrt(1.0 + slope * slope) * 1.0001
     for a in range(first, last + 1):
         left = min(max(a * step - a0, min(0.0, length * da)), max(0.0, length * da))
         right = min(max((a + 1) * step - a0, min(0.0, length * da)), max(0.0, length * da))
         one, other = b0 + slope * left, b0 + slope * right
-        start = max(0, int(math.floor((min(one, other) - thick) / step)))
-        stop = min(nb - 1, int(math.floor((max(one, other) + thick) / step)))
+        start = max(0, math.floor((min(one, other) - thick) / step))
+        stop = min(nb - 1, math.floor((max(one, other) + thick) / step))
         lowest = z0
         if abs(da) > 1e-12:
             lowest = min(z0 + way[2] * (left - wide) / da, z0 + way[2] * (right + wide) / da)

@@ -272,6 +272,10 @@ class Scene:
                     f"scene: mirror {k} stands inside a tower of radius {tower.radius} m; move it"
                 )
 
+    def with_mirrors(self, mirrors: Mirrors) -> "Scene":
+        """Return the scene with its mirrors in other poses."""
+        return replace(self, mirrors=mirrors)
+
     @property
     def incidence(self) -> FloatArray:
         """Cosine of the angle of incidence of each mirror, (H,); 0 if the sun is behind it."""

@@ -3,7 +3,8 @@ r"""Shading and blocking: which part of each mirror sees the sun, and its aim.
 The outlines of the mirrors before it (and of towers) are carried along the rays into a mirror's
 plane, and subtracted from it as convex polygons (Sutherland and Hodgman 1974, Communications of the
 ACM 17, 32), so that the area of a union counts once, exactly, and no number of occluders is too
-many. Shading goes along parallel rays; for blocking, the rays of a curved or canted mirror converge:
+many. Shading goes along parallel rays; for blocking, the rays of a curved or canted mirror
+converge:
 
 $$d(x, y) = d_0 + 2 (δn·s) n + 2 (n·s) δn, \qquad δn = -(x, y) / 2f.$$
 
@@ -12,6 +13,7 @@ Left out: the sun's size and the slope errors, which blur the edges of a shadow 
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -69,22 +71,23 @@ class Shading:
         self._sun = as_input(scene.sun)
         towers = [(t.east, t.north, t.radius, t.bottom, t.top) for t in scene.towers]
         self._towers = as_input(np.array(towers).reshape(-1, kernels.TOWER))
-        self._table, self._ways, self._reaches = _rows(mirrors, scene.sun)
+        self.table, self._ways, self._reaches = _rows(mirrors, scene.sun)
         self._split = np.ones((count, 2), dtype=np.int64) if split is None else split
-        self._parts = _parts(mirrors, self._split)
+        self.parts = _parts(mirrors, self._split)
         self._shares = np.ones((count, 3))
-        self._moments = np.zeros((int(self._parts[3][-1]), 6))
+        self._moments = np.zeros((int(self.parts[3][-1]), 6))
         self._look()
         self._clip(np.arange(count))
 
     @property
     def lit(self) -> Lit:
         """The present state; its arrays change with `move`."""
-        return Lit(*self._shares.T, self._moments, self._parts[3])
+        shading, blocking, both = self._shares.T
+        return Lit(shading, blocking, both, self._moments, self.parts[3])
 
     def _look(self) -> None:
         """Lay the grid, and find the candidates of every mirror."""
-        table = self._table
+        table = self.table
         self._places = table[:, :3].copy()
         radius = float(table[:, 15].max(initial=1.0))
         step, low = 2.0 * (radius + SLACK), table[:, :2].min(axis=0)
@@ -103,7 +106,7 @@ class Shading:
         def block(first: int, last: int) -> None:
             spans = np.empty((last - first + 1, 2), dtype=np.int64)
             near = kernels.candidates(
-                rows[first:last], self._table, self._sun, self._ways, self._reaches, SLACK,
+                rows[first:last], self.table, self._sun, self._ways, self._reaches, SLACK,
                 self._grid, spans,
             )  # fmt: skip
             found[first] = np.column_stack([spans[:-1], spans[1:, 0]]), near
@@ -119,8 +122,8 @@ class Shading:
     def _clip(self, rows: IntArray) -> None:
         def block(first: int, last: int) -> None:
             kernels.clip(
-                first, last, rows, self._table, self._towers, self._sun, self._ways,
-                self._reaches, self._near, self._spans, self._parts,
+                first, last, rows, self.table, self._towers, self._sun, self._ways,
+                self._reaches, self._near, self._spans, self.parts,
                 (self._shares, self._moments),
             )  # fmt: skip
 
@@ -137,7 +140,7 @@ class Shading:
             All mirrors, (H,), in their new poses.
         """
         table, ways, reaches = _rows(mirrors, self._sun, rows)
-        self._table[rows], self._ways[rows], self._reaches[rows] = table, ways, reaches
+        self.table[rows], self._ways[rows], self._reaches[rows] = table, ways, reaches
         if np.abs(table[:, :3] - self._places[rows]).max(initial=0.0) > SLACK:
             before = self._touched(rows)
             self._look()
@@ -153,7 +156,7 @@ class Shading:
 
     def _touched(self, rows: IntArray) -> npt.NDArray[np.bool_]:
         """Return the mask of mirrors that are in ``rows`` or have one of them as candidate."""
-        moved = np.zeros(len(self._table), dtype=np.bool_)
+        moved = np.zeros(len(self.table), dtype=np.bool_)
         moved[rows] = True
         touched = np.empty_like(moved)
         kernels.touched(self._spans, self._near, moved, touched)
@@ -162,10 +165,10 @@ class Shading:
     def pieces(self, row: int) -> list[FloatArray]:
         """Return the convex polygons that make up the lit part of one mirror, m, (k, 2) each."""
         corners, begins = kernels.pieces_of(
-            row, self._table, self._towers, self._sun, self._ways, self._reaches, self._near,
+            row, self.table, self._towers, self._sun, self._ways, self._reaches, self._near,
             self._spans,
         )  # fmt: skip
-        return [corners[a:b] for a, b in zip(begins[:-1], begins[1:], strict=True)]
+        return [corners[a:b] for a, b in pairwise(begins)]
 
 
 def _rows(
