@@ -332,8 +332,11 @@ def _fitted(shape: SunShape, count: int, blur: float) -> Gaussians:
     disk = np.log(SUN_SIGMA**2 / total)
     near, far = (disk + np.linspace(np.log(a), np.log(0.8), count) for a in (0.45, 0.2))
     begins = [near, far, np.append(far[1:], 2.0), np.append(near[:-1], 1.0)]
-    options = {"maxiter": 4000, "xatol": 1e-3, "fatol": 1e-9}
-    found = [minimize(miss, x, method="Nelder-Mead", options=options) for x in begins]
+    # Four digits of the variances are plenty.
+    found = [
+        minimize(miss, x, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-9})
+        for x in begins
+    ]
     logs = np.sort(min(found, key=lambda result: float(result.fun)).x)
     variance = total * np.exp(np.clip(logs, -6.0, 6.0))
     return Gaussians(weights(variance), as_float(variance))
