@@ -31,7 +31,7 @@ from heliotrope.optics.beam import (
     crossing,
     mean_concentration,
 )
-from heliotrope.optics.flux import CELLS, FluxView, field_flux, predict_flux
+from heliotrope.optics.flux import CELLS, FluxView, predict_flux
 from heliotrope.optics.glare import (
     DAYLIGHT,
     Eye,
@@ -65,6 +65,15 @@ from heliotrope.optics.mirror_image import (
 from heliotrope.optics.mirror_surface import equal_facets
 from heliotrope.optics.obstruction import CentroidShift, Neighbours, centroid_shift, nearest
 from heliotrope.optics.offsets import ImageOffsets, image_offsets, target_offsets
+from heliotrope.optics.plant_flux import (
+    EFFICIENCIES,
+    FieldOptics,
+    FluxTable,
+    PlantFlux,
+    field_flux,
+    flux_day,
+    flux_year,
+)
 from heliotrope.optics.sun_shape import SUN_SHAPES, Gaussians, SunShape, sun_profile
 
 __all__ = [
@@ -72,6 +81,7 @@ __all__ = [
     "CELLS",
     "CHI_SQUARE_90",
     "DAYLIGHT",
+    "EFFICIENCIES",
     "NOMINAL_DNI",
     "REACH",
     "SUN_RADIUS",
@@ -84,6 +94,8 @@ __all__ = [
     "Entries",
     "ExpectedError",
     "Eye",
+    "FieldOptics",
+    "FluxTable",
     "FluxView",
     "Gaussians",
     "Glare",
@@ -92,6 +104,7 @@ __all__ = [
     "ImageOffsets",
     "MirrorOptics",
     "Neighbours",
+    "PlantFlux",
     "SunShape",
     "Sweep",
     "Way",
@@ -106,6 +119,8 @@ __all__ = [
     "field_flux",
     "find_entries",
     "flat_top_beam",
+    "flux_day",
+    "flux_year",
     "gaussian_beam",
     "glare_at",
     "glare_map",
