@@ -98,7 +98,7 @@ def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> 
         If there is no such efficiency.
     """
     import matplotlib.pyplot as plt
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
     if by not in EFFICIENCIES:
         raise UnknownNameError("efficiency", by, EFFICIENCIES)
