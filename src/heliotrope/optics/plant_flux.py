@@ -246,8 +246,9 @@ def field_efficiencies(one: Efficiencies, area: FloatArray) -> dict[str, float]:
         m², (N,).
     """
     light = [area, np.nan_to_num(area * one.cosine)]
-    for stage in ("lit", "mirror", "air", "intercept"):
+    for stage in ("lit", "mirror", "air"):
         light.append(light[-1] * np.nan_to_num(getattr(one, stage)))
+    light.append(np.nan_to_num(area * one.total))
     sums = [float(each.sum()) for each in light]
 
     def share(part: float, whole: float) -> float:
