@@ -113,11 +113,12 @@ def candidates(rows, mirrors, sun, ways, reaches, slack, grid, spans):
     end.
     """
     found, count = np.empty(8 * len(rows) + 64, dtype=np.int64), 0
+    # Shadows are no longer than the field.
+    far = 1.5 * grid[1] * (grid[2][0] + grid[2][1])
     for r in range(len(rows)):
         i = rows[r]
         spans[r, 0] = count
-        if sun[2] > 0.0:
-            found, count = _along(i, mirrors, sun, np.inf, slack, grid, found, count)
+        found, count = _along(i, mirrors, sun, far, slack, grid, found, count)
         spans[r, 1] = count
         found, count = _along(i, mirrors, ways[i], reaches[i], slack, grid, found, count)
     spans[len(rows), 0] = count
