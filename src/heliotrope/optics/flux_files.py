@@ -9,7 +9,7 @@
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from heliotrope.files import write_text
 from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.plant_flux import EFFICIENCIES, FluxTable, PlantFlux
-
-if TYPE_CHECKING:
-    from scipy.io import netcdf_file
 
 #: Columns of a table of heliostats, as SolarPILOT exports them.
 HELIOSTAT_COLUMNS = (
@@ -108,7 +105,8 @@ class _Kept(io.BytesIO):
 def _fill_netcdf(stream: BinaryIO, found: PlantFlux) -> None:
     from scipy.io import netcdf_file
 
-    file = netcdf_file(stream, "w", version=2)
+    # Its attributes are those of the file.
+    file: Any = netcdf_file(stream, "w", version=2)
     file.title = f"{found.plant}: optical efficiencies and flux"
     file.sun_east_north_up, file.dni_w_m2, file.rays = found.sun, found.dni, found.rays
     names = np.array([list(name.ljust(max(map(len, found.names)))) for name in found.names], "S1")
@@ -133,7 +131,7 @@ def _fill_netcdf(stream: BinaryIO, found: PlantFlux) -> None:
 
 
 def _put(
-    file: "netcdf_file",
+    file: Any,
     name: str,
     values: Any,
     axes: tuple[str, ...],
@@ -153,8 +151,8 @@ def write_sam(path: str | Path, table: FluxTable) -> None:
     """Write a table over the sun's positions as SAM takes it for a power tower (CSV).
 
     Each line has the sun's azimuth (clockwise from north) and zenith angle in degrees, and the
-    optical efficiency of the field: the matrix ``eta_map`` of SSC's ``csp_solver_pt_sf_perf_interp``,
-    without a header.
+    optical efficiency of the field, without a header: the matrix ``eta_map`` of SSC's
+    ``csp_solver_pt_sf_perf_interp``.
     """
     azimuth, zenith = np.degrees(table.azimuth), 90.0 - np.degrees(table.elevation)
     columns = (_texts(azimuth, 4), _texts(zenith, 4), _texts(table.shares["total"], 6))
@@ -196,7 +194,9 @@ def write_solartherm(path: str | Path, table: FluxTable) -> None:
 
 
 def _texts(values: FloatArray, digits: int) -> list[str]:
-    return ["" if np.isnan(v) else f"{v:.{digits}f}" for v in values.tolist()]
+    # Adding 0 takes the sign from what rounds to −0.
+    rounded = np.round(values, digits) + 0.0
+    return ["" if np.isnan(v) else f"{v:.{digits}f}" for v in rounded.tolist()]
 
 
 def _csv(rows: Any) -> str:

@@ -8,6 +8,7 @@ left, so that their product is the total: cosine, shading and blocking together 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -145,8 +146,8 @@ class PlantFlux(Value, Framed):
         The receivers with their cells.
     rays
         Number of rays, if it was traced; 0: by the engine.
-    errors
-        Standard errors of the maps, if traced.
+    errors, power_error
+        Standard errors of the maps, W/m², and of the power, W, if traced.
     """
 
     plant: str
@@ -163,6 +164,7 @@ class PlantFlux(Value, Framed):
     surfaces: tuple[Surface, ...]
     rays: int = 0
     errors: tuple[FloatArray, ...] = ()
+    power_error: float = 0.0
 
     def _card(self) -> Card:
         s = self.summary
@@ -244,8 +246,9 @@ def field_efficiencies(one: Efficiencies, area: FloatArray) -> dict[str, float]:
         m², (N,).
     """
     light = [area, np.nan_to_num(area * one.cosine)]
-    for stage in ("lit", "mirror", "air", "intercept"):
+    for stage in ("lit", "mirror", "air"):
         light.append(light[-1] * np.nan_to_num(getattr(one, stage)))
+    light.append(np.nan_to_num(area * one.total))
     sums = [float(each.sum()) for each in light]
 
     def share(part: float, whole: float) -> float:
@@ -256,7 +259,7 @@ def field_efficiencies(one: Efficiencies, area: FloatArray) -> dict[str, float]:
         name: share(float(light[1] @ np.nan_to_num(getattr(one, name))), cosine)
         for name in ("shading", "blocking")
     }
-    steps = [share(b, a) for a, b in zip(sums[:-1], sums[1:], strict=True)]
+    steps = [share(b, a) for a, b in pairwise(sums)]
     named = dict(zip(("cosine", "lit", "mirror", "air", "intercept"), steps, strict=True))
     values = {**named, **alone, "total": share(sums[-1], sums[0])}
     return {name: values[name] for name in EFFICIENCIES}
@@ -372,7 +375,8 @@ def _traced(
         for s, f, p in zip(scene.surfaces, traced.flux, traced.power, strict=True)
     ]
     found = _result(plant, scene, shares, views)
-    return replace(found, rays=int(rays), errors=traced.error)
+    spread = float(np.sqrt(np.sum(traced.power_error**2)))
+    return replace(found, rays=int(rays), errors=traced.error, power_error=spread)
 
 
 def _result(plant: Plant, scene: Scene, shares: Efficiencies, maps: list[FluxView]) -> PlantFlux:
@@ -397,10 +401,8 @@ def _view(surface: Surface, flux: FloatArray, power: float, intercept: float, li
         edges = surface.edges
         right = 0.5 * (edges[1:] + edges[:-1]) * surface.radius
     else:
-        return FluxView(
-            surface.name, np.arange(float(flux.size)), np.zeros(1), flux.reshape(1, -1), power, intercept,
-            lit,
-        )  # fmt: skip
+        right, row = np.arange(float(flux.size)), flux.reshape(1, -1)
+        return FluxView(surface.name, right, np.zeros(1), row, power, intercept, lit)
     up = ((np.arange(rows) + 0.5) / rows - 0.5) * surface.height
     return FluxView(surface.name, right, up, flux, power, intercept, lit)
 

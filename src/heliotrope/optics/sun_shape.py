@@ -263,6 +263,7 @@ def sun_profile(theta: npt.ArrayLike, shape: str, circumsolar: float = 0.05) -> 
     return as_float(np.where(disk, body, np.where(angle <= AUREOLE_RADIUS, ring, 0.0)))
 
 
+@lru_cache(maxsize=8)
 def _quadrature(radius: float) -> tuple[FloatArray, FloatArray]:
     """Return nodes and weights from 0 to a radius, with a break at the rim of the disk."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)

@@ -98,7 +98,7 @@ def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> 
         If there is no such efficiency.
     """
     import matplotlib.pyplot as plt
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
     if by not in EFFICIENCIES:
         raise UnknownNameError("efficiency", by, EFFICIENCIES)
@@ -120,6 +120,8 @@ def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> 
     ax.set_ylim(low[1], high[1])
     ax.set_zlim(low[2], high[2] + 1.0)
     ax.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()))
+    ax.locator_params(nbins=5)
+    ax.set_zticks(np.round([low[2], high[2]]))
     ax.set_xlabel("east, m")
     ax.set_ylabel("north, m")
     return ax
