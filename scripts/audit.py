@@ -32,8 +32,8 @@ ALLOWED = (
     "historical permission", "zlib", "unlicense", "public domain", "cc0", "zpl", "eupl",
     "epl", "eclipse", "edl", "blueoak", "ofl",
 )  # fmt: skip
-#: Licences missing from a package's metadata, with the place where they were read.
-KNOWN: dict[str, str] = {}
+#: Licences that a package's metadata do not name, with the place where they were read.
+KNOWN: dict[str, str] = {"embreex": "BSD-2-Clause"}  # its metadata hold the text without a name
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def licence_of(found: Distribution) -> str:
 
 def judge(name: str, version: str, licence: str, pins: dict[str, str]) -> Package:
     """Return a package with its problem, if any."""
-    pinned, licence = pins.get(name, ""), licence or KNOWN.get(name, "")
+    pinned, licence = pins.get(name, ""), KNOWN.get(name, licence)
     problem = ""
     if not pinned:
         problem = "it is not pinned; add it to constraints.txt"

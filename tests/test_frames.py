@@ -208,7 +208,8 @@ def single_records() -> dict[str, Framed]:
         "jacobian": NOMINAL.jacobian(counts, names),
         "armature": NOMINAL.armature,
         "armatures": PLANT.nominal.armature,
-        "flux": ht.flux(PLANT, TIMES[UP][3]),
+        "flux": ht.flux(PLANT, TIMES[UP][3]).maps[0],
+        "plant flux": ht.flux(PLANT, TIMES[UP][3]),
         "offsets": offsets,
         "terms": fit_terms(PLANT["P6A"], seen, "guo6", [term]),
         "calibration": HeliostatCalibration.from_fit(

@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     )
     from heliotrope.mechanism import kinds as kinds
     from heliotrope.optics import field_flux as flux
-    from heliotrope.optics import image_offsets, predict_flux
+    from heliotrope.optics import flux_day, flux_year, image_offsets, predict_flux
     from heliotrope.sun import Site
 
 __version__ = "0.1.0"
@@ -101,6 +101,8 @@ _HOMES = {
     "example_plant": "heliotrope.field",
     "fit": "heliotrope.calibration.fit",
     "flux": "heliotrope.optics",
+    "flux_day": "heliotrope.optics",
+    "flux_year": "heliotrope.optics",
     "image_offsets": "heliotrope.optics",
     "join": "heliotrope.calibration",
     "learn": "heliotrope.calibration.learn",
@@ -164,6 +166,8 @@ __all__ = [
     "example_plant",
     "fit",
     "flux",
+    "flux_day",
+    "flux_year",
     "geometry",
     "image_offsets",
     "imaging",

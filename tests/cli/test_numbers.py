@@ -28,6 +28,15 @@ from heliotrope.sun import vector
 #: Longest time of one case, s.
 LONGEST = 120
 FIELD = "name,group,east_m,north_m,up_m\nA1,azel,0,-30,0\nA2,azel,6,-36,0\n"
+RECEIVER = """
+[[receivers]]
+name = "receiver"
+kind = "planar"
+center_m = [0, 0, 13]
+normal = [0, -1, 0]
+width_m = 3
+height_m = 3
+"""
 NOON = "2026-06-21T12:00:00Z"
 #: Texts for numbers, by what people and programs write.
 TEXTS = (
@@ -43,6 +52,7 @@ WRITTEN = {
     "--by-slot": "", "--clear": "0.5",
     "--aim": "0,0,13", "--sun": "0,-0.6,0.8", "--site": "37,-5,100", "--at": "0,0,0",
     "--home": "0,0,0", "--led": "0,0,0", "--elevations": "35,50", "--rtk-mm": "6,6,8",
+    "--tower": "0,0,1,10", "--focus": "80", "--cells": "4x8",
     "--offset-mm": "0,0,0", "--size": "640x480", "--prior": "tilt_north=0.005",
 }  # fmt: skip
 #: Least words of each command that has numbers; ctl and store fail for want of a plant, later.
@@ -50,6 +60,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "sun": ("--time", NOON),
     "track": ("plant.toml", "--heliostat", "A1", "--time", NOON),
     "view": ("plant.toml", "v.html", "--heliostat", "A1", "--time", NOON, "--every", "4h"),
+    "flux": ("flux.toml", "--sun", "0,0.6,0.8", "--cells", "4x8"),
     "image": ("a.png", "--plant", "plant.toml", "--no-pictures", "--processes", "1"),
     "calibrate": ("plant.toml", "--sightings", "s.csv", "--model", "tilt_north,tilt_east"),
     "evaluate": ("plant.toml", "--sightings", "s.csv", "--model", "tilt_north,tilt_east"),
@@ -159,6 +170,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("numbers")
     toml = TOML.replace("-33.93", "37.0").replace("18.87", "-5.0")
     (folder / "plant.toml").write_text(toml, encoding="utf-8")
+    (folder / "flux.toml").write_text(toml + RECEIVER, encoding="utf-8")
     (folder / "field.csv").write_text(FIELD, encoding="utf-8")
     Image.fromarray(np.full((48, 64), 90, np.uint8)).save(folder / "a.png")
     plant = read_plant(folder / "plant.toml")
@@ -223,6 +235,10 @@ def _faults(lines: Iterator[list[str]], place: Path, monkeypatch: pytest.MonkeyP
     # A plant that may run would do so until Ctrl-C.
     run = importlib.import_module("heliotrope.cli.run.plant")
     monkeypatch.setattr(run, "run_plant", lambda *_: None)
+    # A thousand million rays take an hour.
+    light = importlib.import_module("heliotrope.optics.plant_flux")
+    trace = light.trace
+    monkeypatch.setattr(light, "trace", lambda s, n, **more: trace(s, min(n, 1e3), **more))
     process = importlib.import_module("heliotrope.cli.run.twin_process")
     monkeypatch.setattr(process, "twin_process", not_begun)
     field = importlib.import_module("heliotrope.cli.twin")

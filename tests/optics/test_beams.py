@@ -9,15 +9,14 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import MRAD, FloatArray, bisector, direction, normalize, reflect
 from heliotrope.imaging.synthetic.scenes import example_target
 from heliotrope.optics.mirror_image import (
-    AUREOLE_RADIUS,
     SUN_RADIUS,
     Beam,
     equal_facets,
     flat_top_beam,
     gaussian_beam,
     reflected_beam,
-    sun_profile,
 )
+from heliotrope.optics.sun_shape import AUREOLE_RADIUS, sun_profile
 
 MM = 1e-3
 TARGET = example_target()

@@ -25,6 +25,7 @@ from heliotrope.cli.drone.commands import app as drone_app
 from heliotrope.cli.evaluate import evaluate
 from heliotrope.cli.fetch import fetch
 from heliotrope.cli.field import app as field_app
+from heliotrope.cli.flux import flux
 from heliotrope.cli.image import image
 from heliotrope.cli.parameters import parameters
 from heliotrope.cli.plan import plan
@@ -70,6 +71,7 @@ app.command()(view)
 app.command()(parameters)
 app.add_typer(field_app, name="field")
 app.add_typer(camera_app, name="camera")
+app.command()(flux)
 app.command()(image)
 app.command()(calibrate)
 app.command()(plan)

@@ -5,10 +5,10 @@ from heliotrope.errors import InputError
 #: Name to import: extra of `pyproject.toml`.
 EXTRAS = {
     "aiomqtt": "control", "alembic": "store", "argon2": "console", "cryptography": "control",
-    "dask": "cluster", "distributed": "cluster", "duckdb": "store", "fastapi": "console",
-    "plotly": "notebook", "psycopg": "postgresql", "pyotp": "console", "segno": "console",
-    "serialx": "control", "sqlalchemy": "store", "starlette": "console", "uvicorn": "console",
-    "websockets": "console",
+    "dask": "cluster", "distributed": "cluster", "duckdb": "store", "embreex": "rays",
+    "fastapi": "console", "plotly": "notebook", "psycopg": "postgresql", "pyotp": "console",
+    "segno": "console", "serialx": "control", "sqlalchemy": "store", "starlette": "console",
+    "uvicorn": "console", "websockets": "console",
 }  # fmt: skip
 #: The extra with everything that a command needs, where that is more than one package.
 _WHOLE = {"run": "console", "ctl": "console", "store": "store"}

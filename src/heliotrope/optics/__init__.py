@@ -1,5 +1,6 @@
 """Light between the sun, the mirrors and the surfaces that they light.
 
+- `sun_shape` and `attenuation`: the sun's profile, and what the air takes.
 - `beam`: the sun's angular radius, the width of a beam and its strength along its axis. Every other
   module takes these from there.
 - `offsets`: where an imperfect heliostat throws its beam (Malan's error model as a forward model).
@@ -13,6 +14,7 @@
 Begin with `image_offsets` for a tracking error, `predict_flux` for a receiver.
 """
 
+from heliotrope.optics.attenuation import AIR_MODELS, air_loss
 from heliotrope.optics.beam import (
     CHI_SQUARE_90,
     NOMINAL_DNI,
@@ -29,7 +31,7 @@ from heliotrope.optics.beam import (
     crossing,
     mean_concentration,
 )
-from heliotrope.optics.flux import CELLS, FluxView, air_loss, field_flux, predict_flux
+from heliotrope.optics.flux import CELLS, FluxView, predict_flux
 from heliotrope.optics.glare import (
     DAYLIGHT,
     Eye,
@@ -59,19 +61,31 @@ from heliotrope.optics.mirror_image import (
     flat_top_beam,
     gaussian_beam,
     reflected_beam,
-    sun_profile,
 )
 from heliotrope.optics.mirror_surface import equal_facets
 from heliotrope.optics.obstruction import CentroidShift, Neighbours, centroid_shift, nearest
 from heliotrope.optics.offsets import ImageOffsets, image_offsets, target_offsets
+from heliotrope.optics.plant_flux import (
+    EFFICIENCIES,
+    FieldOptics,
+    FluxTable,
+    PlantFlux,
+    field_flux,
+    flux_day,
+    flux_year,
+)
+from heliotrope.optics.sun_shape import SUN_SHAPES, Gaussians, SunShape, sun_profile
 
 __all__ = [
+    "AIR_MODELS",
     "CELLS",
     "CHI_SQUARE_90",
     "DAYLIGHT",
+    "EFFICIENCIES",
     "NOMINAL_DNI",
     "REACH",
     "SUN_RADIUS",
+    "SUN_SHAPES",
     "SUN_SIGMA",
     "Beam",
     "Beams",
@@ -80,13 +94,18 @@ __all__ = [
     "Entries",
     "ExpectedError",
     "Eye",
+    "FieldOptics",
+    "FluxTable",
     "FluxView",
+    "Gaussians",
     "Glare",
     "GlareMap",
     "Hazard",
     "ImageOffsets",
     "MirrorOptics",
     "Neighbours",
+    "PlantFlux",
+    "SunShape",
     "Sweep",
     "Way",
     "air_loss",
@@ -100,6 +119,8 @@ __all__ = [
     "field_flux",
     "find_entries",
     "flat_top_beam",
+    "flux_day",
+    "flux_year",
     "gaussian_beam",
     "glare_at",
     "glare_map",

@@ -11,8 +11,7 @@ a field of 10,000 beams is one product of two matrices. The power of a beam is
 
 $$P = A \, E \, ρ \, \sqrt{(1 + s·t)/2} \, (1 - l(d)),$$
 
-with the loss l in clear air after Vittitoe and Biggs as in DELSOL3 (Kistler 1986):
-$l = 0.006789 + 0.1046 d - 0.017 d^2 + 0.002845 d^3$, d in km. `predict_flux` says what is left out.
+with the loss l in clear air of `air_loss`. `predict_flux` says what is left out.
 """
 
 from dataclasses import dataclass
@@ -21,14 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
 from heliotrope.frames import Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
-from heliotrope.mechanism.tracking import track
+from heliotrope.optics.attenuation import air_loss
 from heliotrope.optics.beam import beam_sigma
 from heliotrope.optics.intercept import intercept_rectangle
-from heliotrope.sun import Times, vector
 from heliotrope.values import Card, Value, amount, span
 
 #: Default number of cells across and up.
@@ -80,12 +77,6 @@ class FluxView(Value, Framed):
         }
         notes = {"receiver": self.receiver, "cells": "centres, m from that of the aperture"}
         return Labelled(rows, {"up": self.up, "right": self.right}, variables, notes=notes)
-
-
-def air_loss(distance: npt.ArrayLike) -> FloatArray:
-    """Return the share of the light that clear air absorbs and scatters over a distance in m."""
-    d = 1e-3 * as_float(distance)
-    return as_float(np.clip(0.006789 + 0.1046 * d - 0.017 * d**2 + 0.002845 * d**3, 0.0, 1.0))
 
 
 def predict_flux(
@@ -195,64 +186,6 @@ def predict_flux(
         caught,
         caught / total if total > 0.0 else float("nan"),
         len(power),
-    )
-
-
-def field_flux(
-    plant: Plant,
-    time: Times,
-    receiver: str = "",
-    *,
-    error: npt.ArrayLike = 1e-3,
-    dni: float = 900.0,
-    reflectivity: float = 0.9,
-    slope: float = 1e-3,
-    cells: tuple[int, int] = CELLS,
-) -> FluxView:
-    """Return the flux of a whole plant on a receiver, all heliostats aiming at its centre.
-
-    Heliostats that cannot reach it count for nothing. See `predict_flux` for what is left out.
-
-    Parameters
-    ----------
-    plant
-        As calibrated.
-    time
-        One time; see `heliotrope.sun.Times`.
-    receiver
-        Name; "": the first.
-    error
-        Two-dimensional standard deviation of the normals, rad, () or (N,).
-    dni, reflectivity, slope, cells
-        As for `predict_flux`.
-
-    Raises
-    ------
-    InputError
-        If there is no receiver, or more than one time.
-    UnknownNameError
-        If there is no receiver of that name.
-    """
-    if not plant.receivers:
-        raise InputError(f"flux: plant {plant.name} has no receiver; add one to the plant file")
-    aperture = plant.receiver(receiver) if receiver else plant.receivers[0]
-    light = vector(time, plant.site)
-    if light.shape != (3,):
-        raise InputError(f"flux: times of shape {light.shape[:-1]}; give one time")
-    tracking = track(plant, light, aperture.center)
-    good = tracking.reachable
-    area = np.concatenate([g.width * g.height for g in plant.groups.values()])
-    return predict_flux(
-        aperture,
-        tracking.chosen(tracking.vertex)[good],
-        np.broadcast_to(aperture.center, (int(good.sum()), 3)),
-        area[good],
-        np.broadcast_to(as_float(error), area.shape)[good],
-        sun=light,
-        dni=dni,
-        reflectivity=reflectivity,
-        slope=slope,
-        cells=cells,
     )
 
 

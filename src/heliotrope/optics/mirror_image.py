@@ -23,10 +23,7 @@ from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.optics.coverage import coverage
 from heliotrope.optics.mirror_surface import elements_of, equal_facets, mirror_axes
 from heliotrope.optics.obstruction import Neighbours
-
-#: Outer radius of Buie's aureole, rad.
-AUREOLE_RADIUS = 43.6e-3
-SUN_SHAPES = ("pillbox", "limb", "buie")
+from heliotrope.optics.sun_shape import AUREOLE_RADIUS, PROFILES, sun_profile
 
 #: A Gaussian is drawn to this many σ; 4e-6 of a two-dimensional one lies beyond.
 _REACH = 5.0
@@ -356,7 +353,7 @@ def reflected_beam(
     slope_error
         Standard deviation of the surface's normal per axis, rad.
     sun_shape
-        "pillbox", "limb" (darkened towards the limb) or "buie" (with an aureole).
+        "pillbox", "limb" or "quartic" (darkened towards the limb), or "buie" (with an aureole).
     circumsolar
         Parameter χ of Buie's shape, nearly the circumsolar ratio, 0.01 to 0.8.
     reflectivity, dni
@@ -542,34 +539,6 @@ def _sun_cells(
     return as_float(value.reshape(2 * half[1] + 1, fine, 2 * half[0] + 1, fine).mean(axis=(1, 3)))
 
 
-def sun_profile(theta: npt.ArrayLike, shape: str, circumsolar: float = 0.05) -> FloatArray:
-    """Return the sun's radiance at angles from its centre (rad), relative to the centre.
-
-    Notes
-    -----
-    Limb: 0.3 + 0.93 μ − 0.23 μ², at 550 nm, μ = √(1 − (θ/θ_sun)²) (Cox, Allen's Astrophysical
-    Quantities, 2000). Buie, Monger and Dey, Solar Energy 74 (2003): cos 0.326θ / cos 0.308θ on
-    the disk and e^κ θ^γ to 43.6 mrad, θ in mrad, κ = 0.9 ln(13.5 χ) χ^−0.3,
-    γ = 2.2 ln(0.52 χ) χ^0.43 − 0.1.
-    """
-    angle = as_float(theta)
-    disk = angle <= SUN_RADIUS
-    if shape == "pillbox":
-        return as_float(np.where(disk, 1.0, 0.0))
-    if shape == "limb":
-        mu = np.sqrt(np.clip(1.0 - (angle / SUN_RADIUS) ** 2, 0.0, 1.0))
-        return as_float(np.where(disk, 0.3 + 0.93 * mu - 0.23 * mu**2, 0.0))
-    if shape != "buie":
-        raise InputError(f"sun shape {shape!r}; known: {', '.join(SUN_SHAPES)}")
-    mrad, chi = angle * 1e3, circumsolar
-    kappa = 0.9 * np.log(13.5 * chi) * chi**-0.3
-    gamma = 2.2 * np.log(0.52 * chi) * chi**0.43 - 0.1
-    ring = np.exp(kappa) * np.maximum(mrad, 1e3 * SUN_RADIUS) ** gamma
-    inside = np.minimum(mrad, 1e3 * SUN_RADIUS)
-    body = np.cos(0.326 * inside) / np.cos(0.308 * inside)
-    return as_float(np.where(disk, body, np.where(angle <= AUREOLE_RADIUS, ring, 0.0)))
-
-
 def deposit(places: FloatArray, weights: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Return a grid of weights (E,) at columns and rows (E, 2), each split over four cells."""
     whole = np.floor(places).astype(np.intp)
@@ -628,8 +597,8 @@ def _reflection_guards(
     name = "reflected beam"
     if not 0.0 <= slope_error < 0.1:
         raise InputError(f"{name}: slope_error {slope_error} rad must be 0 or more, below 0.1")
-    if sun_shape not in SUN_SHAPES:
-        raise InputError(f"{name}: sun_shape {sun_shape!r}; known: {', '.join(SUN_SHAPES)}")
+    if sun_shape not in PROFILES:
+        raise InputError(f"{name}: sun_shape {sun_shape!r}; known: {', '.join(PROFILES)}")
     if not 0.01 <= circumsolar <= 0.8:
         raise InputError(f"{name}: circumsolar {circumsolar} must be from 0.01 to 0.8")
     if not 0.0 < reflectivity <= 1.0:

@@ -1,8 +1,9 @@
 """Pictures of days, errors, fields and mechanisms, each on given axes or new ones.
 
-`day`, `residuals`, `ellipses`, `field_map`, `year_map` and `drift` draw on axes of matplotlib and
-return them; reports draw with the same functions. `mechanism_3d` gives a figure of plotly with a
-slider of time (``pip install 'heliotrope[notebook]'``). Colours can be told apart by the
+Drawn on axes of matplotlib, which are returned: `day`, `residuals`, `ellipses`, `field_map`,
+`year_map`, `drift`, `receiver_map`, `efficiency_map` and `flux_3d`; reports draw with the same
+functions. `flux_figure` gives a figure of the field's light, and `mechanism_3d` one of plotly with
+a slider of time (``pip install 'heliotrope[notebook]'``). Colours can be told apart by the
 colour-blind.
 """
 
@@ -16,6 +17,7 @@ from heliotrope.plot.charts import (
     residuals,
     year_map,
 )
+from heliotrope.plot.light import efficiency_map, flux_3d, flux_figure, receiver_map
 from heliotrope.plot.scene import mechanism_3d
 
 __all__ = [
@@ -23,9 +25,13 @@ __all__ = [
     "Group",
     "day",
     "drift",
+    "efficiency_map",
     "ellipses",
     "field_map",
+    "flux_3d",
+    "flux_figure",
     "mechanism_3d",
+    "receiver_map",
     "residuals",
     "year_map",
 ]

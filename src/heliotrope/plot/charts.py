@@ -285,6 +285,7 @@ def field_map(
     label: str = "",
     names: Sequence[str] = (),
     targets: npt.ArrayLike = (),
+    whole: bool = False,
     ax: "Axes | None" = None,
 ) -> "Axes":
     """Draw a map of heliostats coloured by a number; grey where it is NaN.
@@ -301,6 +302,9 @@ def field_map(
         Written beside the dots of at most 60 heliostats.
     targets
         Centres of targets, (K, 3), drawn as triangles.
+    whole
+        The colours go from the lowest number to the highest, instead of from 0 to the 95th
+        percentile.
     ax
         Axes to draw on; default new ones.
 
@@ -323,11 +327,13 @@ def field_map(
         size = 45.0 if known.sum() < 200 else 8.0
         top = max(float(np.percentile(shown[known], 95)), 1e-6)
         low = min(0.0, float(shown[known].min()))
+        if whole:
+            low, top = float(shown[known].min()), float(shown[known].max())
         dots = ax.scatter(
             places[known, 0], places[known, 1], c=shown[known], s=size, cmap="cividis",
             vmin=low, vmax=top,
         )  # fmt: skip
-        ax.figure.colorbar(dots, ax=ax, label=label, extend="max")
+        ax.figure.colorbar(dots, ax=ax, label=label, extend="neither" if whole else "max")
     if len(names) == len(places) and known.sum() <= _NAMED:
         for i in np.flatnonzero(known):
             where = (float(places[i, 0]), float(places[i, 1]))

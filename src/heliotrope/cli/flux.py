@@ -1,0 +1,454 @@
+"""``heliotrope flux``: what each heliostat puts on the receiver, and what is lost where."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from heliotrope.cli._calibration import progress
+from heliotrope.cli._common import (
+    day_of,
+    open_plant,
+    parse_numbers,
+    parse_point,
+    parse_site,
+    parse_time,
+    print_json,
+    print_table,
+    sunlit,
+)
+from heliotrope.errors import InputError, shown
+
+if TYPE_CHECKING:
+    from heliotrope.field.plant import Plant
+    from heliotrope.optics import FieldOptics, FluxTable, PlantFlux
+    from heliotrope.optics.scene import Tower
+
+#: Words for the efficiencies, in the order of the light.
+_WORDS = {
+    "cosine": "cosine",
+    "shading": "  not shaded",
+    "blocking": "  not blocked",
+    "lit": "neither shaded nor blocked",
+    "mirror": "reflectivity and soiling",
+    "air": "air",
+    "intercept": "intercept",
+    "total": "total",
+}
+
+
+def flux(
+    field: Annotated[Path, typer.Argument(help="Plant file, or a field in another format.")],
+    time: Annotated[
+        str | None, typer.Option(help="ISO 8601 with a time zone, or now. Default: noon today.")
+    ] = None,
+    sun: Annotated[str | None, typer.Option(help="East,north,up instead of a time.")] = None,
+    every: Annotated[
+        str | None, typer.Option(help="A table of the whole day, at this step, such as 30min.")
+    ] = None,
+    year: Annotated[
+        bool, typer.Option("--year", help="A table over the sun's positions in a year.")
+    ] = False,
+    receiver: Annotated[
+        list[str] | None, typer.Option(help="Name; may be repeated. Default: all.")
+    ] = None,
+    aim: Annotated[
+        str | None, typer.Option(help="East,north,up, m. Default: own aims, else the receiver.")
+    ] = None,
+    site: Annotated[
+        str | None, typer.Option(help="LATITUDE,LONGITUDE,HEIGHT of a field without a place.")
+    ] = None,
+    dni: Annotated[float, typer.Option(min=0, max=2000, help="W/m².")] = 900.0,
+    shape: Annotated[
+        str,
+        typer.Option(
+            "--sun-shape", help="limb, quartic, pillbox, buie:RATIO or gaussian:SIGMA in rad."
+        ),
+    ] = "limb",
+    air: Annotated[
+        str,
+        typer.Option(
+            help="clear, hazy, mirval, ballestrin-clear, ballestrin-hazy, none, or the visibility "
+            "in km."
+        ),
+    ] = "clear",
+    slope_mrad: Annotated[
+        float, typer.Option(min=0, max=50, help="Slope error of the surface per axis, mrad.")
+    ] = 1.0,
+    error_mrad: Annotated[
+        float, typer.Option(min=0, max=100, help="Expected error of the normals, mrad RMS.")
+    ] = 1.0,
+    reflectivity: Annotated[float, typer.Option(min=0, max=1, help="Of a clean mirror.")] = 0.9,
+    clean: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of it that soiling leaves.")
+    ] = 1.0,
+    focus: Annotated[
+        str, typer.Option(help="slant, flat, or the focal length of all mirrors, m.")
+    ] = "slant",
+    cells: Annotated[
+        str | None, typer.Option(help="Rows and columns of each receiver, such as 20x56.")
+    ] = None,
+    tower: Annotated[
+        list[str] | None,
+        typer.Option(help="Obstacle: EAST,NORTH,RADIUS,TOP in m; may be repeated."),
+    ] = None,
+    rays: Annotated[
+        float, typer.Option(min=0, max=1e9, help="Trace this many rays as a second opinion.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Of the rays.")] = 0,
+    by: Annotated[
+        Literal["cosine", "shading", "blocking", "lit", "mirror", "air", "intercept", "total"],
+        typer.Option(help="Efficiency that colours the field in the picture."),
+    ] = "total",
+    csv: Annotated[
+        Path | None, typer.Option("--csv", help="File for the heliostats, or for the table.")
+    ] = None,
+    cells_csv: Annotated[
+        Path | None, typer.Option("--map", help="File for the cells, CSV.")
+    ] = None,
+    netcdf: Annotated[Path | None, typer.Option(help="File for both, NetCDF.")] = None,
+    sam: Annotated[Path | None, typer.Option(help="File for SAM, with --year.")] = None,
+    solartherm: Annotated[
+        Path | None, typer.Option(help="File for SolarTherm (.motab), with --year.")
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Show the flux on the receivers and the efficiencies of the field and of each heliostat."""
+    from heliotrope.optics import FieldOptics
+
+    light = FieldOptics(
+        dni=dni,
+        shape=shape,
+        air=air,
+        slope=1e-3 * slope_mrad,
+        error=1e-3 * error_mrad,
+        reflectivity=reflectivity,
+        clean=clean,
+        focus=_focus(focus),
+        cells=_cells(cells),
+        towers=tuple(_tower(text) for text in tower or ()),
+    )
+    files = {
+        "csv": csv, "map": cells_csv, "netcdf": netcdf, "sam": sam, "solartherm": solartherm,
+        "picture": picture,
+    }  # fmt: skip
+    order = _Order(
+        light,
+        tuple(receiver or ()),
+        None if aim is None else parse_point(aim, "aim"),
+        {name: path for name, path in files.items() if path is not None},
+        as_json,
+    )
+    order.check(field, table=every is not None or year, year=year)
+    plant = open_plant(field, None if site is None else parse_site(site))
+    if year:
+        _year(plant, order, any_of={"--time": time, "--sun": sun, "--every": every}, rays=rays)
+    elif every is not None:
+        _day(plant, order, time, every, any_of={"--sun": sun}, rays=rays)
+    else:
+        _moment(plant, order, time, sun, (rays, seed), by)
+
+
+@dataclass(frozen=True)
+class _Order:
+    """What is asked for, whatever the suns."""
+
+    light: "FieldOptics"
+    receiver: tuple[str, ...]
+    aim: tuple[float, float, float] | None
+    files: dict[str, Path]
+    as_json: bool
+
+    def check(self, field: Path, *, table: bool, year: bool) -> None:
+        """Refuse files that cannot be written, or that this table has nothing for."""
+        from heliotrope.calibration.plan.report import check_picture
+        from heliotrope.cli.plan import check_outputs
+
+        if "picture" in self.files:
+            check_picture(self.files["picture"])
+        check_outputs(tuple(self.files.values()), field, None)
+        barred = ("map", "netcdf", "picture") if table else ()
+        barred = barred if year else (*barred, "sam", "solartherm")
+        for name in barred:
+            if name in self.files:
+                needs = "--year" if name in ("sam", "solartherm") else "one time"
+                raise InputError(f"--{name}: it is written of {needs} only; leave it out")
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Arguments of `field_flux`, `flux_day` and `flux_year`."""
+        return {"receiver": self.receiver, "aim": self.aim, "light": self.light}
+
+    def print_files(self) -> None:
+        """Say which files were written."""
+        for name, path in self.files.items():
+            print(f"{name}: {path}")
+
+
+def _focus(text: str) -> Literal["slant", "flat"] | float:
+    if text in ("slant", "flat"):
+        return "slant" if text == "slant" else "flat"
+    refusal = f"--focus {shown(text)}: give slant, flat, or a focal length from 0.1 to 1e5 m"
+    (length,) = parse_numbers(text, refusal, least=0.1, most=1e5)
+    return length
+
+
+def _cells(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text, re.ASCII)
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not (min(size) >= 1 and size[0] * size[1] <= 1_000_000):
+        raise InputError(
+            f"--cells {shown(text)}: give rows and columns such as 20x56, at most a million cells"
+        )
+    return size
+
+
+def _tower(text: str) -> "Tower":
+    from heliotrope.optics.scene import Tower
+
+    refusal = f"--tower {shown(text)}: give four numbers in m, east,north,radius,top"
+    east, north, radius, top = parse_numbers(text, refusal, count=4)
+    # Its foot lies below the ground of any field.
+    return Tower(east, north, radius, min(top - 1.0, -1e4), top)
+
+
+def _refuse(what: str, any_of: dict[str, str | None], rays: float) -> None:
+    for name, value in any_of.items():
+        if value is not None:
+            raise InputError(f"{name}: {what} takes no {name}; leave it out")
+    if rays:
+        raise InputError(f"--rays: {what} is not traced; give one time")
+
+
+def _noon(plant: "Plant") -> Any:
+    from heliotrope.sun import events
+
+    return events(day_of(parse_time("now"), plant.site), plant.site).culmination
+
+
+def _moment(
+    plant: "Plant",
+    order: _Order,
+    time: str | None,
+    sun: str | None,
+    rays: tuple[float, int],
+    by: str,
+) -> None:
+    from heliotrope.optics import field_flux, flux_files
+    from heliotrope.plot import flux_figure
+
+    if time is not None and sun is not None:
+        raise InputError("give --time or --sun, not both")
+    when = None if sun is not None else _noon(plant) if time is None else parse_time(time)
+    given = {**order.options, "sun": None if sun is None else parse_point(sun, "sun")}
+    with progress("casting beams", order.as_json) as step:
+        step(0, 1)
+        found = field_flux(plant, when, **given)
+    second = None
+    if rays[0]:
+        with progress("tracing rays", order.as_json) as step:
+            second = field_flux(plant, when, rays=rays[0], seed=rays[1], progress=step, **given)
+    if "csv" in order.files:
+        flux_files.write_heliostats(order.files["csv"], found)
+    if "map" in order.files:
+        flux_files.write_map(order.files["map"], found)
+    if "netcdf" in order.files:
+        flux_files.write_netcdf(order.files["netcdf"], found)
+    if "picture" in order.files:
+        from heliotrope.calibration.plan.report import write_picture
+
+        write_picture(order.files["picture"], flux_figure(found, by))
+    if order.as_json:
+        print_json(
+            _document(found, when) | ({} if second is None else {"rays": _second(found, second)})
+        )
+        return
+    _print_moment(found, second)
+    order.print_files()
+
+
+def _document(found: "PlantFlux", when: Any) -> dict[str, Any]:
+    import numpy as np
+
+    from heliotrope.geometry import azimuth_elevation
+    from heliotrope.optics import EFFICIENCIES
+
+    azimuth, elevation = np.degrees(azimuth_elevation(found.sun))
+    shares = {name: getattr(found.efficiencies, name) for name in EFFICIENCIES}
+    power = found.heliostat_power
+    return {
+        "plant": found.plant,
+        "time": when,
+        "sun_azimuth_deg": float(azimuth),
+        "sun_elevation_deg": float(elevation),
+        "dni_w_m2": found.dni,
+        "mirror_area_m2": float(found.area.sum()),
+        "power_w": found.power,
+        "peak_w_m2": found.peak,
+        "efficiencies": found.summary,
+        "receivers": [
+            {
+                "name": view.receiver,
+                "power_w": view.power,
+                "intercept": view.intercept,
+                "peak_w_m2": float(view.flux.max()),
+                "flux_w_m2": view.flux,
+            }
+            for view in found.maps
+        ],
+        "heliostats": [
+            {"name": name, "power_w": power[i]} | {key: shares[key][i] for key in EFFICIENCIES}
+            for i, name in enumerate(found.names)
+        ],
+    }
+
+
+def _second(found: "PlantFlux", second: "PlantFlux") -> dict[str, Any]:
+    """Return what rays say, beside the engine's result."""
+    import numpy as np
+
+    apart = [a.flux - b.flux for a, b in zip(found.maps, second.maps, strict=True)]
+    squares = np.concatenate([each.ravel() ** 2 for each in apart])
+    noise = np.concatenate([each.ravel() ** 2 for each in second.errors])
+    peak = max(second.peak, 1e-300)
+    return {
+        "count": second.rays,
+        "efficiencies": second.summary,
+        "power_w": second.power,
+        "power_error_w": second.power_error,
+        "peak_w_m2": second.peak,
+        "cells_apart_of_peak": float(np.sqrt(squares.mean())) / peak,
+        "cells_noise_of_peak": float(np.sqrt(noise.mean())) / peak,
+    }
+
+
+def _print_moment(found: "PlantFlux", second: "PlantFlux | None") -> None:
+    import numpy as np
+
+    from heliotrope.geometry import azimuth_elevation
+
+    azimuth, elevation = np.degrees(azimuth_elevation(found.sun))
+    shares = np.stack([getattr(found.efficiencies, name) for name in _WORDS])
+    header = ["efficiency", "field", "lowest heliostat", "highest"]
+    rows = []
+    for (name, words), each in zip(_WORDS.items(), shares, strict=True):
+        known = each[np.isfinite(each)]
+        ends = (f"{100 * x:.2f} %" for x in ((known.min(), known.max()) if known.size else ()))
+        row = [words, f"{100 * found.summary[name]:.2f} %", *ends]
+        rows.append(row + [""] * (4 - len(row)))
+        if second is not None:
+            rows[-1].append(f"{100 * second.summary[name]:.2f} %")
+    if second is not None:
+        header.append("by rays")
+    title = f"{found.plant}: sun {azimuth:.2f}° from north, {elevation:.2f}° high, "
+    title += f"{found.dni:g} W/m² on {found.area.sum():,.0f} m²"
+    print_table(header, rows, title=title)
+    for view in found.maps:
+        print(
+            f"{view.receiver}: {1e-6 * view.power:.5g} MW, peak {1e-3 * view.flux.max():.5g} kW/m²,"
+            f" {100 * view.intercept:.2f} % of the light"
+        )
+    dark = int(np.isnan(found.efficiencies.total).sum())
+    if dark:
+        print(f"{dark} of {len(found.names)} heliostats cannot reach their aim")
+    if second is not None:
+        said = _second(found, second)
+        print(
+            f"by {second.rays:,} rays: {1e-6 * said['power_w']:.5g} ± "
+            f"{1e-6 * said['power_error_w']:.2g} MW, peak {1e-3 * second.peak:.5g} kW/m²; cells "
+            f"differ by {100 * said['cells_apart_of_peak']:.2f} % of the peak (RMS), the rays' own "
+            f"noise is {100 * said['cells_noise_of_peak']:.2f} %"
+        )
+
+
+def _day(
+    plant: "Plant",
+    order: _Order,
+    time: str | None,
+    every: str,
+    *,
+    any_of: dict[str, str | None],
+    rays: float,
+) -> None:
+    from heliotrope.optics import flux_day
+
+    _refuse("a day", any_of, rays)
+    when = parse_time("now" if time is None else time)
+    times = sunlit(when, plant.site, every, least=60.0)
+    with progress("casting beams", order.as_json) as step:
+        table = flux_day(plant, times, progress=step, **order.options)
+    _print_table(table, order)
+
+
+def _year(plant: "Plant", order: _Order, *, any_of: dict[str, str | None], rays: float) -> None:
+    from heliotrope.optics import flux_files, flux_year
+
+    _refuse("a year", any_of, rays)
+    with progress("casting beams", order.as_json) as step:
+        table = flux_year(plant, progress=step, **order.options)
+    if "sam" in order.files:
+        flux_files.write_sam(order.files["sam"], table)
+    if "solartherm" in order.files:
+        flux_files.write_solartherm(order.files["solartherm"], table)
+    _print_table(table, order)
+
+
+def _print_table(table: "FluxTable", order: _Order) -> None:
+    import numpy as np
+
+    from heliotrope.calibration.plan.report import write_table
+    from heliotrope.files.times import format_time
+    from heliotrope.optics import EFFICIENCIES
+
+    degrees = np.degrees([table.azimuth, table.elevation, table.declination, table.hour])
+    by_time = bool(np.isfinite(table.time).all())
+    records = []
+    for k in range(len(table.sun)):
+        azimuth, elevation, declination, hour = degrees[:, k].tolist()
+        place: dict[str, Any] = (
+            {"time": format_time(table.time[k])}
+            if by_time
+            else {"declination_deg": round(declination, 4), "hour_angle_deg": round(hour, 4)}
+        )
+        place |= {"azimuth_deg": round(azimuth, 4), "elevation_deg": round(elevation, 4)}
+        place |= {name: round(float(table.shares[name][k]), 6) for name in EFFICIENCIES}
+        place |= {
+            "dni_w_m2": round(float(table.dni[k]), 2),
+            "power_w": round(float(table.power[k]), 1),
+        }
+        records.append(place | {"peak_w_m2": round(float(table.peak[k]), 1)})
+    if "csv" in order.files:
+        write_table(order.files["csv"], records)
+    if order.as_json:
+        mean = dict(zip(table.names, table.heliostat.tolist(), strict=True))
+        print_json(
+            {
+                "plant": table.plant,
+                "mean_efficiency": table.mean,
+                "suns": records,
+                "heliostats": mean,
+            }
+        )
+        return
+    first = ("time",) if by_time else ("declination_deg", "hour_angle_deg")
+    heads = [*(name.replace("_deg", ", °").replace("_", " ") for name in first)]
+    heads += ["elevation, °", "cosine", "lit", "intercept", "total", "MW", "peak, kW/m²"]
+    rows = [
+        [
+            *(str(one[name]) for name in first),
+            f"{one['elevation_deg']:.1f}",
+            *(f"{100 * one[name]:.2f} %" for name in ("cosine", "lit", "intercept", "total")),
+            f"{1e-6 * one['power_w']:.4g}",
+            f"{1e-3 * one['peak_w_m2']:.4g}",
+        ]
+        for one in records
+    ]
+    print_table(
+        heads, rows, title=f"{table.plant}: mean optical efficiency {100 * table.mean:.2f} %"
+    )
+    order.print_files()

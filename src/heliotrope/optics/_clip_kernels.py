@@ -1,0 +1,570 @@
+# mypy: disable-error-code="no-untyped-call, untyped-decorator"
+# mypy: allow-untyped-defs
+"""Compiled: which part of each mirror sees the sun and its aim past mirrors and towers.
+
+A mirror's row of SIZE numbers holds its centre, its axes x and y and its normal (3 each), half its
+width and height, its curvature 1 / 2f, and a radius that holds it. An occluder is a convex polygon.
+A ray that leaves the mirror at (x, y) goes along d + D (x, y), D being the derivative of the
+reflected direction by the place on the curved mirror; 0 for shading. The occluder's corners are
+carried along these rays into the mirror's plane, and the polygons are subtracted from the mirror's
+rectangle one by one. What is left is a list of convex pieces, however many there are.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from heliotrope.jit import INLINED, INNER, OPTIONS
+
+#: Numbers of a mirror's row; of a tower's (east, north, radius, bottom, top).
+SIZE, TOWER = 16, 5
+#: Corners of a polygon at most: a tower's top, cut twice.
+CORNERS = 32
+#: Corners of a tower's top.
+ROUND = 24
+#: Pieces below this share of the mirror's area are dropped.
+SPECK = 1e-13
+
+
+@njit(**INNER)
+def cells_of(mirrors, low, step, shape, heads, links, tops):
+    """Put mirrors in a grid of the ground: the first of each cell, the next of each, the top."""
+    for k in range(len(heads)):
+        heads[k] = -1
+        tops[k] = -math.inf
+    for j in range(len(mirrors)):
+        k = int((mirrors[j, 1] - low[1]) / step) * shape[1] + int((mirrors[j, 0] - low[0]) / step)
+        links[j], heads[k] = heads[k], j
+        tops[k] = max(tops[k], mirrors[j, 2] + mirrors[j, 15])
+
+
+@njit(**OPTIONS)
+def gridded(mirrors, low, step, shape, heads, links, tops):
+    """As `cells_of`, for callers from Python."""
+    cells_of(mirrors, low, step, shape, heads, links, tops)
+
+
+@njit(**INNER)
+def _near(i, j, mirrors, way, reach, slack):
+    """Whether mirror j may touch the rays from mirror i along a way, up to a distance."""
+    x, y = mirrors[j, 0] - mirrors[i, 0], mirrors[j, 1] - mirrors[i, 1]
+    z = mirrors[j, 2] - mirrors[i, 2]
+    along = x * way[0] + y * way[1] + z * way[2]
+    room = mirrors[i, 15] + mirrors[j, 15] + slack
+    if along < -room or along > reach + room:
+        return False
+    return x * x + y * y + z * z - along * along <= room * room
+
+
+@njit(**INNER)
+def _along(i, mirrors, way, reach, slack, grid, found, count):
+    """Append the mirrors near the rays from mirror i along a way; returns them and their number."""
+    low, step, shape, heads, links, tops, top = grid
+    x0, y0, z0 = mirrors[i, 0] - low[0], mirrors[i, 1] - low[1], mirrors[i, 2] - mirrors[i, 15]
+    wide = mirrors[i, 15] + 0.5 * step + slack
+    length = reach
+    if way[2] > 0.0:
+        length = min(reach, max(0.0, (top - z0) / way[2]))
+    # Columns are taken along the axis in which the ray goes faster.
+    major = 0 if abs(way[0]) >= abs(way[1]) else 1
+    a0, b0 = (x0, y0) if major == 0 else (y0, x0)
+    da, db = way[major], way[1 - major]
+    na, nb = shape[1 - major], shape[major]
+    ends = (a0, a0 + length * da)
+    first = max(0, math.floor((min(ends) - wide) / step))
+    last = min(na - 1, math.floor((max(ends) + wide) / step))
+    slope = db / da if abs(da) > 1e-12 else 0.0
+    thick = wide * math.sqrt(1.0 + slope * slope) * 1.0001
+    for a in range(first, last + 1):
+        left = min(max(a * step - a0, min(0.0, length * da)), max(0.0, length * da))
+        right = min(max((a + 1) * step - a0, min(0.0, length * da)), max(0.0, length * da))
+        one, other = b0 + slope * left, b0 + slope * right
+        start = max(0, math.floor((min(one, other) - thick) / step))
+        stop = min(nb - 1, math.floor((max(one, other) + thick) / step))
+        lowest = z0
+        if abs(da) > 1e-12:
+            lowest = min(z0 + way[2] * (left - wide) / da, z0 + way[2] * (right + wide) / da)
+            lowest = min(lowest, z0 + way[2] * (left + wide) / da)
+            lowest = min(lowest, z0 + way[2] * (right - wide) / da)
+        for b in range(start, stop + 1):
+            k = b * shape[1] + a if major == 0 else a * shape[1] + b
+            if tops[k] < lowest:
+                continue
+            j = heads[k]
+            while j >= 0:
+                if j != i and _near(i, j, mirrors, way, reach, slack):
+                    if count == len(found):
+                        grown = np.empty(2 * count, dtype=np.int64)
+                        for m in range(count):
+                            grown[m] = found[m]
+                        found = grown
+                    found[count] = j
+                    count += 1
+                j = links[j]
+    return found, count
+
+
+@njit(**OPTIONS)
+def candidates(rows, mirrors, sun, ways, reaches, slack, grid, spans):
+    """Mirrors that may shade and block each of ``rows``: one list, and where each part begins.
+
+    ``spans`` (R + 1, 2) gets the begin of the shading and of the blocking ones; the last row, the
+    end.
+    """
+    found, count = np.empty(8 * len(rows) + 64, dtype=np.int64), 0
+    # Shadows are no longer than the field.
+    far = 1.5 * grid[1] * (grid[2][0] + grid[2][1])
+    for r in range(len(rows)):
+        i = rows[r]
+        spans[r, 0] = count
+        found, count = _along(i, mirrors, sun, far, slack, grid, found, count)
+        spans[r, 1] = count
+        found, count = _along(i, mirrors, ways[i], reaches[i], slack, grid, found, count)
+    spans[len(rows), 0] = count
+    spans[len(rows), 1] = count
+    return found[:count]
+
+
+@njit(**INLINED)
+def _cut(corners, m, into, axis_x, axis_y, axis_z, offset):
+    """Keep the part of a polygon in space where axis · p ≤ offset; returns its corners' number."""
+    count = 0
+    for k in range(m):
+        k2 = k + 1 if k + 1 < m else 0
+        here = (corners[k, 0] * axis_x + corners[k, 1] * axis_y + corners[k, 2] * axis_z) - offset
+        there = (
+            corners[k2, 0] * axis_x + corners[k2, 1] * axis_y + corners[k2, 2] * axis_z
+        ) - offset
+        if here <= 0.0:
+            for c in range(3):
+                into[count, c] = corners[k, c]
+            count += 1
+        if (here < 0.0 < there) or (there < 0.0 < here):
+            t = here / (here - there)
+            for c in range(3):
+                into[count, c] = corners[k, c] + t * (corners[k2, c] - corners[k, c])
+            count += 1
+    return count
+
+
+@njit(**INNER)
+def _carry(i, mirrors, way, bend, reach, corners, m, spare, polygon):
+    """Carry a polygon, relative to mirror i in ENU, into its plane; 0 corners if it hides nothing.
+
+    ``bend`` is D in the mirror's axes, (3, 2).
+    """
+    row = mirrors[i]
+    for k in range(m):
+        x, y, z = corners[k, 0], corners[k, 1], corners[k, 2]
+        corners[k, 0] = x * row[3] + y * row[4] + z * row[5]
+        corners[k, 1] = x * row[6] + y * row[7] + z * row[8]
+        corners[k, 2] = x * row[9] + y * row[10] + z * row[11]
+    dx = way[0] * row[3] + way[1] * row[4] + way[2] * row[5]
+    dy = way[0] * row[6] + way[1] * row[7] + way[2] * row[8]
+    dz = way[0] * row[9] + way[1] * row[10] + way[2] * row[11]
+    if dz <= 1e-9:
+        return 0
+    # Only what is in front of the mirror and before the aim hides anything.
+    m = _cut(corners, m, spare, 0.0, 0.0, -1.0, 0.0)
+    if m < 3:
+        return 0
+    if reach < np.inf:
+        m = _cut(spare, m, corners, dx, dy, dz, reach)
+    else:
+        for k in range(m):
+            for c in range(3):
+                corners[k, c] = spare[k, c]
+    if m < 3:
+        return 0
+    x0, x1, y0, y1, area = math.inf, -math.inf, math.inf, -math.inf, 0.0
+    for k in range(m):
+        px, py, pz = corners[k, 0], corners[k, 1], corners[k, 2]
+        t = pz / dz
+        x, y = px - t * dx, py - t * dy
+        if bend[0, 0] != 0.0 or bend[1, 1] != 0.0:
+            for _ in range(3):
+                a, b = 1.0 + t * bend[0, 0], t * bend[0, 1]
+                c, d = t * bend[1, 0], 1.0 + t * bend[1, 1]
+                u, v, det = px - t * dx, py - t * dy, a * d - b * c
+                x, y = (d * u - b * v) / det, (a * v - c * u) / det
+                t = pz / (dz + bend[2, 0] * x + bend[2, 1] * y)
+        polygon[k, 0], polygon[k, 1] = x, y
+        x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
+    if x1 <= -row[12] or x0 >= row[12] or y1 <= -row[13] or y0 >= row[13]:
+        return 0
+    for k in range(m):
+        k2 = k + 1 if k + 1 < m else 0
+        area += polygon[k, 0] * polygon[k2, 1] - polygon[k2, 0] * polygon[k, 1]
+    if abs(area) < SPECK * row[12] * row[13]:
+        return 0
+    if area < 0.0:
+        for k in range(m // 2):
+            for c in range(2):
+                kept = polygon[k, c]
+                polygon[k, c], polygon[m - 1 - k, c] = polygon[m - 1 - k, c], kept
+    return m
+
+
+@njit(**INLINED)
+def _mirror_corners(i, j, mirrors, corners):
+    a, b = mirrors[j, 12], mirrors[j, 13]
+    for k in range(4):
+        s = a if k in (1, 2) else -a
+        t = b if k in (2, 3) else -b
+        for c in range(3):
+            corners[k, c] = (
+                mirrors[j, c] - mirrors[i, c] + s * mirrors[j, 3 + c] + t * mirrors[j, 6 + c]
+            )
+    return 4
+
+
+@njit(**INNER)
+def _tower_corners(i, tower, mirrors, way, part, corners):
+    """Corners of a tower's outline across the way (part 0) or of its top (part 1)."""
+    x, y = tower[0] - mirrors[i, 0], tower[1] - mirrors[i, 1]
+    bottom, top = tower[3] - mirrors[i, 2], tower[4] - mirrors[i, 2]
+    if part == 1:
+        turn = 2.0 * math.pi / ROUND
+        # A polygon of the circle's area.
+        radius = tower[2] * math.sqrt(turn / math.sin(turn))
+        for k in range(ROUND):
+            corners[k, 0] = x + radius * math.cos(k * turn)
+            corners[k, 1] = y + radius * math.sin(k * turn)
+            corners[k, 2] = top
+        return ROUND
+    flat = math.sqrt(way[0] ** 2 + way[1] ** 2)
+    if flat < 1e-9:
+        return 0
+    ax, ay = -way[1] / flat * tower[2], way[0] / flat * tower[2]
+    for k in range(4):
+        s = 1.0 if k in (1, 2) else -1.0
+        corners[k, 0], corners[k, 1] = x + s * ax, y + s * ay
+        corners[k, 2] = top if k >= 2 else bottom
+    return 4
+
+
+@njit(**INLINED)
+def _beside_tower(i, tower, mirrors, way, reach):
+    """Whether a tower is away from the rays of mirror i."""
+    x, y = tower[0] - mirrors[i, 0], tower[1] - mirrors[i, 1]
+    flat = math.sqrt(way[0] ** 2 + way[1] ** 2)
+    room = mirrors[i, 15] + tower[2]
+    if flat < 1e-9:
+        return x * x + y * y > room * room
+    along = (x * way[0] + y * way[1]) / flat
+    return (
+        along < -room
+        or abs(x * way[1] - y * way[0]) / flat > room
+        or mirrors[i, 2] + (along - room) / flat * way[2] - mirrors[i, 15] > tower[4]
+        or along - room > reach * flat
+    )
+
+
+@njit(**INNER)
+def bend_of(row, sun, bend):
+    """D of a curved mirror, in its axes: r = 2 (n·s) n − s, dn = −(x, y) / 2f."""
+    sx = sun[0] * row[3] + sun[1] * row[4] + sun[2] * row[5]
+    sy = sun[0] * row[6] + sun[1] * row[7] + sun[2] * row[8]
+    sz = sun[0] * row[9] + sun[1] * row[10] + sun[2] * row[11]
+    curve = row[14]
+    bend[0, 0] = bend[1, 1] = -2.0 * sz * curve
+    bend[0, 1] = bend[1, 0] = 0.0
+    bend[2, 0], bend[2, 1] = -2.0 * sx * curve, -2.0 * sy * curve
+
+
+@njit(**INNER)
+def outlines(i, near, mirrors, towers, way, bend, reach, work):
+    """Polygons that hide a part of mirror i along a way; returns them, their corners and number.
+
+    ``near`` lists the mirrors. ``work`` holds two lists of corners.
+    """
+    corners, spare = work
+    room = len(near) + 2 * len(towers)
+    polygons, sizes = np.empty((room, CORNERS, 2)), np.empty(room, dtype=np.int64)
+    count = 0
+    for j in near:
+        m = _mirror_corners(i, j, mirrors, corners)
+        m = _carry(i, mirrors, way, bend, reach, corners, m, spare, polygons[count])
+        if m:
+            sizes[count] = m
+            count += 1
+    for k in range(len(towers)):
+        if _beside_tower(i, towers[k], mirrors, way, reach):
+            continue
+        for part in range(2):
+            m = _tower_corners(i, towers[k], mirrors, way, part, corners)
+            m = _carry(i, mirrors, way, bend, reach, corners, m, spare, polygons[count])
+            if m:
+                sizes[count] = m
+                count += 1
+    return polygons, sizes, count
+
+
+@njit(**INNER)
+def _split(points, m, ax, ay, bx, by, inside, outside):
+    """Cut a convex polygon along the line from a to b; the left of it is inside."""
+    nx, ny = ay - by, bx - ax
+    p = q = 0
+    here = (points[0, 0] - ax) * nx + (points[0, 1] - ay) * ny
+    for k in range(m):
+        k2 = k + 1 if k + 1 < m else 0
+        there = (points[k2, 0] - ax) * nx + (points[k2, 1] - ay) * ny
+        x, y = points[k, 0], points[k, 1]
+        if here >= 0.0:
+            inside[p, 0], inside[p, 1] = x, y
+            p += 1
+        if here <= 0.0:
+            outside[q, 0], outside[q, 1] = x, y
+            q += 1
+        if here * there < 0.0:
+            t = here / (here - there)
+            x, y = x + t * (points[k2, 0] - x), y + t * (points[k2, 1] - y)
+            inside[p, 0], inside[p, 1] = x, y
+            outside[q, 0], outside[q, 1] = x, y
+            p += 1
+            q += 1
+        here = there
+    return p, q
+
+
+@njit(**INLINED)
+def _area(points, m):
+    total = 0.0
+    for k in range(m):
+        k2 = k + 1 if k + 1 < m else 0
+        total += points[k, 0] * points[k2, 1] - points[k2, 0] * points[k, 1]
+    return 0.5 * total
+
+
+@njit(**INLINED)
+def _apart(points, m, polygon, n):
+    """Whether the boxes of two polygons do not overlap."""
+    for c in range(2):
+        low, high = points[0, c], points[0, c]
+        for k in range(1, m):
+            low, high = min(low, points[k, c]), max(high, points[k, c])
+        under, over = True, True
+        for k in range(n):
+            under = under and polygon[k, c] <= low
+            over = over and polygon[k, c] >= high
+        if under or over:
+            return True
+    return False
+
+
+@njit(**INNER)
+def _subtract(points, begins, pieces, polygon, n, speck, into, starts, one, two):
+    """Subtract a convex polygon from convex pieces; returns the number of the new ones."""
+    total = 0
+    for k in range(pieces):
+        m = begins[k + 1] - begins[k]
+        piece = points[begins[k] : begins[k + 1]]
+        first, before = starts[total], total
+        rest, other = one, two
+        for c in range(m):
+            rest[c, 0], rest[c, 1] = piece[c, 0], piece[c, 1]
+        left = m
+        if _apart(piece, m, polygon, n):
+            left = 0
+        else:
+            for e in range(n):
+                f = e + 1 if e + 1 < n else 0
+                at = starts[total]
+                left, cut = _split(
+                    rest, left, polygon[e, 0], polygon[e, 1], polygon[f, 0], polygon[f, 1],
+                    other, into[at:],
+                )  # fmt: skip
+                if cut >= 3 and _area(into[at:], cut) > speck:
+                    starts[total + 1] = at + cut
+                    total += 1
+                rest, other = other, rest
+                if left < 3 or _area(rest, left) <= speck:
+                    left = 0
+                    break
+        if left == 0:
+            # Nothing in common: the piece stays as it was.
+            for c in range(m):
+                into[first + c, 0], into[first + c, 1] = piece[c, 0], piece[c, 1]
+            starts[before + 1] = first + m
+            total = before + 1
+    return total
+
+
+@njit(**INNER)
+def left_of(x0, x1, y0, y1, polygons, sizes, count, state):
+    """Subtract polygons from a rectangle; returns the state, whose first two list the pieces.
+
+    ``state``: corners and begins of the pieces, their number, and as many to be written.
+    """
+    points, begins, pieces, into, starts, one, two = state
+    points[0, 0], points[0, 1], points[1, 0], points[1, 1] = x0, y0, x1, y0
+    points[2, 0], points[2, 1], points[3, 0], points[3, 1] = x1, y1, x0, y1
+    begins[0], begins[1], pieces = 0, 4, 1
+    starts[0] = 0
+    speck = SPECK * (x1 - x0) * (y1 - y0)
+    for k in range(count):
+        n = sizes[k]
+        # A cut adds at most four corners, and one piece.
+        need = begins[pieces] + pieces * (4 * n + 4) + CORNERS
+        if need > len(into):
+            into, one, two = (
+                np.empty((2 * need, 2)), np.empty((2 * need, 2)), np.empty((2 * need, 2)),
+            )  # fmt: skip
+        if pieces * (n + 1) + 2 > len(starts):
+            starts = np.empty(2 * pieces * (n + 1) + 2, dtype=np.int64)
+        starts[0] = 0
+        pieces = _subtract(points, begins, pieces, polygons[k], n, speck, into, starts, one, two)
+        points, into = into, points
+        begins, starts = starts, begins
+        if pieces == 0:
+            break
+    return points, begins, pieces, into, starts, one, two
+
+
+@njit(**INNER)
+def new_state():
+    """Room for `left_of`; it grows as needed."""
+    return (
+        np.empty((256, 2)), np.empty(64, dtype=np.int64), 0,
+        np.empty((256, 2)), np.empty(64, dtype=np.int64), np.empty((256, 2)), np.empty((256, 2)),
+    )  # fmt: skip
+
+
+@njit(**INNER)
+def moments_of(points, begins, pieces, into):
+    """Write area, centroid (2) and covariance (xx, xy, yy) of the pieces' union."""
+    area = mx = my = xx = xy = yy = 0.0
+    for k in range(pieces):
+        first, last = begins[k], begins[k + 1]
+        for c in range(first, last):
+            d = c + 1 if c + 1 < last else first
+            x, y, u, v = points[c, 0], points[c, 1], points[d, 0], points[d, 1]
+            cross = x * v - u * y
+            area += cross
+            mx += (x + u) * cross
+            my += (y + v) * cross
+            xx += (x * x + x * u + u * u) * cross
+            yy += (y * y + y * v + v * v) * cross
+            xy += (x * (2.0 * y + v) + u * (y + 2.0 * v)) * cross
+    if area <= 0.0:
+        for c in range(6):
+            into[c] = 0.0
+        return
+    cx, cy = mx / (3.0 * area), my / (3.0 * area)
+    into[0], into[1], into[2] = 0.5 * area, cx, cy
+    into[3] = xx / (6.0 * area) - cx * cx
+    into[4] = xy / (12.0 * area) - cx * cy
+    into[5] = yy / (6.0 * area) - cy * cy
+
+
+@njit(**INLINED)
+def whole(x, y, a, b, into):
+    """Write the moments of a rectangle with half sides a and b."""
+    into[0], into[1], into[2] = 4.0 * a * b, x, y
+    into[3], into[4], into[5] = a * a / 3.0, 0.0, b * b / 3.0
+
+
+@njit(**INNER)
+def part_of(i, f, table, kind, split, row):
+    """Middle and half sides of part f of mirror i: a facet, or one of its equal divisions."""
+    if len(table):
+        cell = table[kind[i], f]
+        return cell[0], cell[1], cell[2], cell[3]
+    nx, ny = split[i, 0], split[i, 1]
+    a, b = row[12] / nx, row[13] / ny
+    return (2 * (f % nx) + 1) * a - row[12], (2 * (f // nx) + 1) * b - row[13], a, b
+
+
+@njit(**OPTIONS)
+def clip(first, last, rows, mirrors, towers, sun, ways, reaches, near, spans, parts, out):
+    """Clip mirrors ``rows[first:last]``; see `Lit` for what is written.
+
+    ``spans`` (H, 3): where the list ``near`` of mirrors that may shade it begins, that of those
+    that may block it, and its end. ``parts``: facets (K, F, 4), kind (H,), divisions (H, 2) and the
+    place of each mirror's parts (H + 1,). ``out``: shares (H, 3) and moments of the parts (P, 6).
+    """
+    table, kind, split, begin = parts
+    shares, moments = out
+    state, work = new_state(), (np.empty((CORNERS, 3)), np.empty((CORNERS, 3)))
+    straight, bend, whole_one = np.zeros((3, 2)), np.zeros((3, 2)), np.empty(6)
+    for r in range(first, last):
+        i = rows[r]
+        row = mirrors[i]
+        a, b = row[12], row[13]
+        area = 4.0 * a * b
+        bend_of(row, sun, bend)
+        dark, sizes, n = outlines(
+            i, near[spans[i, 0] : spans[i, 1]], mirrors, towers, sun, straight, np.inf, work
+        )
+        blocks, lengths, m = outlines(
+            i, near[spans[i, 1] : spans[i, 2]], mirrors, towers, ways[i], bend,
+            reaches[i], work,
+        )  # fmt: skip
+        both, corners = np.empty((n + m, CORNERS, 2)), np.empty(n + m, dtype=np.int64)
+        for k in range(n + m):
+            size = sizes[k] if k < n else lengths[k - n]
+            corners[k] = size
+            for c in range(size):
+                for e in range(2):
+                    both[k, c, e] = dark[k, c, e] if k < n else blocks[k - n, c, e]
+        shares[i, 0] = shares[i, 1] = shares[i, 2] = 1.0
+        whole(0.0, 0.0, a, b, whole_one)
+        if n:
+            state = left_of(-a, a, -b, b, dark, sizes, n, state)
+            moments_of(state[0], state[1], state[2], whole_one)
+            shares[i, 0] = whole_one[0] / area
+        if m:
+            state = left_of(-a, a, -b, b, blocks, lengths, m, state)
+            moments_of(state[0], state[1], state[2], whole_one)
+            shares[i, 1] = whole_one[0] / area
+        if n and m:
+            state = left_of(-a, a, -b, b, both, corners, n + m, state)
+            moments_of(state[0], state[1], state[2], whole_one)
+        shares[i, 2] = whole_one[0] / area
+        count = begin[i + 1] - begin[i]
+        if count == 1 and not len(table):
+            for c in range(6):
+                moments[begin[i], c] = whole_one[c]
+            continue
+        for f in range(count):
+            x, y, p, q = part_of(i, f, table, kind, split, row)
+            into = moments[begin[i] + f]
+            if n + m and p * q > 0.0:
+                state = left_of(x - p, x + p, y - q, y + q, both, corners, n + m, state)
+                moments_of(state[0], state[1], state[2], into)
+            else:
+                whole(x, y, p, q, into)
+
+
+@njit(**OPTIONS)
+def pieces_of(i, mirrors, towers, sun, ways, reaches, near, spans):
+    """Convex pieces of the lit part of one mirror: corners and where each begins."""
+    work, straight, bend = (
+        (np.empty((CORNERS, 3)), np.empty((CORNERS, 3))), np.zeros((3, 2)), np.zeros((3, 2)),
+    )  # fmt: skip
+    row = mirrors[i]
+    bend_of(row, sun, bend)
+    dark, sizes, n = outlines(
+        i, near[spans[i, 0] : spans[i, 1]], mirrors, towers, sun, straight, np.inf, work
+    )
+    blocks, lengths, m = outlines(
+        i, near[spans[i, 1] : spans[i, 2]], mirrors, towers, ways[i], bend, reaches[i], work
+    )
+    both, corners = np.empty((n + m, CORNERS, 2)), np.empty(n + m, dtype=np.int64)
+    for k in range(n + m):
+        corners[k] = sizes[k] if k < n else lengths[k - n]
+        both[k] = dark[k] if k < n else blocks[k - n]
+    state = left_of(-row[12], row[12], -row[13], row[13], both, corners, n + m, new_state())
+    return state[0][: state[1][state[2]]].copy(), state[1][: state[2] + 1].copy()
+
+
+@njit(**OPTIONS)
+def touched(spans, near, moved, into):
+    """Mark the mirrors that moved, or have one that moved among their candidates."""
+    for i in range(len(spans)):
+        into[i] = moved[i]
+        for k in range(spans[i, 0], spans[i, 2]):
+            if moved[near[k]]:
+                into[i] = True
+                break

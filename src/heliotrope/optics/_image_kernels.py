@@ -1,0 +1,542 @@
+# mypy: disable-error-code="no-untyped-call, untyped-decorator"
+# mypy: allow-untyped-defs
+"""Compiled: the images of mirrors on surfaces, as sums of elliptic Gaussians.
+
+A mirror's parts (facets, or equal divisions) each have a lit area, a centroid and a covariance. At
+distance t along the mirror's central ray, a part's image has its mean where the centroid's ray goes
+and the covariance A C Aᵀ, A being the derivative of the ray's place by the place on the part. Parts
+whose images lie close together are merged by their moments. Each image is convolved with the
+slope's and the belief's Gaussians, and with a sum of Gaussians for the sun.
+
+Surfaces are columns of cells in equal rows: along a column the exponent is a quadratic form of the
+height, so the values of the cells follow from two multiplications each. The size of the cells
+counts as a further variance.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from heliotrope.jit import INLINED, INNER, OPTIONS
+from heliotrope.optics._clip_kernels import part_of
+
+#: Numbers of an image: power, mean (2) and covariance (uu, uv, vv).
+IMAGE = 6
+#: Exponent beyond which a Gaussian is left out: 1e-7 of its peak.
+DEEP = 16.0
+#: Parts whose images differ in place by less than this share of the blur are merged.
+CLOSE = 0.7
+FLAT, ROUND = 0, 1
+_FAST = {**OPTIONS, "fastmath": {"contract", "nsz", "arcp"}}
+
+
+@njit(**INLINED)
+def _exp(x):
+    """e^x for |x| ≤ 40 to 1e-7, without branches, so that loops use vectors."""
+    y = x * (1.0 / 256.0)
+    p = 1.0 + y * (1.0 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y * (1 / 120 + y * (1 / 720))))))
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    return p * p
+
+
+@njit(**INNER)
+def _ray(row, sun, ray, axes):
+    """Write the central ray, and the axes right and up across it as seen from the mirror."""
+    nx, ny, nz = row[9], row[10], row[11]
+    c = 2.0 * (nx * sun[0] + ny * sun[1] + nz * sun[2])
+    ray[0], ray[1], ray[2] = c * nx - sun[0], c * ny - sun[1], c * nz - sun[2]
+    flat = math.sqrt(ray[0] ** 2 + ray[1] ** 2)
+    if flat > 1e-9:
+        axes[0, 0], axes[0, 1], axes[0, 2] = ray[1] / flat, -ray[0] / flat, 0.0
+    else:
+        axes[0, 0], axes[0, 1], axes[0, 2] = 1.0, 0.0, 0.0
+    for k in range(3):
+        m, n = (k + 1) % 3, (k + 2) % 3
+        axes[1, k] = axes[0, m] * ray[n] - axes[0, n] * ray[m]
+    return 0.5 * c
+
+
+@njit(**INLINED)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(**INNER)
+def _turn(row, sun, cosine, axes, into):
+    """Write the place of the ray (2) by a tilt of the normal (2), at distance 1."""
+    for j in range(2):
+        axis = row[3 + 3 * j : 6 + 3 * j]
+        along = _dot(axis, sun)
+        for e in range(2):
+            into[e, j] = 2.0 * (along * _dot(axes[e], row[9:12]) + cosine * _dot(axes[e], axis))
+
+
+@njit(**INNER)
+def _blur(row, sun, cosine, axes, slope, pointing, turn):
+    """Variances (uu, uv, vv) of the beam's direction by slope and belief, rad²."""
+    _turn(row, sun, cosine, axes, turn)
+    s = slope * slope
+    uu = s * (turn[0, 0] ** 2 + turn[0, 1] ** 2) + pointing[0, 0]
+    uv = s * (turn[0, 0] * turn[1, 0] + turn[0, 1] * turn[1, 1]) + pointing[0, 1]
+    vv = s * (turn[1, 0] ** 2 + turn[1, 1] ** 2) + pointing[1, 1]
+    return uu, uv, vv
+
+
+@njit(**INNER)
+def _spread(turn, axes, row, t, curve, into):
+    """Write A: the place of the ray (2) by the place on the part (2), at distance t."""
+    for j in range(2):
+        axis = row[3 + 3 * j : 6 + 3 * j]
+        for e in range(2):
+            into[e, j] = _dot(axes[e], axis) - t * curve * turn[e, j]
+
+
+@njit(**INNER)
+def _place(row, sun, ray, axes, t, x, y, tilt_x, tilt_y, into):
+    """Write where the ray from (x, y) with a tilted normal crosses the plane at t; its cosine."""
+    nx = row[9] + tilt_x * row[3] + tilt_y * row[6]
+    ny = row[10] + tilt_x * row[4] + tilt_y * row[7]
+    nz = row[11] + tilt_x * row[5] + tilt_y * row[8]
+    length = nx * nx + ny * ny + nz * nz
+    c = 2.0 * (nx * sun[0] + ny * sun[1] + nz * sun[2]) / length
+    rx, ry, rz = c * nx - sun[0], c * ny - sun[1], c * nz - sun[2]
+    px, py, pz = x * row[3] + y * row[6], x * row[4] + y * row[7], x * row[5] + y * row[8]
+    along = rx * ray[0] + ry * ray[1] + rz * ray[2]
+    way = (t - (px * ray[0] + py * ray[1] + pz * ray[2])) / along
+    qx, qy, qz = px + way * rx, py + way * ry, pz + way * rz
+    for e in range(2):
+        into[e] = qx * axes[e, 0] + qy * axes[e, 1] + qz * axes[e, 2]
+    return 0.5 * c * math.sqrt(length)
+
+
+@njit(**INNER)
+def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work):
+    """Write the images of mirror i, parts merged; returns their number and the light's area."""
+    table, kind, split, begin = parts
+    turn, spread, place = work
+    _turn(row, sun, cosine, axes, turn)
+    curve = row[14]
+    _spread(turn, axes, row, t, curve, spread)
+    count, total = 0, 0.0
+    close = 1.0 / (CLOSE * sigma)
+    for f in range(begin[i + 1] - begin[i]):
+        lit = moments[begin[i] + f]
+        if lit[0] <= 0.0:
+            continue
+        x, y, _, _ = part_of(i, f, table, kind, split, row)
+        tilt_x, tilt_y = 0.0, 0.0
+        if len(table):
+            surface = surfaces[kind[i], f]
+            tilt_x, tilt_y, curve = surface[0], surface[1], surface[2]
+            _spread(turn, axes, row, t, curve, spread)
+        else:
+            x, y = 0.0, 0.0
+        tilt_x -= curve * (lit[1] - x)
+        tilt_y -= curve * (lit[2] - y)
+        c = _place(row, sun, ray, axes, t, lit[1], lit[2], tilt_x, tilt_y, place)
+        power = lit[0] * max(c, 0.0)
+        a, b, p, q = spread[0, 0], spread[0, 1], spread[1, 0], spread[1, 1]
+        uu = a * a * lit[3] + 2.0 * a * b * lit[4] + b * b * lit[5]
+        vv = p * p * lit[3] + 2.0 * p * q * lit[4] + q * q * lit[5]
+        uv = a * p * lit[3] + (a * q + b * p) * lit[4] + b * q * lit[5]
+        u, v = place[0], place[1]
+        total += power
+        key_u, key_v = math.floor(u * close + 0.5), math.floor(v * close + 0.5)
+        k = 0
+        while k < count and not (images[k, 6] == key_u and images[k, 7] == key_v):
+            k += 1
+        if k == count:
+            for e in range(IMAGE):
+                images[k, e] = 0.0
+            images[k, 6], images[k, 7] = key_u, key_v
+            count += 1
+        # Sums of moments; divided below.
+        images[k, 0] += power
+        images[k, 1] += power * u
+        images[k, 2] += power * v
+        images[k, 3] += power * (uu + u * u)
+        images[k, 4] += power * (uv + u * v)
+        images[k, 5] += power * (vv + v * v)
+    for k in range(count):
+        power = images[k, 0]
+        if power > 0.0:
+            u, v = images[k, 1] / power, images[k, 2] / power
+            images[k, 1], images[k, 2] = u, v
+            images[k, 3] = images[k, 3] / power - u * u
+            images[k, 4] = images[k, 4] / power - u * v
+            images[k, 5] = images[k, 5] / power - v * v
+    return count, total
+
+
+@njit(**INNER)
+def _distance(row, ray, shape):
+    """Distance along the ray to the surface, or to where it passes it; 0 if it never does."""
+    kind, middle, axis, normal, radius = shape
+    x, y, z = middle[0] - row[0], middle[1] - row[1], middle[2] - row[2]
+    if kind == FLAT:
+        front = ray[0] * normal[0] + ray[1] * normal[1] + ray[2] * normal[2]
+        # Along the plate, or from behind.
+        if front > -1e-3:
+            return 0.0
+        return max(0.0, (x * normal[0] + y * normal[1] + z * normal[2]) / front)
+    up = _dot(ray, axis)
+    away = x * axis[0] + y * axis[1] + z * axis[2]
+    rx, ry, rz = ray[0] - up * axis[0], ray[1] - up * axis[1], ray[2] - up * axis[2]
+    x, y, z = x - away * axis[0], y - away * axis[1], z - away * axis[2]
+    flat = rx * rx + ry * ry + rz * rz
+    if flat < 1e-6:
+        return 0.0
+    t = (x * rx + y * ry + z * rz) / flat
+    beside = x * x + y * y + z * z - t * t * flat
+    return max(0.0, t - math.sqrt(max(radius * radius - beside, 0.0) / flat))
+
+
+@njit(**INNER)
+def _columns(row, ray, axes, t, shape, columns, seen):
+    """Write the visible columns: index, place (2), step along it (2), width (2) and weight."""
+    kind, middle, axis, normal, radius = shape
+    bases, wides, means, edges, angles = columns
+    ups = (_dot(axes[0], axis), _dot(axes[1], axis))
+    count = 0
+    level, facing = 0.0, 0.0
+    for k in range(len(bases)):
+        one, other = -_dot(ray, edges[k]), -_dot(ray, edges[k + 1])
+        if one <= 0.0 and other <= 0.0:
+            continue
+        weight, narrow = -_dot(ray, means[k]), 1.0
+        x, y, z = bases[k, 0], bases[k, 1], bases[k, 2]
+        if kind == ROUND and (one < 0.0 or other < 0.0):
+            # Only the part of the column that the light reaches.
+            if level == 0.0:
+                side = np.cross(normal, axis)
+                a, b = -_dot(ray, normal), -_dot(ray, side)
+                level, facing = math.sqrt(a * a + b * b), math.atan2(b, a)
+            start = angles[k] - facing
+            start -= 2.0 * math.pi * math.floor(start / (2.0 * math.pi) + 0.5)
+            step = angles[k + 1] - angles[k]
+            first = max(start, -0.5 * math.pi)
+            last = min(start + step, 0.5 * math.pi)
+            if last <= first:
+                continue
+            weight = level * (math.sin(last) - math.sin(first)) / step
+            narrow = (last - first) / step
+            at = facing + 0.5 * (first + last)
+            c, s = radius * math.cos(at), radius * math.sin(at)
+            side = np.cross(normal, axis)
+            x = middle[0] + c * normal[0] + s * side[0]
+            y = middle[1] + c * normal[1] + s * side[1]
+            z = middle[2] + c * normal[2] + s * side[2]
+        x, y, z = x - row[0], y - row[1], z - row[2]
+        depth = x * ray[0] + y * ray[1] + z * ray[2]
+        if depth <= 0.0 or weight <= 0.0:
+            continue
+        scale = t / depth
+        seen[0, count] = k
+        for e in range(2):
+            seen[1 + e, count] = scale * (x * axes[e, 0] + y * axes[e, 1] + z * axes[e, 2])
+            seen[3 + e, count] = scale * ups[e]
+            seen[5 + e, count] = narrow * scale * _dot(axes[e], wides[k])
+        seen[7, count] = weight * scale * scale
+        count += 1
+    return count
+
+
+@njit(**_FAST)
+def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
+    """Add one Gaussian to the visible cells; returns the first and the last row that it reaches."""
+    value, ratio, shrink, up, down = room
+    box = step * step / 12.0
+    most, first, last = -1e300, 1e300, -1e300
+    middle, heaviest = 0.0, -1e300
+    for k in range(count):
+        du, dv, wu, wv = seen[3, k], seen[4, k], seen[5, k], seen[6, k]
+        a = uu + box * du * du + wu * wu
+        b = uv + box * du * dv + wu * wv
+        c = vv + box * dv * dv + wv * wv
+        det = a * c - b * b
+        inverse = 1.0 / det
+        pu, pv = seen[1, k] - u, seen[2, k] - v
+        alpha = (du * du * c - 2.0 * du * dv * b + dv * dv * a) * inverse
+        beta = (du * pu * c - (du * pv + dv * pu) * b + dv * pv * a) * inverse
+        gamma = (pu * pu * c - 2.0 * pu * pv * b + pv * pv * a) * inverse
+        value[k], ratio[k], shrink[k] = gamma, beta, alpha
+        up[k] = power * seen[7, k] / (2.0 * math.pi * math.sqrt(det))
+        down[k] = gamma - beta * beta / alpha
+    for k in range(count):
+        if down[k] < 2.0 * DEEP:
+            at = -ratio[k] / shrink[k]
+            reach = math.sqrt((2.0 * DEEP - down[k]) / shrink[k])
+            first, last = min(first, at - reach), max(last, at + reach)
+            if -down[k] > heaviest:
+                heaviest, middle = -down[k], at
+    if last < first:
+        return rows, -1
+    begin = max(0, math.ceil((first - low) / step))
+    end = min(rows - 1, math.floor((last - low) / step))
+    if end < begin:
+        return rows, -1
+    start = min(end, max(begin, math.floor((middle - low) / step + 0.5)))
+    z = low + start * step
+    for k in range(count):
+        alpha, beta, gamma = shrink[k], ratio[k], value[k]
+        if down[k] >= 2.0 * DEEP:
+            value[k], ratio[k], shrink[k] = 0.0, 0.0, 0.0
+            up[k] = 0.0
+            continue
+        value[k] = -0.5 * (alpha * z * z + 2.0 * beta * z + gamma)
+        ratio[k] = -0.5 * step * (alpha * (2.0 * z + step) + 2.0 * beta)
+        shrink[k] = -alpha * step * step
+        most = max(most, abs(value[k]), abs(ratio[k]), abs(shrink[k]))
+    if most < 40.0:
+        for k in range(count):
+            value[k] = up[k] * _exp(value[k])
+            ratio[k] = _exp(ratio[k])
+            shrink[k] = _exp(shrink[k])
+    else:
+        for k in range(count):
+            value[k] = up[k] * math.exp(max(value[k], -700.0))
+            ratio[k] = math.exp(min(ratio[k], 700.0))
+            shrink[k] = math.exp(shrink[k])
+    for k in range(count):
+        # The ratio downwards: the product of both is the ratio of ratios.
+        down[k] = shrink[k] / ratio[k]
+        up[k] = value[k]
+    for i in range(start, end + 1):
+        line = local[i]
+        for k in range(count):
+            line[k] += value[k]
+            value[k] *= ratio[k]
+            ratio[k] *= shrink[k]
+    for i in range(start - 1, begin - 1, -1):
+        line = local[i]
+        for k in range(count):
+            up[k] *= down[k]
+            down[k] *= shrink[k]
+            line[k] += up[k]
+    return begin, end
+
+
+@njit(**OPTIONS)
+def cast(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, surfaces, moments,
+         shape, columns, grid, sign, flux, out):  # fmt: skip
+    """Add the images of mirrors ``rows[first:last]`` to the flux of a surface in columns.
+
+    ``light`` (H,): power per area across the light, W/m². ``sums``: weights and variances of the
+    sun's Gaussians, rad². ``grid``: lowest row, step and number of rows, and area of a cell.
+    ``flux`` (rows, columns) in W/m²; ``out`` (H, 2) gets the power that leaves each mirror and the
+    power on the surface.
+    """
+    weights, variances = sums
+    low, step, number, area = grid
+    wide = len(columns[0])
+    seen, local = np.empty((8, wide)), np.zeros((number, wide))
+    room = (np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide))
+    ray, axes = np.empty(3), np.empty((2, 3))
+    turn, work = np.empty((2, 2)), (np.empty((2, 2)), np.empty((2, 2)), np.empty(2))
+    most = 1
+    for i in rows[first:last]:
+        most = max(most, parts[3][i + 1] - parts[3][i])
+    images = np.empty((most, IMAGE + 2))
+    total = 0.0
+    for k in range(len(weights)):
+        total += weights[k] * variances[k]
+    for i in rows[first:last]:
+        out[i, 0] = out[i, 1] = 0.0
+        if light[i] <= 0.0:
+            continue
+        row = mirrors[i]
+        cosine = _ray(row, sun, ray, axes)
+        if cosine <= 0.0:
+            continue
+        t = _distance(row, ray, shape)
+        reach = t if t > 0.0 else 1.0
+        uu, uv, vv = _blur(row, sun, cosine, axes, slopes[i], pointing[i], turn)
+        sigma = reach * math.sqrt(0.5 * (uu + vv) + total)
+        count, leaving = _images(
+            i, row, sun, ray, axes, cosine, reach, sigma, parts, surfaces, moments, images, work
+        )
+        out[i, 0] = light[i] * leaving
+        if t <= 0.0:
+            continue
+        visible = _columns(row, ray, axes, t, shape, columns, seen)
+        if not visible:
+            continue
+        begin, end = number, -1
+        for m in range(count):
+            image = images[m]
+            for g in range(len(weights)):
+                more = variances[g]
+                a, b = _gauss(
+                    weights[g] * image[0] * light[i], image[1], image[2],
+                    image[3] + t * t * (uu + more), image[4] + t * t * uv,
+                    image[5] + t * t * (vv + more),
+                    seen, visible, low, step, number, local, room,
+                )  # fmt: skip
+                begin, end = min(begin, a), max(end, b)
+        caught = 0.0
+        for r in range(begin, end + 1):
+            line, into = local[r], flux[r]
+            for k in range(visible):
+                value = line[k]
+                caught += value
+                into[int(seen[0, k])] += sign * value
+                line[k] = 0.0
+        out[i, 1] = caught * area
+
+
+@njit(**OPTIONS)
+def cast_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, surfaces,
+               moments, middle, cells, hidden, group, aperture, sign, flux, out):  # fmt: skip
+    """Add the images of mirrors ``rows[first:last]`` to the flux of cells of any shape.
+
+    ``cells`` (C, 16): centre, normal, area and second moments (9) of each. ``hidden`` (D, C): cells
+    that others hide as seen from direction D, which is ``group`` (H,) of each mirror. ``aperture``:
+    centre, right and up (3 each) and half sizes of a rectangle that the light must pass; empty if
+    there is none. ``flux`` (C,) in W/m²; ``out`` (H, 2) as `cast`.
+    """
+    weights, variances = sums
+    ray, axes = np.empty(3), np.empty((2, 3))
+    turn, work = np.empty((2, 2)), (np.empty((2, 2)), np.empty((2, 2)), np.empty(2))
+    most, total = 1, 0.0
+    for i in rows[first:last]:
+        most = max(most, parts[3][i + 1] - parts[3][i])
+    for k in range(len(weights)):
+        total += weights[k] * variances[k]
+    images = np.empty((most, IMAGE + 2))
+    for i in rows[first:last]:
+        out[i, 0] = out[i, 1] = 0.0
+        if light[i] <= 0.0:
+            continue
+        row = mirrors[i]
+        cosine = _ray(row, sun, ray, axes)
+        if cosine <= 0.0:
+            continue
+        away = (middle[0] - row[0], middle[1] - row[1], middle[2] - row[2])
+        t = _dot(ray, away)
+        reach = t if t > 0.0 else 1.0
+        uu, uv, vv = _blur(row, sun, cosine, axes, slopes[i], pointing[i], turn)
+        sigma = reach * math.sqrt(0.5 * (uu + vv) + total)
+        count, leaving = _images(
+            i, row, sun, ray, axes, cosine, reach, sigma, parts, surfaces, moments, images, work
+        )
+        out[i, 0] = light[i] * leaving
+        if t <= 0.0:
+            continue
+        caught = 0.0
+        for k in range(len(cells)):
+            cell = cells[k]
+            x, y, z = cell[0] - row[0], cell[1] - row[1], cell[2] - row[2]
+            depth = x * ray[0] + y * ray[1] + z * ray[2]
+            facing = -(x * cell[3] + y * cell[4] + z * cell[5])
+            if facing <= 0.0 or depth <= 0.0 or hidden[group[i], k]:
+                continue
+            share = 1.0
+            if len(aperture):
+                share = _passes(aperture, row, x, y, z)
+                if share <= 0.0:
+                    continue
+            scale = t / depth
+            u = scale * (x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2])
+            v = scale * (x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2])
+            suu, suv, svv = _own(cell, axes, scale)
+            distance = math.sqrt(x * x + y * y + z * z)
+            value = 0.0
+            for m in range(count):
+                image = images[m]
+                pu, pv = u - image[1], v - image[2]
+                for g in range(len(weights)):
+                    a = image[3] + suu + t * t * (uu + variances[g])
+                    b = image[4] + suv + t * t * uv
+                    c = image[5] + svv + t * t * (vv + variances[g])
+                    det = a * c - b * b
+                    form = (pu * pu * c - 2.0 * pu * pv * b + pv * pv * a) / det
+                    if form < 2.0 * DEEP:
+                        value += weights[g] * image[0] * math.exp(-0.5 * form) / math.sqrt(det)
+            value *= light[i] * share * scale * scale * facing / distance / (2.0 * math.pi)
+            flux[k] += sign * value
+            caught += value * cell[6]
+        out[i, 1] = caught
+
+
+@njit(**INNER)
+def _own(cell, axes, scale):
+    """Second moments of a cell across the ray."""
+    form = (0.0, 0.0, 0.0)
+    for p in range(3):
+        for q in range(3):
+            value = scale * scale * cell[7 + 3 * p + q]
+            form = (
+                form[0] + axes[0, p] * axes[0, q] * value,
+                form[1] + axes[0, p] * axes[1, q] * value,
+                form[2] + axes[1, p] * axes[1, q] * value,
+            )
+    return form
+
+
+@njit(**INNER)
+def _passes(aperture, row, x, y, z):
+    """Share of the rays from a mirror to a point (relative to it) that pass the aperture.
+
+    They come from all of the mirror, so that the aperture's edge is blurred.
+    """
+    ax, ay, az = aperture[0] - row[0], aperture[1] - row[1], aperture[2] - row[2]
+    nx = aperture[4] * aperture[8] - aperture[5] * aperture[7]
+    ny = aperture[5] * aperture[6] - aperture[3] * aperture[8]
+    nz = aperture[3] * aperture[7] - aperture[4] * aperture[6]
+    along = x * nx + y * ny + z * nz
+    if along == 0.0:
+        return 0.0
+    t = (ax * nx + ay * ny + az * nz) / along
+    if t <= 0.0 or t >= 1.0:
+        return 0.0
+    px, py, pz = t * x - ax, t * y - ay, t * z - az
+    blur = (1.0 - t) * math.sqrt(row[12] * row[13] / 3.0) + 1e-9
+    share = 1.0
+    for e in range(2):
+        at = px * aperture[3 + 3 * e] + py * aperture[4 + 3 * e] + pz * aperture[5 + 3 * e]
+        half, root = aperture[9 + e], math.sqrt(2.0) * blur
+        share *= 0.5 * (math.erf((half - at) / root) + math.erf((half + at) / root))
+    return share
+
+
+@njit(**OPTIONS)
+def hide(first, last, ways, cells, corners, hidden):
+    """Mark the cells that other triangles (C, 3, 3) hide from light along ``ways[first:last]``."""
+    for d in range(first, last):
+        way = ways[d]
+        for k in range(len(cells)):
+            hidden[d, k] = False
+            if _dot(way, cells[k, 3:6]) >= 0.0:
+                hidden[d, k] = True
+                continue
+            for j in range(len(corners)):
+                if j != k and _meets(cells[k], way, corners[j]):
+                    hidden[d, k] = True
+                    break
+
+
+@njit(**INNER)
+def _meets(cell, way, triangle):
+    """Whether the ray from a cell against the light meets a triangle (Möller and Trumbore)."""
+    a, b = triangle[1] - triangle[0], triangle[2] - triangle[0]
+    x, y, z = -way[0], -way[1], -way[2]
+    px, py, pz = y * b[2] - z * b[1], z * b[0] - x * b[2], x * b[1] - y * b[0]
+    det = a[0] * px + a[1] * py + a[2] * pz
+    if abs(det) < 1e-14:
+        return False
+    tx, ty, tz = cell[0] - triangle[0, 0], cell[1] - triangle[0, 1], cell[2] - triangle[0, 2]
+    u = (tx * px + ty * py + tz * pz) / det
+    if u < 0.0 or u > 1.0:
+        return False
+    qx, qy, qz = ty * a[2] - tz * a[1], tz * a[0] - tx * a[2], tx * a[1] - ty * a[0]
+    v = (x * qx + y * qy + z * qz) / det
+    if v < 0.0 or u + v > 1.0:
+        return False
+    return (b[0] * qx + b[1] * qy + b[2] * qz) / det > 1e-9

@@ -1,0 +1,339 @@
+"""A second opinion on the flux: random rays, traced through the triangles of `embreex`.
+
+It shares nothing with the flux engine but the scene and the sun's random rays. Each ray begins on
+a mirror, at a random place with a random slope error. Backwards it goes to a random place of the
+sun: what it meets on the way shades it. Forwards it is reflected: what it meets before a surface
+blocks it. Not for production: 10⁷ rays take about half a minute.
+
+Left out, as in the engine: the sag of the mirrors, which are flat to their neighbours, and the
+light that one surface keeps from another.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, normalize, tangent_axes
+from heliotrope.optics.attenuation import air_loss
+from heliotrope.optics.scene import Scene, Tower
+from heliotrope.optics.sun_shape import SunShape
+from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
+
+#: Rays that are traced at once.
+_BATCH = 250_000
+#: Limits of the number of rays.
+RAYS = (1_000, 1_000_000_000)
+#: Rays begin this far in front of their mirror, m, so that they do not meet it.
+_OFF = 0.01
+#: Sides of a tower.
+_SIDES = 96
+
+
+@dataclass(frozen=True, eq=False)
+class RayTrace:
+    """What random rays say of a scene with H mirrors and K surfaces.
+
+    Attributes
+    ----------
+    flux, error
+        Of each surface, W/m², and its standard error, in the shape of its cells.
+    power, power_error
+        On each surface, W, and its standard error, (K,).
+    cosine, shading, blocking, lit, intercept
+        Shares of each mirror, (H,), as in `Efficiencies`; NaN where no ray was traced.
+    count
+        Rays from each mirror, (H,).
+    """
+
+    flux: tuple[FloatArray, ...]
+    error: tuple[FloatArray, ...]
+    power: FloatArray
+    power_error: FloatArray
+    cosine: FloatArray
+    shading: FloatArray
+    blocking: FloatArray
+    lit: FloatArray
+    intercept: FloatArray
+    count: FloatArray
+
+
+def trace(
+    scene: Scene,
+    rays: float = 1e6,
+    *,
+    sun: str | SunShape = "limb",
+    air: str | float = "clear",
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> RayTrace:
+    """Trace random rays through a scene.
+
+    Parameters
+    ----------
+    scene
+        Mirrors, surfaces, towers, and a sun.
+    rays
+        Number of rays from the whole field, 1e3 to 1e9; each mirror gets its share by area.
+    sun, air
+        As for `FieldFlux`.
+    seed
+        Of the random numbers.
+    progress
+        Called with the rays done and the rays of all.
+
+    Raises
+    ------
+    InputError
+        If the number is out of range, a name is unknown, or `embreex` is not installed.
+    """
+    if not RAYS[0] <= rays <= RAYS[1]:
+        raise InputError(f"rays: {rays:g} must be from {RAYS[0]:,} to {RAYS[1]:,}")
+    shape = SunShape.of(sun)
+    tracer = _Tracer(scene, shape, np.random.default_rng(seed))
+    power, total = tracer.power(air), int(rays)
+    # Each patch gets rays by its power, begun at a random part of a ray; each ray carries as much.
+    ends = np.cumsum(power) / power.sum() * total if power.sum() > 0.0 else np.zeros(len(power))
+    begins = np.floor(np.append(0.0, ends) + tracer.rng.random()).astype(np.int64)
+    counts = np.diff(begins)
+    tally = _Tally(scene, float(power.sum()) / total)
+    done = 0
+    for first in range(0, int(counts.sum()), _BATCH):
+        last = min(first + _BATCH, int(counts.sum()))
+        rows = np.searchsorted(np.cumsum(counts), np.arange(first, last), side="right")
+        tally.add(*tracer.batch(rows))
+        done = last
+        if progress is not None:
+            progress(done, int(counts.sum()))
+    return tally.result()
+
+
+class _Tracer:
+    """Patches (mirrors, or their facets) and everything that rays can meet."""
+
+    def __init__(self, scene: Scene, shape: SunShape, rng: np.random.Generator) -> None:
+        self.scene, self.shape, self.rng = scene, shape, rng
+        mirrors, facets = scene.mirrors, scene.mirrors.facets
+        if facets is None:
+            self.mirror = np.arange(len(mirrors))
+            self.center, self.tilt = np.zeros((len(mirrors), 2)), np.zeros((len(mirrors), 2))
+            self.half = 0.5 * np.stack([mirrors.width, mirrors.height], axis=-1)
+            self.focal = mirrors.focal
+        else:
+            real = facets.half.min(axis=-1)[mirrors.kind] > 0.0
+            self.mirror, column = np.nonzero(real)
+            row = mirrors.kind[self.mirror]
+            self.center, self.tilt = facets.center[row, column], facets.tilt[row, column]
+            self.half, self.focal = facets.half[row, column], facets.focal[row, column]
+        self.origin = mirrors.center.mean(axis=0)
+        self.solids = _embree([*self._panels(), *map(_sides, scene.towers)], self.origin)
+        self.meshes = {id(m): _embree([m.corners], self.origin) for m in _meshes(scene.surfaces)}
+        across, along = tangent_axes(scene.sun)
+        self.axes = np.stack([across, along])
+
+    def _panels(self) -> list[FloatArray]:
+        """Return two triangles for each patch; gaps between facets let light through."""
+        m, k = self.scene.mirrors, self.mirror
+        a, b = self.half[:, :1] * m.right[k], self.half[:, 1:] * m.up[k]
+        middle = m.center[k] + self.center[:, :1] * m.right[k] + self.center[:, 1:] * m.up[k]
+        corners = [middle - a - b, middle + a - b, middle + a + b, middle - a + b]
+        return [np.stack([corners[i] for i in three], axis=1) for three in ((0, 1, 2), (0, 2, 3))]
+
+    def power(self, air: str | float) -> FloatArray:
+        """Return the power that leaves each patch if nothing hides it, after the air, W."""
+        scene, m, k = self.scene, self.scene.mirrors, self.mirror
+        sent = scene.dni * m.reflectivity * m.clean * (1.0 - air_loss(m.slant, air))
+        sent = sent * np.maximum(m.normal @ scene.sun, 0.0)
+        if scene.dark is not None:
+            sent = np.where(scene.dark, 0.0, sent)
+        return as_float(sent[k] * 4.0 * self.half.prod(axis=-1))
+
+    def batch(self, rows: np.ndarray) -> tuple[Any, ...]:
+        """Trace a ray from each row of patches.
+
+        Returns
+        -------
+        mirror, weight
+            Where each begins, and its power over the mean, (R,).
+        shaded, blocked
+            (R,).
+        surface, cell
+            What it meets if it is not blocked; −1: nothing, (R,).
+        """
+        m, k, rng, count = self.scene.mirrors, self.mirror[rows], self.rng, len(rows)
+        place = (2.0 * rng.random((count, 2)) - 1.0) * self.half[rows]
+        right, up, normal = m.right[k], m.up[k], m.normal[k]
+        x, y = (self.center[rows] + place).T[..., None]
+        point = m.center[k] + x * right + y * up
+        # A concave mirror's normal leans back to its axis.
+        tilt = self.tilt[rows] - place / (2.0 * self.focal[rows])[:, None]
+        tilt = tilt + m.slope[k][:, None] * rng.standard_normal((count, 2))
+        lean = normalize(normal + tilt[:, :1] * right + tilt[:, 1:] * up)
+        light = normalize(self.scene.sun + self.shape.sample(count, rng) @ self.axes)
+        ray = 2.0 * _dot(light, lean)[:, None] * lean - light
+        ray = self._pointed(ray, k)
+        weight = _dot(light, normal) / np.maximum(normal @ self.scene.sun, 1e-12)
+        surface, cell, distance = self._met(point, ray)
+        start = point + _OFF * normal
+        shaded = self._stopped(start, light, np.full(count, 1e6))
+        blocked = self._stopped(start, ray, np.where(surface >= 0, distance, m.slant[k]))
+        return k, weight, shaded, blocked, surface, cell
+
+    def _pointed(self, ray: FloatArray, k: np.ndarray) -> FloatArray:
+        """Turn rays by random pointing errors, right of and above the aim as seen from there."""
+        spread = self.scene.mirrors.pointing
+        if not spread.any():
+            return ray
+        root = np.linalg.cholesky(spread + 1e-18 * np.eye(2))[k]
+        error = (root @ self.rng.standard_normal((len(ray), 2, 1)))[..., 0]
+        right = normalize(np.cross(ray, [0.0, 0.0, 1.0]))
+        return normalize(ray + error[:, :1] * right + error[:, 1:] * np.cross(right, ray))
+
+    def _stopped(self, start: FloatArray, ray: FloatArray, length: FloatArray) -> np.ndarray:
+        origin, way = _single(start - self.origin), _single(ray)
+        hit = self.solids.run(origin, way, dists=_single(length - 2.0 * _OFF), query="OCCLUDED")
+        return np.asarray(hit >= 0)
+
+    def _met(self, point: FloatArray, ray: FloatArray) -> tuple[Any, Any, FloatArray]:
+        """Return the first surface of each ray, its cell there, and the distance."""
+        surface = np.full(len(point), -1)
+        cell, nearest = np.full(len(point), -1), np.full(len(point), np.inf)
+        for j, each in enumerate(self.scene.surfaces):
+            where, distance = self._cell(each, point, ray)
+            first = (where >= 0) & (distance < nearest)
+            surface[first], cell[first], nearest[first] = j, where[first], distance[first]
+        return surface, cell, nearest
+
+    def _cell(self, surface: Surface, point: FloatArray, ray: FloatArray) -> tuple[Any, FloatArray]:
+        """Return the cell that each ray meets from its lit side, or −1, and how far it is."""
+        if isinstance(surface, Plate):
+            return _on_plate(surface, point, ray)
+        if isinstance(surface, Cylinder):
+            return _on_cylinder(surface, point, ray)
+        inner = surface if isinstance(surface, Mesh) else surface.inner
+        found = self.meshes[id(inner)].run(_single(point - self.origin), _single(ray), output=True)
+        cell, distance = found["primID"], as_float(found["tfar"])
+        front = _dot(inner.cells.normal[cell], ray) < 0.0
+        if isinstance(surface, Cavity):
+            front &= _on_plate(surface.aperture, point, ray)[0] >= 0
+        return np.where((cell >= 0) & front, cell, -1), distance
+
+
+def _on_plate(plate: Plate, point: FloatArray, ray: FloatArray) -> tuple[Any, FloatArray]:
+    towards = ray @ plate.normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (plate.center - point) @ plate.normal / towards
+        at = point + distance[:, None] * ray - plate.center
+    rows, columns = plate.shape
+    x, y = at @ plate.right / plate.width + 0.5, at @ plate.up / plate.height + 0.5
+    hit = (towards < 0.0) & (distance > 0.0) & (x >= 0.0) & (x < 1.0) & (y >= 0.0) & (y < 1.0)
+    x, y = np.where(hit, x, 0.0), np.where(hit, y, 0.0)
+    cell = (y * rows).astype(np.int64) * columns + (x * columns).astype(np.int64)
+    return np.where(hit, cell, -1), as_float(distance)
+
+
+def _on_cylinder(pipe: Cylinder, point: FloatArray, ray: FloatArray) -> tuple[Any, FloatArray]:
+    """Return where rays enter a cylinder from outside."""
+    frame = np.stack([pipe.front, pipe.side, pipe.axis])
+    p, d = (point - pipe.center) @ frame.T, ray @ frame.T
+    a, b = np.sum(d[:, :2] ** 2, axis=-1), np.sum(p[:, :2] * d[:, :2], axis=-1)
+    c = np.sum(p[:, :2] ** 2, axis=-1) - pipe.radius**2
+    square = b * b - a * c
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (-b - np.sqrt(square)) / a
+        at = p + distance[:, None] * d
+    first, last = pipe.span
+    turn = np.mod(np.arctan2(at[:, 1], at[:, 0]) - first, 2.0 * np.pi) / (last - first)
+    y = at[:, 2] / pipe.height + 0.5
+    hit = (square > 0.0) & (distance > 0.0) & (turn < 1.0) & (y >= 0.0) & (y < 1.0)
+    x, y = np.where(hit, turn, 0.0), np.where(hit, y, 0.0)
+    rows, columns = pipe.shape
+    cell = (y * rows).astype(np.int64) * columns + (x * columns).astype(np.int64)
+    return np.where(hit, cell, -1), as_float(distance)
+
+
+class _Tally:
+    """Sums over rays, each of ``unit`` W on average."""
+
+    def __init__(self, scene: Scene, unit: float) -> None:
+        self.scene, self.unit = scene, unit
+        self.sums = np.zeros((5, len(scene.mirrors)))
+        self.cells = [np.zeros((2, len(s.cells.area))) for s in scene.surfaces]
+
+    def add(
+        self, mirror: Any, weight: FloatArray, shaded: Any, blocked: Any, surface: Any, cell: Any
+    ) -> None:
+        lit = ~(shaded | blocked)
+        shares = (np.ones(len(weight)), ~shaded, ~blocked, lit, lit & (surface >= 0))
+        for row, share in enumerate(shares):
+            self.sums[row] += np.bincount(mirror, share, minlength=self.sums.shape[1])
+        for j, sums in enumerate(self.cells):
+            here = lit & (surface == j)
+            for row in (0, 1):
+                got = weight[here] ** (row + 1)
+                sums[row] += np.bincount(cell[here], got, minlength=sums.shape[1])
+
+    def result(self) -> RayTrace:
+        count, unshaded, unblocked, lit, caught = self.sums
+        flux, error, power, spread = [], [], [], []
+        for surface, (first, second) in zip(self.scene.surfaces, self.cells, strict=True):
+            cells = surface.cells
+            flux.append((self.unit * first / cells.area).reshape(cells.shape))
+            error.append((self.unit * np.sqrt(second) / cells.area).reshape(cells.shape))
+            power.append(self.unit * first.sum())
+            # Of all rays a share lands: the error is that of a binomial distribution.
+            share = first.sum() / max(count.sum(), 1.0)
+            spread.append(self.unit * np.sqrt(second.sum() * max(1.0 - share, 0.0)))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return RayTrace(
+                tuple(flux),
+                tuple(error),
+                np.array(power),
+                np.array(spread),
+                cosine=self.scene.incidence,
+                shading=as_float(unshaded / count),
+                blocking=as_float(unblocked / count),
+                lit=as_float(lit / count),
+                intercept=as_float(caught / lit),
+                count=as_float(count),
+            )
+
+
+def _embree(triangles: list[FloatArray], origin: FloatArray) -> Any:
+    """Return a scene of Embree with triangles, each (T, 3, 3), about an origin."""
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError:
+        raise InputError(
+            "rays: embreex is not installed; say pip install 'heliotrope[rays]'"
+        ) from None
+    scene = EmbreeScene()
+    TriangleMesh(scene, _single(np.concatenate(triangles) - origin))
+    return scene
+
+
+def _sides(tower: Tower) -> FloatArray:
+    """Return the sides of a tower as triangles, of the mean radius of the circle."""
+    turn = np.linspace(0.0, 2.0 * np.pi, _SIDES + 1)
+    edge = tower.radius * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
+    edge = edge + [tower.east, tower.north]
+    low, high = (np.insert(edge, 2, z, axis=1) for z in (tower.bottom, tower.top))
+    one = np.stack([low[:-1], low[1:], high[1:]], axis=1)
+    return np.concatenate([one, np.stack([low[:-1], high[1:], high[:-1]], axis=1)])
+
+
+def _meshes(surfaces: tuple[Surface, ...]) -> list[Mesh]:
+    inner = [s.inner if isinstance(s, Cavity) else s for s in surfaces]
+    return [s for s in inner if isinstance(s, Mesh)]
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return as_float(np.einsum("ij,ij->i", a, b))
+
+
+def _single(values: FloatArray) -> np.ndarray:
+    """Return values as Embree takes them."""
+    return np.ascontiguousarray(values, dtype=np.float32)

@@ -1,0 +1,349 @@
+r"""The flux of a field on its receivers, mirror by mirror, kept up to date while mirrors move.
+
+The image of a mirror is that of its lit part (`shading`): the convex polygons' area, centroid and
+covariance C go through the mirror to the receiver as A C Aᵀ, A being the derivative of the ray's
+place by the place on the mirror, which holds the astigmatism at the true angle of incidence. To it
+come, as covariances of the ray's direction times the square of the distance, the slope errors
+(4 σ² in the plane of incidence and 4 σ² cos² θ across it), the covariance of the belief, and the
+sun as a short sum of Gaussians. Facets, and the parts of a flat mirror, each have their own image;
+images that lie together are merged.
+
+Left out: the light that one surface keeps from another, reflection by the receivers, the sag of the
+mirrors, and the difference of distances within one mirror. A sun's sum of Gaussians expects a blur
+of at least 0.5 mrad by slope and belief.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, reflect
+from heliotrope.jit import as_input
+from heliotrope.optics import _image_kernels as kernels
+from heliotrope.optics.attenuation import air_model
+from heliotrope.optics.beam import SUN_SIGMA
+from heliotrope.optics.scene import Mirrors, Scene
+from heliotrope.optics.shading import IntArray, Lit, Shading, parts_of
+from heliotrope.optics.sun_shape import SunShape
+from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
+from heliotrope.parallel import run_blocks
+
+#: A part's image is at most as wide as this times the blur by sun and slope.
+PART = 2.0
+#: Parts of a flat mirror at most, each way.
+_MOST = 64
+#: Blocks of mirrors whose flux is summed apart, whatever the number of threads.
+_BLOCKS = 8
+#: Mirrors whose directions differ by less than this see the same cells of a mesh, rad.
+_ALIKE = np.radians(3.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Efficiencies:
+    """Where the sun's light on each of H mirrors goes, as shares, (H,).
+
+    Attributes
+    ----------
+    cosine
+        Cosine of the angle of incidence.
+    shading, blocking, lit
+        Not shaded, not blocked, and neither (the exact union).
+    mirror
+        Reflectivity times what soiling leaves.
+    air
+        What the air lets through to the aim.
+    intercept
+        Share of the light that leaves the mirror and reaches a surface; NaN if none leaves.
+    total
+        Power on the surfaces over direct normal irradiance times area.
+    """
+
+    cosine: FloatArray
+    shading: FloatArray
+    blocking: FloatArray
+    lit: FloatArray
+    mirror: FloatArray
+    air: FloatArray
+    intercept: FloatArray
+    total: FloatArray
+
+
+class FieldFlux:
+    """The flux of a scene on its surfaces.
+
+    Parameters
+    ----------
+    scene
+        Mirrors, surfaces and sun.
+    sun
+        Shape of the sun, or its name; see `SunShape`.
+    air
+        Name of the air's model, or the visibility, km; see `air_loss`.
+    gaussians
+        Number of Gaussians of the sun's shape; each costs as much as the first.
+
+    Raises
+    ------
+    InputError
+        If no mirror's beam can meet a surface, or a name is unknown.
+
+    Notes
+    -----
+    Against 10⁷ rays on a cylinder of 20 × 56 cells, whose own noise is 0.4 % of the peak, cells
+    differ by 0.41 % RMS (high sun) and 0.42 % (15°), and power by 0.002 % and 0.07 %; flat mirrors
+    by 0.65 % (noise 0.65 %) and 0.15 %.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        sun: str | SunShape = "limb",
+        air: str | float = "clear",
+        gaussians: int = 3,
+    ) -> None:
+        shape = SunShape.of(sun)
+        weights, variances = shape.gaussians(gaussians)
+        self.scene, self._air = scene, air_model(air)
+        self._sums = (as_input(weights), as_input(variances))
+        mirrors = scene.mirrors
+        self._shading = Shading(scene, _divisions(scene, shape.variance))
+        self._transmitted = 1.0 - self._air(mirrors.slant)
+        self._light = _light(scene, self._transmitted)
+        self._figure = _figure(mirrors)
+        # What the present flux was cast with.
+        self._table, self._moments = self._shading.table.copy(), self._shading.lit.moments.copy()
+        self._plans = [_plan(surface, scene) for surface in scene.surfaces]
+        self._flux = [np.zeros(surface.cells.shape) for surface in scene.surfaces]
+        self._power = [np.zeros((len(mirrors), 2)) for _ in scene.surfaces]
+        self._cast(np.arange(len(mirrors)), 1.0)
+        self._check_met()
+
+    def _check_met(self) -> None:
+        for surface, power in zip(self.scene.surfaces, self._power, strict=True):
+            if power[:, 0].any() and not power[:, 1].any():
+                raise InputError(
+                    f"receiver {surface.name}: no mirror sends light to it; turn it to the field, "
+                    "or correct the aims"
+                )
+
+    def _cast(self, rows: IntArray, sign: float) -> None:
+        """Add (1) or take away (−1) the images of the mirrors in ``rows``."""
+        mirrors, shading = self.scene.mirrors, self._shading
+        edges = [len(rows) * k // _BLOCKS for k in range(_BLOCKS + 1)]
+        field = (
+            self._table, as_input(self.scene.sun), self._light, as_input(mirrors.slope),
+            as_input(mirrors.pointing), self._sums, shading.parts, self._figure, self._moments,
+        )  # fmt: skip
+        for plan, flux, power in zip(self._plans, self._flux, self._power, strict=True):
+            plan(rows, edges, field, sign, flux, power)
+
+    def move(self, rows: IntArray, mirrors: Mirrors) -> IntArray:
+        """Move mirrors, and return the rows of all whose light has changed.
+
+        Only these and the mirrors that they hide or no longer hide are computed again.
+
+        Parameters
+        ----------
+        rows
+            Which moved, (M,).
+        mirrors
+            All mirrors, (H,), in their new poses and with their new aims; nothing else of them
+            may differ.
+        """
+        changed = self._shading.move(rows, mirrors)
+        self._cast(changed, -1.0)
+        parts = parts_of(self._shading.lit.begin, changed)
+        self._table[changed] = self._shading.table[changed]
+        self._moments[parts] = self._shading.lit.moments[parts]
+        self.scene = self.scene.with_mirrors(mirrors)
+        self._transmitted[rows] = 1.0 - self._air(mirrors.slant[rows])
+        self._light[rows] = _light(self.scene, self._transmitted)[rows]
+        self._cast(changed, 1.0)
+        return changed
+
+    @property
+    def lit(self) -> Lit:
+        """Shading and blocking of each mirror."""
+        return self._shading.lit
+
+    @property
+    def maps(self) -> list[FloatArray]:
+        """Flux on each surface, W/m², in the shape of its cells."""
+        return [flux.copy() for flux in self._flux]
+
+    @property
+    def powers(self) -> list[float]:
+        """Power on each surface, W; into the aperture of a cavity."""
+        return [float(power[:, 1].sum()) for power in self._power]
+
+    @property
+    def power(self) -> FloatArray:
+        """Power of each mirror on all surfaces, W, (H,)."""
+        return as_float(sum(power[:, 1] for power in self._power))
+
+    @property
+    def leaving(self) -> FloatArray:
+        """Power of each mirror's beam, less what the air takes on the way, W, (H,)."""
+        return as_float(self._power[0][:, 0])
+
+    @property
+    def intercept(self) -> float:
+        """Share of the field's light that reaches a surface; NaN if there is none."""
+        leaving = float(self.leaving.sum())
+        return float(self.power.sum()) / leaving if leaving > 0.0 else float("nan")
+
+    @property
+    def efficiencies(self) -> Efficiencies:
+        """Where the light goes, mirror by mirror."""
+        mirrors, lit, leaving = self.scene.mirrors, self.lit, self.leaving
+        some = leaving > 0.0
+        intercept = np.where(some, self.power / np.where(some, leaving, 1.0), np.nan)
+        sunlight = self.scene.dni * mirrors.area
+        total = self.power / sunlight if self.scene.dni > 0.0 else np.full(len(mirrors), np.nan)
+        return Efficiencies(
+            self.scene.incidence,
+            lit.shading.copy(),
+            lit.blocking.copy(),
+            lit.both.copy(),
+            as_float(mirrors.reflectivity * mirrors.clean),
+            self._transmitted.copy(),
+            as_float(intercept),
+            as_float(total),
+        )
+
+
+class _Grid:
+    """How images fall on a plate or a cylinder."""
+
+    def __init__(self, surface: Plate | Cylinder) -> None:
+        rows, count = surface.shape
+        if isinstance(surface, Plate):
+            x = ((np.arange(count) + 0.5) / count - 0.5) * surface.width
+            base = surface.center + x[:, None] * surface.right
+            wide = np.broadcast_to(surface.width / count * surface.right, (count, 3))
+            mean = np.broadcast_to(surface.normal, (count, 3))
+            edges = np.broadcast_to(surface.normal, (count + 1, 3))
+            kind, axis, front, radius = kernels.FLAT, surface.up, surface.normal, 0.0
+            angles = np.zeros(count + 1)
+        else:
+            kind, axis, front = kernels.ROUND, surface.axis, surface.front
+            radius, angles = surface.radius, surface.edges
+            half = 0.5 * (angles[1] - angles[0])
+            outward = surface.outward(angles[:-1] + half)
+            base = surface.center + radius * outward
+            wide = 2.0 * half * radius * np.cross(outward, axis)
+            mean, edges = outward * np.sin(half) / half, surface.outward(angles)
+        self._shape = (kind, as_input(surface.center), as_input(axis), as_input(front), radius)
+        # A cell counts as a Gaussian of its own variance.
+        arrays = (base, wide / np.sqrt(12.0), mean, edges, angles)
+        self._columns = tuple(as_input(array) for array in arrays)
+        step = surface.height / rows
+        low = 0.5 * (step - surface.height)
+        self._grid = (low, step, rows, float(surface.cells.area[0]))
+
+    def __call__(
+        self, rows: IntArray, edges: list[int], field: Any, sign: float, flux: FloatArray,
+        power: FloatArray,
+    ) -> None:  # fmt: skip
+        sums = np.zeros((_BLOCKS, *flux.shape))
+
+        def block(first: int, last: int) -> None:
+            for k in range(first, last):
+                kernels.cast(
+                    edges[k], edges[k + 1], rows, *field, self._shape, self._columns, self._grid,
+                    sign, sums[k], power,
+                )  # fmt: skip
+
+        run_blocks(block, _BLOCKS, 2)
+        flux += sums.sum(axis=0)
+
+
+class _Cells:
+    """How images fall on a mesh, behind an aperture or not."""
+
+    def __init__(self, surface: Mesh | Cavity, scene: Scene) -> None:
+        mesh = surface.inner if isinstance(surface, Cavity) else surface
+        self._aperture = np.empty(0)
+        self._front: _Grid | None = None
+        if isinstance(surface, Cavity):
+            plate = surface.aperture
+            half = (0.5 * plate.width, 0.5 * plate.height)
+            self._aperture = np.concatenate([plate.center, plate.right, plate.up, half])
+            self._front = _Grid(plate)
+            self._seen = np.zeros(plate.shape)
+        cells, corners = mesh.cells, mesh.corners
+        from_middle = corners - cells.center[:, None]
+        own = np.einsum("cki,ckj->cij", from_middle, from_middle) / 12.0
+        parts = (cells.center, cells.normal, cells.area, own.reshape(-1, 9))
+        self._cells, self._middle = as_input(np.column_stack(parts)), as_input(surface.center)
+        mirrors = scene.mirrors
+        ways = reflect(np.broadcast_to(scene.sun, mirrors.normal.shape), mirrors.normal)
+        names, self._group = np.unique(np.round(ways / _ALIKE), axis=0, return_inverse=True)
+        hidden = np.zeros((len(names), len(corners)), dtype=np.bool_)
+        first = np.array([ways[self._group == k].mean(axis=0) for k in range(len(names))])
+        run_blocks(
+            lambda a, b: kernels.hide(a, b, first, self._cells, as_input(corners), hidden),
+            len(names),
+            2,
+        )
+        self._hidden = hidden
+
+    def __call__(
+        self, rows: IntArray, edges: list[int], field: Any, sign: float, flux: FloatArray,
+        power: FloatArray,
+    ) -> None:  # fmt: skip
+        sums = np.zeros((_BLOCKS, *flux.shape))
+
+        def block(first: int, last: int) -> None:
+            for k in range(first, last):
+                kernels.cast_cells(
+                    edges[k], edges[k + 1], rows, *field, self._middle, self._cells, self._hidden,
+                    self._group, self._aperture, sign, sums[k], power,
+                )  # fmt: skip
+
+        run_blocks(block, _BLOCKS, 2)
+        flux += sums.sum(axis=0)
+        if self._front is not None:
+            # What enters the aperture, whatever the cells make of it.
+            self._front(rows, edges, field, sign, self._seen, power)
+
+
+def _plan(surface: Surface, scene: Scene) -> _Grid | _Cells:
+    if isinstance(surface, Plate | Cylinder):
+        return _Grid(surface)
+    return _Cells(surface, scene)
+
+
+def _light(scene: Scene, transmitted: FloatArray) -> FloatArray:
+    """Return the power across each mirror's beam for one square metre across the sun's light."""
+    mirrors = scene.mirrors
+    light = scene.dni * mirrors.reflectivity * mirrors.clean * transmitted
+    return light if scene.dark is None else np.where(scene.dark, 0.0, light)
+
+
+def _figure(mirrors: Mirrors) -> FloatArray:
+    """Return tilt (2) and curvature 1 / 2f of each facet, (K, F, 3)."""
+    facets = mirrors.facets
+    if facets is None:
+        return as_input(np.empty((0, 0, 3)))
+    return as_input(np.concatenate([facets.tilt, 0.5 / facets.focal[..., None]], axis=-1))
+
+
+def _divisions(scene: Scene, sun: float = SUN_SIGMA**2) -> IntArray:
+    """Return columns and rows of parts of each mirror, so that no part's image is wide, (H, 2)."""
+    mirrors, cosine = scene.mirrors, scene.incidence
+    count = np.ones((len(mirrors), 2), dtype=np.int64)
+    if mirrors.facets is not None:
+        return count
+    t = mirrors.slant
+    blur = t * np.sqrt(sun + 2.0 * mirrors.slope**2 * (1.0 + cosine**2))
+    # Along the two principal directions a mirror's image is |1 − t cos θ / f| and |cos θ − t / f|
+    # as large as the mirror.
+    curve = t / mirrors.focal
+    gain = np.maximum(np.abs(1.0 - curve * cosine), np.abs(cosine - curve))
+    for k, side in enumerate((mirrors.width, mirrors.height)):
+        count[:, k] = np.clip(np.ceil(side * gain / (PART * blur)), 1, _MOST)
+    return count

@@ -1,0 +1,223 @@
+r"""Shading and blocking: which part of each mirror sees the sun, and its aim.
+
+The outlines of the mirrors before it (and of towers) are carried along the rays into a mirror's
+plane, and subtracted from it as convex polygons (Sutherland and Hodgman 1974, Communications of the
+ACM 17, 32), so that the area of a union counts once, exactly, and no number of occluders is too
+many. Shading goes along parallel rays; for blocking, the rays of a curved or canted mirror
+converge:
+
+$$d(x, y) = d_0 + 2 (δn·s) n + 2 (n·s) δn, \qquad δn = -(x, y) / 2f.$$
+
+Left out: the sun's size and the slope errors, which blur the edges of a shadow and leave its area
+(measured by rays on 11,915 mirrors: 0.0003 of the field's light), and the sag of the mirrors.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.geometry import FloatArray, as_float, reflect
+from heliotrope.jit import as_input
+from heliotrope.optics import _clip_kernels as kernels
+from heliotrope.optics.scene import Mirrors, Scene
+from heliotrope.parallel import run_blocks
+
+IntArray = npt.NDArray[np.int64]
+#: Room for a vertex that moves when its mirror turns, m; beyond it the grid is made anew.
+SLACK = 0.5
+#: The aim itself, and what touches it, hides nothing: this share of the way is not looked at.
+_BEFORE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Lit:
+    """What neighbours and towers leave of each mirror.
+
+    Attributes
+    ----------
+    shading, blocking, both
+        Shares of the mirror's area that are not shaded, not blocked, and neither, (H,).
+    moments
+        Of the lit part of each part of a mirror: area, centroid (x, y) and covariance
+        (xx, xy, yy) in the mirror's axes, m² and m, (P, 6).
+    begin
+        Row of ``moments`` where each mirror's parts begin, (H + 1,).
+    """
+
+    shading: FloatArray
+    blocking: FloatArray
+    both: FloatArray
+    moments: FloatArray
+    begin: IntArray
+
+
+class Shading:
+    """Shading and blocking of a scene, kept up to date while mirrors move.
+
+    Parameters
+    ----------
+    scene
+        Mirrors, towers and sun.
+    split
+        Columns and rows of equal parts of which the moments are wanted, (H, 2); mirrors with
+        facets have these as their parts. None: one part.
+    """
+
+    def __init__(self, scene: Scene, split: IntArray | None = None) -> None:
+        mirrors, count = scene.mirrors, len(scene.mirrors)
+        self._sun = as_input(scene.sun)
+        towers = [(t.east, t.north, t.radius, t.bottom, t.top) for t in scene.towers]
+        self._towers = as_input(np.array(towers).reshape(-1, kernels.TOWER))
+        self.table, self._ways, self._reaches = _rows(mirrors, scene.sun)
+        self._split = np.ones((count, 2), dtype=np.int64) if split is None else split
+        self.parts = _parts(mirrors, self._split)
+        self._shares = np.ones((count, 3))
+        self._moments = np.zeros((int(self.parts[3][-1]), 6))
+        self._look()
+        self._clip(np.arange(count))
+
+    @property
+    def lit(self) -> Lit:
+        """The present state; its arrays change with `move`."""
+        shading, blocking, both = self._shares.T
+        return Lit(shading, blocking, both, self._moments, self.parts[3])
+
+    def _look(self) -> None:
+        """Lay the grid, and find the candidates of every mirror."""
+        table = self.table
+        self._places = table[:, :3].copy()
+        radius = float(table[:, 15].max(initial=1.0))
+        step, low = 2.0 * (radius + SLACK), table[:, :2].min(axis=0)
+        shape = ((table[:, :2].max(axis=0) - low) // step).astype(np.int64) + 1
+        heads = np.empty(int(shape.prod()), dtype=np.int64)
+        links, tops = np.empty(len(table), dtype=np.int64), np.empty(len(heads))
+        sides = (int(shape[1]), int(shape[0]))
+        kernels.gridded(table, low, step, sides, heads, links, tops)
+        self._grid = (low, step, sides, heads, links, tops, float(tops.max()) + SLACK)
+        self._spans, self._near = self._candidates(np.arange(len(table)))
+
+    def _candidates(self, rows: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the parts (R, 3) of a list of candidates of the mirrors in ``rows``."""
+        found: dict[int, tuple[IntArray, IntArray]] = {}
+
+        def block(first: int, last: int) -> None:
+            spans = np.empty((last - first + 1, 2), dtype=np.int64)
+            near = kernels.candidates(
+                rows[first:last], self.table, self._sun, self._ways, self._reaches, SLACK,
+                self._grid, spans,
+            )  # fmt: skip
+            found[first] = np.column_stack([spans[:-1], spans[1:, 0]]), near
+
+        run_blocks(block, len(rows))
+        parts, start = [], 0
+        for first in sorted(found):
+            parts.append(found[first][0] + start)
+            start += len(found[first][1])
+        lists = [found[first][1] for first in sorted(found)]
+        return np.concatenate(parts), np.concatenate(lists)
+
+    def _clip(self, rows: IntArray) -> None:
+        def block(first: int, last: int) -> None:
+            kernels.clip(
+                first, last, rows, self.table, self._towers, self._sun, self._ways,
+                self._reaches, self._near, self._spans, self.parts,
+                (self._shares, self._moments),
+            )  # fmt: skip
+
+        run_blocks(block, len(rows))
+
+    def move(self, rows: IntArray, mirrors: Mirrors) -> IntArray:
+        """Move mirrors, and return the rows of all whose light has changed.
+
+        Parameters
+        ----------
+        rows
+            Which moved, (M,).
+        mirrors
+            All mirrors, (H,), in their new poses.
+        """
+        table, ways, reaches = _rows(mirrors, self._sun, rows)
+        touched = self._touched(rows)
+        self.table[rows], self._ways[rows], self._reaches[rows] = table, ways, reaches
+        if np.abs(table[:, :3] - self._places[rows]).max(initial=0.0) > SLACK:
+            self._look()
+            touched |= self._touched(rows)
+        else:
+            self._replace(rows)
+        looked = np.flatnonzero(touched)
+        parts = parts_of(self.parts[3], looked)
+        before = self._moments[parts]
+        self._clip(looked)
+        # Most that might be hidden are not, and their light stays as it was.
+        changed = np.zeros(len(touched), dtype=np.bool_)
+        changed[rows] = True
+        altered = (self._moments[parts] != before).any(axis=1)
+        counts = np.diff(self.parts[3])[looked]
+        changed[np.repeat(looked, counts)[altered]] = True
+        return np.flatnonzero(changed)
+
+    def _replace(self, rows: IntArray) -> None:
+        """Find the candidates of some mirrors anew."""
+        spans, near = self._candidates(rows)
+        self._spans[rows] = spans + len(self._near)
+        self._near = np.concatenate([self._near, near])
+        if len(self._near) > 2 * int((self._spans[:, 2] - self._spans[:, 0]).sum()) + 1024:
+            # What is left of lists that were replaced.
+            self._spans, self._near = self._candidates(np.arange(len(self.table)))
+
+    def _touched(self, rows: IntArray) -> npt.NDArray[np.bool_]:
+        """Return the mask of mirrors that are in ``rows`` or have one of them as candidate."""
+        moved = np.zeros(len(self.table), dtype=np.bool_)
+        moved[rows] = True
+        touched = np.empty_like(moved)
+        kernels.touched(self._spans, self._near, moved, touched)
+        return touched
+
+    def pieces(self, row: int) -> list[FloatArray]:
+        """Return the convex polygons that make up the lit part of one mirror, m, (k, 2) each."""
+        corners, begins = kernels.pieces_of(
+            row, self.table, self._towers, self._sun, self._ways, self._reaches, self._near,
+            self._spans,
+        )  # fmt: skip
+        return [corners[a:b] for a, b in pairwise(begins)]
+
+
+def parts_of(begin: IntArray, rows: IntArray) -> IntArray:
+    """Return the rows of the parts of some mirrors; ``begin`` (H + 1,) as in `Lit`."""
+    counts = begin[rows + 1] - begin[rows]
+    ends = np.cumsum(counts)
+    return np.arange(int(ends[-1]) if len(rows) else 0) + np.repeat(
+        begin[rows] - ends + counts, counts
+    )
+
+
+def _rows(
+    mirrors: Mirrors, sun: FloatArray, rows: IntArray | slice = slice(None)
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the kernels' table, the central rays and how far they are looked at."""
+    center, normal = mirrors.center[rows], mirrors.normal[rows]
+    half = 0.5 * np.stack([mirrors.width[rows], mirrors.height[rows]], axis=-1)
+    curve = 0.5 / mirrors.focal[rows]
+    radius = np.linalg.norm(half, axis=-1)
+    axes = (mirrors.right[rows], mirrors.up[rows])
+    table = np.column_stack([center, *axes, normal, half, curve, radius])
+    ways = reflect(np.broadcast_to(sun, normal.shape), normal)
+    reaches = (1.0 - _BEFORE) * np.linalg.norm(mirrors.aim[rows] - center, axis=-1)
+    return table, np.ascontiguousarray(ways), as_float(reaches)
+
+
+def _parts(mirrors: Mirrors, split: IntArray) -> Any:
+    """Return facets, their kinds, the divisions, and where each mirror's parts begin."""
+    facets = mirrors.facets
+    if facets is None:
+        counts = split.prod(axis=1)
+        table, kind = np.empty((0, 0, 4)), np.zeros(1, dtype=np.int64)
+    else:
+        table = np.concatenate([facets.center, facets.half], axis=-1)
+        kind = mirrors.kind
+        counts = np.full(len(mirrors), table.shape[1])
+    begin = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return as_input(table), as_input(kind), as_input(split), as_input(begin)

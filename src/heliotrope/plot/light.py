@@ -1,0 +1,159 @@
+"""The flux of a field: receivers unrolled, and field and receiver in three dimensions."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.optics.flux import FluxView
+from heliotrope.optics.plant_flux import EFFICIENCIES, PlantFlux
+from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate
+from heliotrope.plot.charts import _axes, field_map
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Colours of flux and of efficiency.
+_FLUX, _SHARE = "inferno", "cividis"
+#: Most heliostats that are drawn in three dimensions; of more, every second, third, … is left out.
+_MOST = 4000
+
+
+def receiver_map(view: FluxView, *, ax: "Axes | None" = None) -> "Axes":
+    """Draw the flux on a receiver; a cylinder's is unrolled.
+
+    Parameters
+    ----------
+    view
+        One of `heliotrope.optics.PlantFlux.maps`.
+    ax
+        Axes to draw on; default new ones.
+
+    Raises
+    ------
+    InputError
+        If the receiver is a mesh, which has no rows and columns.
+    """
+    if len(view.up) < 2:
+        raise InputError(
+            f"receiver {view.receiver}: a mesh cannot be unrolled; draw it with flux_3d"
+        )
+    ax = _axes(ax)
+    mesh = ax.pcolormesh(
+        view.right, view.up, 1e-3 * view.flux, cmap=_FLUX, vmin=0.0, rasterized=True
+    )
+    ax.figure.colorbar(mesh, ax=ax, label="flux, kW/m²")
+    ax.set_aspect("equal", adjustable="box")
+    ax.set_title(
+        f"{view.receiver}: {1e-6 * view.power:.4g} MW, peak {1e-3 * view.flux.max():.4g} kW/m²",
+        fontsize=10,
+    )
+    ax.set_xlabel("right, m")
+    ax.set_ylabel("up, m")
+    return ax
+
+
+def efficiency_map(found: PlantFlux, by: str = "total", *, ax: "Axes | None" = None) -> "Axes":
+    """Draw a map of the field coloured by an efficiency; grey where a beam cannot reach its aim.
+
+    Parameters
+    ----------
+    found
+        Result of `heliotrope.flux`.
+    by
+        One of "cosine", "shading", "blocking", "lit", "mirror", "air", "intercept" and "total".
+    ax
+        Axes to draw on; default new ones.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such efficiency.
+    """
+    if by not in EFFICIENCIES:
+        raise UnknownNameError("efficiency", by, EFFICIENCIES)
+    values = 100.0 * getattr(found.efficiencies, by)
+    centers = np.stack([surface.center for surface in found.surfaces])
+    ax = field_map(found.position, values, label=f"{by}, %", targets=centers, whole=True, ax=ax)
+    ax.set_title(f"{by} of the field: {100.0 * found.summary[by]:.2f} %", fontsize=10)
+    return ax
+
+
+def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> Any:
+    """Draw the field, coloured by an efficiency, with its receivers, coloured by their flux.
+
+    Parameters
+    ----------
+    found
+        Result of `heliotrope.flux`.
+    by
+        As for `efficiency_map`.
+    ax
+        Axes of matplotlib in three dimensions; default new ones.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such efficiency.
+    """
+    import matplotlib.pyplot as plt
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
+
+    if by not in EFFICIENCIES:
+        raise UnknownNameError("efficiency", by, EFFICIENCIES)
+    if ax is None:
+        ax = plt.figure(layout="constrained").add_subplot(projection="3d")
+    every = -(-len(found.names) // _MOST)
+    place, shares = found.position[::every], getattr(found.efficiencies, by)[::every]
+    ax.scatter(*place.T, c=shares, cmap=_SHARE, s=4.0, depthshade=False)
+    top = max(found.peak, 1e-9)
+    for surface, view in zip(found.surfaces, found.maps, strict=True):
+        faces = Poly3DCollection(_faces(surface), linewidths=0.0)
+        faces.set_facecolor(plt.get_cmap(_FLUX)(view.flux.ravel() / top))
+        ax.add_collection3d(faces)
+        middle = surface.center
+        ax.plot(*np.stack([middle, [*middle[:2], place[:, 2].min()]]).T, color="0.5", lw=1.5)
+    points = np.concatenate([place, [surface.center for surface in found.surfaces]])
+    low, high = points.min(axis=0), points.max(axis=0)
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(low[1], high[1])
+    ax.set_zlim(low[2], high[2] + 1.0)
+    ax.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()))
+    ax.locator_params(nbins=5)
+    ax.set_zticks(np.round([low[2], high[2]]))
+    ax.set_xlabel("east, m")
+    ax.set_ylabel("north, m")
+    return ax
+
+
+def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
+    """Return one picture of a field's light: map, first receiver unrolled, and both in space."""
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(13.0, 8.0), layout="constrained")
+    grid = figure.add_gridspec(2, 2)
+    efficiency_map(found, by, ax=figure.add_subplot(grid[:, 0]))
+    space = figure.add_subplot(grid[1, 1], projection="3d")
+    flux_3d(found, by, ax=space)
+    if len(found.maps[0].up) > 1:
+        receiver_map(found.maps[0], ax=figure.add_subplot(grid[0, 1]))
+    return figure
+
+
+def _faces(surface: Plate | Cylinder | Mesh | Cavity) -> Any:
+    """Return the corners of each cell, (C, 3 or 4, 3)."""
+    if isinstance(surface, Cavity):
+        surface = surface.inner
+    if isinstance(surface, Mesh):
+        return surface.corners
+    rows, columns = surface.shape
+    z = np.linspace(-0.5, 0.5, rows + 1) * surface.height
+    if isinstance(surface, Plate):
+        x = np.linspace(-0.5, 0.5, columns + 1) * surface.width
+        grid = surface.center + x[:, None] * surface.right + z[:, None, None] * surface.up
+    else:
+        around = surface.center + surface.radius * surface.outward(surface.edges)
+        grid = around + z[:, None, None] * surface.axis
+    corners = [grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]]
+    return np.stack(corners, axis=2).reshape(-1, 4, 3)

@@ -1,0 +1,175 @@
+"""The ray tracer: another tracer's flux on a real plant, and scenes that are done by hand."""
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import bisector, direction, normalize
+from heliotrope.optics import SunShape
+from heliotrope.optics.rays import trace
+from heliotrope.optics.scene import FacetTable, Mirrors, Scene, Tower
+from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate
+from support import dunhuang
+
+pytest.importorskip("embreex", reason="the extra `rays` is not installed")
+
+MRAD = 1e-3
+EAST, NORTH, UP = np.eye(3)
+SUN = direction(np.radians(180.0), np.radians(50.0))
+POINT = SunShape("gaussian", sigma=1e-6)
+MIDDLE = np.array([0.0, 0.0, 60.0])
+# As seen from the north, its front to it, the right is the west.
+PLATE = Plate("plate", MIDDLE, -EAST, UP, 6.0, 6.0, (6, 6))
+
+
+def scene(places: Any, surface: Any = PLATE, towers: tuple[Tower, ...] = (), **more: Any) -> Scene:
+    places = np.atleast_2d(np.asarray(places, dtype=float))
+    normal = bisector(SUN, normalize(MIDDLE - places))
+    mirrors = Mirrors.of(places, normal, (3.0, 2.0), MIDDLE, **{"slope": 0.0} | more)
+    return Scene(SUN, 1000.0, mirrors, (surface,), towers)
+
+
+@pytest.mark.parametrize("name", ["high_slant", "mid_slant", "low_slant", "high_flat"])
+def test_rays_agree_with_another_tracer_on_a_real_plant(name: str) -> None:
+    reference, given = dunhuang.flux(name), dunhuang.scene(name)
+    traced = trace(given, 4e5, sun="pillbox", seed=1)
+    error = np.hypot(traced.power_error[0], 1e3 * reference["power_se_kW"])
+    assert traced.power[0] == pytest.approx(1e3 * reference["power_kW"], abs=3.5 * error)
+    theirs = 1e3 * np.array(reference["flux_kW_m2"])
+    apart = np.sqrt(np.mean((traced.flux[0] - theirs) ** 2))
+    noise = np.hypot(
+        np.sqrt(np.mean(traced.error[0] ** 2)), reference["se_rms_rel_peak"] * theirs.max()
+    )
+    assert 0.85 * noise < apart < 1.1 * noise
+    exact = dunhuang.efficiencies()["suns"][name.partition("_")[0]]
+    assert np.abs(traced.cosine - exact["cosine"]).max() < 1e-5
+    ours = np.where(traced.count > 0, traced.shading, 0.0) @ traced.count / traced.count.sum()
+    shading = np.array(exact["shading"]) @ traced.count / traced.count.sum()
+    # The sun's disk, which the exact shares leave out, makes edges soft and no share less.
+    assert ours == pytest.approx(shading, abs=4.0 * np.sqrt(shading * (1 - shading) / 4e5) + 1e-4)
+
+
+def test_a_mirror_alone_sends_all_its_light() -> None:
+    given = scene([10.0, 80.0, 0.0], reflectivity=0.8, clean=0.5)
+    traced = trace(given, 2e4, sun=POINT, air="none")
+    cosine = given.incidence[0]
+    assert traced.power[0] == pytest.approx(6.0 * cosine * 0.4 * 1000.0, rel=1e-6)
+    assert traced.shading[0] == traced.blocking[0] == traced.intercept[0] == 1.0
+    # Focused on the middle, it lights a little of it.
+    assert traced.flux[0][[0, -1]].sum() == 0.0
+
+
+def test_the_size_of_an_image_is_that_of_sun_slope_and_pointing() -> None:
+    fine = replace(PLATE, width=4.0, height=4.0, shape=(80, 80))
+    place = np.array([0.0, 160.0, 60.0])  # level with the target, square to it
+    spread = [[4 * MRAD**2, 0.0], [0.0, 1 * MRAD**2]]
+    given = scene(place, fine, slope=0.5 * MRAD, pointing=spread)
+    small = Mirrors.of(
+        place, given.mirrors.normal, (1e-3, 1e-3), MIDDLE, slope=0.5 * MRAD, pointing=spread
+    )
+    traced = trace(replace(given, mirrors=small), 2e5, sun="pillbox", air="none")
+    light = traced.flux[0] / traced.flux[0].sum()
+    at = (np.arange(80) + 0.5) * 0.05 - 2.0
+    right = light.sum(axis=0) @ at**2 - (light.sum(axis=0) @ at) ** 2
+    up = light.sum(axis=1) @ at**2 - (light.sum(axis=1) @ at) ** 2
+    sun, cos2 = SunShape("pillbox").variance, given.incidence[0] ** 2
+    # The plane of incidence is upright here: slope counts 4 σ² in it and 4 σ² cos² across.
+    cell = 0.05**2 / 12
+    across = 160.0**2 * (sun + MRAD**2 * cos2 + 4 * MRAD**2) + cell
+    assert right == pytest.approx(across, rel=0.015)
+    assert up == pytest.approx(160.0**2 * (sun + MRAD**2 + MRAD**2) + cell, rel=0.015)
+
+
+def test_a_neighbour_shades_and_blocks_the_share_that_it_covers() -> None:
+    place = np.array([0.0, 100.0, 0.0])
+    alone = scene(place).mirrors
+    # Half a width to the side on the way to the sun; then on the way to the target.
+    for way, name in ((SUN, "shading"), (normalize(MIDDLE - place), "blocking")):
+        aside = place + 8.0 * way + 1.5 * alone.right[0]
+        pair = scene([place, aside])
+        same = replace(pair.mirrors, normal=np.repeat(alone.normal, 2, axis=0),
+                       right=np.repeat(alone.right, 2, axis=0), up=np.repeat(alone.up, 2, axis=0),
+                       focal=np.full(2, np.inf))  # fmt: skip
+        traced = trace(replace(pair, mirrors=same), 4e4, sun=POINT)
+        assert getattr(traced, name)[0] == pytest.approx(0.5, abs=0.015)
+        assert traced.lit[0] == getattr(traced, name)[0]
+
+
+def test_a_tower_shades() -> None:
+    place = np.array([0.0, 30.0, 0.0])
+    tower = Tower(0.0, 10.0, 1.0, -5.0, 55.0)  # south of it, where the sun is
+    traced = trace(scene(place, towers=(tower,)), 4e4, sun=POINT)
+    mirror = scene(place).mirrors
+    assert mirror.width[0] == 3.0  # level in the east-west direction
+    assert traced.shading[0] == pytest.approx(1.0 / 3.0, abs=0.01)
+
+
+def box(plate: Plate, depth: float) -> Mesh:
+    """The inside of a box behind a plate, without its front."""
+    a, b = 0.5 * plate.width * plate.right, 0.5 * plate.height * plate.up
+    near = [plate.center + x * a + y * b for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    far = [corner - depth * plate.normal for corner in near]
+    faces = [(4, 5, 6), (4, 6, 7)]  # the back, seen from the front
+    for i in range(4):
+        j = (i + 1) % 4
+        faces += [(i, j, 4 + j), (i, 4 + j, 4 + i)]
+    return Mesh("box", np.array(near + far), np.array(faces))
+
+
+def test_plates_meshes_and_cavities_take_the_same_light() -> None:
+    places = [[x, 90.0, 0.0] for x in (-30.0, 0.0, 30.0)]
+    two = Mesh("mesh", PLATE.corners, np.array([(0, 1, 2), (0, 2, 3)]))
+    more = {"slope": 2.0 * MRAD, "focal": 150.0}
+    plate, mesh, cavity = (
+        trace(scene(places, surface, **more), 5e4, seed=2)
+        for surface in (PLATE, two, Cavity(PLATE, box(PLATE, 4.0)))
+    )
+    assert 0.5 < plate.intercept.min() < 0.99 or plate.power[0] > 0.0
+    assert mesh.power[0] == pytest.approx(plate.power[0], rel=1e-4)
+    assert cavity.power[0] == pytest.approx(plate.power[0], rel=1e-4)
+    # Its light comes from below: the back and the upper side get it, the floor next to nothing.
+    assert cavity.flux[0].max() == cavity.flux[0][[0, 1, 6, 7]].max()
+
+
+def test_a_cylinder_gets_light_on_the_side_of_the_mirrors() -> None:
+    pipe = Cylinder("pipe", MIDDLE, UP, NORTH, 3.0, 8.0, shape=(4, 8))
+    traced = trace(scene([0.0, 90.0, 0.0], pipe, slope=2.0 * MRAD), 3e4)
+    columns = traced.flux[0].sum(axis=0)
+    assert columns[[0, 7]].sum() > 0.9 * columns.sum()  # on both sides of north
+    assert columns[2:6].sum() == 0.0
+
+
+def test_facets_that_lie_on_the_mirror_s_curve_make_its_image() -> None:
+    whole = scene([0.0, 120.0, 0.0])
+    slant = whole.mirrors.slant[0]
+    x, y = (a.ravel() for a in np.meshgrid([-1.0, 0.0, 1.0], [-0.5, 0.5]))
+    center = np.stack([x, y], axis=-1)[None]
+    facets = FacetTable(
+        center, -center / (2.0 * slant), np.full((1, 6, 2), 0.5), np.full((1, 6), slant)
+    )
+    parted = replace(whole, mirrors=whole.mirrors.with_facets(facets))
+    one, six = (trace(each, 1e5, seed=3, sun="pillbox") for each in (whole, parted))
+    assert six.power[0] == pytest.approx(one.power[0], rel=1e-3)
+    noise = np.hypot(one.error[0], six.error[0])
+    assert (np.abs(one.flux[0] - six.flux[0]) < 4.5 * noise + 1e-9).all()
+
+
+def test_dark_mirrors_send_no_rays() -> None:
+    given = replace(scene([[0.0, 90.0, 0.0], [9.0, 90.0, 0.0]]), dark=np.array([True, False]))
+    traced = trace(given, 1e4)
+    assert traced.count.tolist() == [0.0, 1e4]
+    assert np.isnan(traced.lit[0])
+
+
+def test_the_number_of_rays_and_the_extra_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = scene([0.0, 90.0, 0.0])
+    for rays in (10, 1e10, float("nan")):
+        with pytest.raises(InputError, match="must be from 1,000 to 1,000,000,000"):
+            trace(given, rays)
+    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
+    with pytest.raises(InputError, match=r"embreex is not installed; say pip install 'helio"):
+        trace(given, 1e4)
