@@ -69,6 +69,8 @@ NEEDED = {
     ("GET", "pictures-to-mark/{identity}"): "engineer",
     ("GET", "heliostats/{name}/why"): "viewer",
     ("GET", "journal"): "viewer",
+    ("GET", "report"): "viewer",
+    ("POST", "notes"): "operator",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",
     ("PATCH", "accounts/{name}"): "engineer",

@@ -324,7 +324,9 @@ def journal(
     context: typer.Context,
     since: Annotated[str, typer.Option(help="From this time, ISO 8601.", show_default=False)] = "",
     until: Annotated[str, typer.Option(help="Before this time.", show_default=False)] = "",
-    kind: Annotated[str, typer.Option(help="event, alarm or command.", show_default=False)] = "",
+    kind: Annotated[
+        str, typer.Option(help="event, alarm, command or note.", show_default=False)
+    ] = "",
     person: Annotated[str, typer.Option(help="Person.", show_default=False)] = "",
     heliostat: Annotated[str, typer.Option(help="Heliostat.", show_default=False)] = "",
     text: Annotated[str, typer.Option(help="Text in it, in any case.", show_default=False)] = "",
@@ -354,6 +356,66 @@ def journal(
         print("  ".join(row))
     if not rows:
         print("nothing is found")
+
+
+@app.command()
+def report(
+    context: typer.Context,
+    since: Annotated[
+        str, typer.Option(help="From this time, ISO 8601; else 8 h before.", show_default=False)
+    ] = "",
+    until: Annotated[
+        str, typer.Option(help="Before this time; else now.", show_default=False)
+    ] = "",
+    as_json: Json = False,
+) -> None:
+    """Print the report of a shift: production, availability, calibrations, alarms, work, notes."""
+    given = {"since": since, "until": until}
+    times = [f"{name}={parse_time(at).timestamp():.3f}" for name, at in given.items() if at]
+    with _client(context) as client:
+        answer = client.get("?".join(filter(None, ("report", "&".join(times)))))
+    if as_json:
+        print_json(answer)
+        return
+    print(f"{answer['plant']}, {_utc(answer['since'])} to {_utc(answer['until'])}")
+    hours = answer["recorded"] / 3600.0
+    print(f"figures are kept for {hours:.1f} h of it, {answer['daylight'] / 3600.0:.1f} h by day")
+    for one in answer["production"]:
+        print(
+            f"{one['receiver']}: {one['energy'] / 3.6e9:.3f} MWh predicted, at most "
+            f"{one['peak'] / 1e6:.2f} MW at {_utc(one['peak_at'])}"
+        )
+    if answer["availability"] is not None:
+        print(f"availability {answer['availability']:.1%}; not available:")
+        print_table(
+            ("reason", "heliostat hours"),
+            [(why, "-" if s is None else f"{s / 3600:.1f}") for why, s in answer["lacks"].items()],
+        )
+    rows = [(name.replace("_", " "), str(count)) for name, count in answer["outcomes"].items()]
+    print_table(("visits", "number"), rows, "calibrations")
+    for name in ("alarms", "locks", "work", "notes"):
+        print(f"{name}: {len(answer[name])}")
+        for one in answer[name]:
+            print(f"  {_utc(one.get('at') or one.get('raised') or one['since'])}  {_line(one)}")
+
+
+def _line(one: dict[str, Any]) -> str:
+    """Return an alarm, a lock or an entry of the journal in one line."""
+    if "who" in one:
+        return f"{one['kind']} {one['name']}: {one['reason']} ({one['who']})"
+    over = f"; over at {_utc(one['cleared'])}" if one.get("cleared") else ""
+    return f"{one.get('condition', '')} {one['text']}{over}".strip()
+
+
+@app.command()
+def note(
+    context: typer.Context,
+    text: Annotated[str, typer.Argument(help="What the next shift has to know.")],
+) -> None:
+    """Keep a note for the next shift, in the journal and the report."""
+    with _client(context) as client:
+        client.ask("POST", "notes", {"text": text})
+    print("noted")
 
 
 @app.command()

@@ -2,6 +2,7 @@
 import { api, me, rowsWhere, store } from "./live.js";
 import { CLICKS, FieldMap, SHAPES } from "./map.js";
 import { heliostats } from "./table.js";
+import { shift } from "./shift.js";
 import { VIEWS } from "./palette.js";
 import * as panels from "./panels.js";
 import * as people from "./people.js";
@@ -88,7 +89,7 @@ function tabs() {
     panel.replaceChildren(box);
     panel.scrollTop = 0;
     panel.ariaLabel = button.firstChild.textContent;
-    end = { ...panels, heliostats }[button.dataset.tab](box);
+    end = { ...panels, heliostats, shift }[button.dataset.tab](box);
   };
   buttons.forEach((button, i) => {
     button.onclick = () => open(button);
@@ -127,7 +128,7 @@ store.confirm = async () => {
 };
 menu(part("menu"));
 bar(part("bar"));
-store.begun.then(() => {
+store.start().then(() => {
   map(part("map")); head(part("head")); whoCommands(part("authority")); alert(part("alert")); badge(part("badge"));
   tabs();
 });

@@ -30,6 +30,7 @@ from heliotrope.plant.interface.tickets import TicketState
 from heliotrope.plant.operations import bus_frames as bus
 from heliotrope.plant.operations import views
 from heliotrope.plant.operations.marking import MarksView, PictureToMark
+from heliotrope.plant.operations.report import ShiftReport
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.zero import lock_position, zero
@@ -284,9 +285,25 @@ def events(desk: Desk, order: orders.Some) -> tuple[views.EventRow, ...]:
 async def journal(desk: Desk, order: orders.Journal) -> tuple[JournalEntry, ...]:
     """Return events, alarms and commands of all days from the store, the latest first.
 
-    `since` and `until` are POSIX seconds; `kind` is `event`, `alarm` or `command`.
+    `since` and `until` are POSIX seconds; `kind` is `event`, `alarm`, `command` or `note`.
     """
     return tuple(await desk.operations.journal(JournalQuery(**order.model_dump())))
+
+
+@_call("GET report", "logs")
+async def report(desk: Desk, order: orders.Period) -> ShiftReport:
+    """Return the report of a time: production, availability, calibrations, alarms, work, notes.
+
+    `since` and `until` are POSIX seconds, at most 31 days apart; 0 or left out: the last eight
+    hours. Energy and power are predicted.
+    """
+    return await desk.operations.report(order.since, order.until)
+
+
+@_call("POST notes", "logs", OPERATOR)
+def note_for_people(desk: Desk, who: Person, order: orders.NoteOrder) -> None:
+    """Keep a note for the next shift; the journal and the report show it."""
+    desk.operations.note(who, order.text)
 
 
 @_call("GET packets", "logs", fresh=FRESH)

@@ -98,11 +98,24 @@ class Journal(Some):
 
     since: Moment = 0.0
     until: Moment = 1e11
-    kind: Literal["", "event", "alarm", "command"] = ""
+    kind: Literal["", "event", "alarm", "command", "note"] = ""
     person: Annotated[str, Field(max_length=64)] = ""
     heliostat: Annotated[str, Field(max_length=64)] = ""
     text: Annotated[str, Field(max_length=100)] = ""
     but: Annotated[str, Field(max_length=64, description="Whose commands are left out.")] = ""
+
+
+class Period(Strict):
+    """A time; `until` 0: now, and `since` 0: eight hours before."""
+
+    since: Moment = 0.0
+    until: Moment = 0.0
+
+
+class NoteOrder(Strict):
+    """A note for other people."""
+
+    text: Annotated[str, Field(min_length=1, max_length=1000, pattern=f"^{_LETTER}*$")]
 
 
 class SomePackets(Some):

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy.typing as npt
 
@@ -30,12 +30,14 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import ORDERED, EmergencyOrder
 from heliotrope.plant.field.lockouts import TOWER
-from heliotrope.plant.operations.automatic import AutomaticControl
+from heliotrope.plant.operations.automatic import AUTOMATIC, AutomaticControl
 from heliotrope.plant.operations.errands import Errands
 from heliotrope.plant.operations.explaining import explain
+from heliotrope.plant.operations.history import History, figures
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.operations.report import ShiftReport, period, report
 from heliotrope.plant.operations.security import SecurityLog
 from heliotrope.plant.operations.typed_parameters import TypedParameters
 from heliotrope.plant.operations.viewing import Viewer
@@ -49,7 +51,9 @@ from heliotrope.plant.orders.authority import Grant, Person, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import Act
-from heliotrope.store.records import JournalEntry, JournalQuery, Kind, Records
+from heliotrope.store.records import NOTE, JournalEntry, JournalQuery, Kind, Records
+
+T = TypeVar("T")
 
 #: Commands that take heliostats from automatic control, and that give them to it.
 _TAKES_FROM_AUTOMATIC = messages.having("manual")
@@ -132,6 +136,7 @@ class Operations:
         self.security = SecurityLog(logbook, plant.clock)
         self.viewer = Viewer(plant, self.automatic)
         self.parameters = TypedParameters(plant, logbook, records)
+        self._history = History(plant, records, self._figures)
         self._records = records
         self._flux: dict[str, _Cached] = {}
         self._closing = asyncio.Event()
@@ -143,7 +148,8 @@ class Operations:
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
-            beside = [group.create_task(self._look()), group.create_task(self._follow())]
+            parts = (self._look(), self._follow(), self._history.run())
+            beside = [group.create_task(part) for part in parts]
             await self._closing.wait()
             self.automatic.stop()
             work.cancel()
@@ -235,10 +241,48 @@ class Operations:
         InputError
             If the plant keeps no records.
         """
+        return await self._read("journal", lambda records: records.journal(query))
+
+    async def report(self, since: float, until: float) -> ShiftReport:
+        """Return the report of a time; see `report.period`.
+
+        Raises
+        ------
+        InputError
+            If the plant keeps no records, or the time is not one.
+        """
+        name, now = self.plant.design.name, self.plant.clock.utc().timestamp()
+        first, last = period(since, until, now)
+        return await self._read(
+            "report",
+            lambda records: report(name, records, first, last, now, AUTOMATIC.name),
+        )
+
+    def note(self, person: Person, text: str) -> None:
+        """Keep a person's note, such as one for the next shift, in the journal.
+
+        Raises
+        ------
+        RefusedError
+            If the person is a viewer.
+        InputError
+            If it is empty.
+        """
+        _operator(person, "note")
+        if not text.strip():
+            raise InputError("note: it is empty; write what the next shift has to know")
+        self._tell(person, text.strip(), NOTE)
+
+    async def _read(self, what: str, read: Callable[[Records], T]) -> T:
+        """Return what a thread reads from the store, with the latest records in it."""
         if self._records is None:
-            raise InputError("journal: this plant keeps no records; run it with a data folder")
+            raise InputError(f"{what}: this plant keeps no records; run it with a data folder")
         await self._records.confirm()
-        return await asyncio.to_thread(self._records.journal, query)
+        return await asyncio.to_thread(read, self._records)
+
+    def _figures(self) -> dict[str, float]:
+        power = {name: self.receiver_flux(name).power for name in self.receivers}
+        return figures(self.viewer.frame(), self.summary(), self.sun(), power)
 
     # -- light -----------------------------------------------------------------------------
 

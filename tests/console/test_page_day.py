@@ -1,0 +1,58 @@
+"""What an operator does all day, in a browser: each task with its clicks and seconds."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from support.live_console import LiveConsole
+from support.pages import NEEDS_BROWSER, said, task
+
+pytestmark = NEEDS_BROWSER
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """Twelve heliostats at eight times the speed of real time."""
+    made = LiveConsole(tmp_path_factory.mktemp("day"), 12, speed=8.0)
+    yield made
+    made.close()
+
+
+def produced(field: LiveConsole) -> bool:
+    """Whether figures are kept in which a receiver gets power."""
+    rows = field.keeper.figures(0.0, 1e11)
+    return any(value > 0.0 for row in rows for name, value in row.values.items() if "power" in name)
+
+
+def test_a_note_and_the_report_of_the_shift(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    field.until(lambda: produced(field))
+    page = enter("operator", viewport={"width": 820, "height": 1180})
+    with task(page, "hand-over note"):
+        page.click(".hx-tabs >> text=Shift")
+        page.fill("[name=note]", "Mirror 7 is dirty,\nwash it tomorrow")
+        page.click("text=Keep note")
+        page.wait_for_selector("td:has-text('operator: Mirror 7 is dirty, wash it tomorrow')")
+    said(page, "note: done")
+    assert not page.input_value("[name=note]")
+    with task(page, "shift report"), page.context.expect_page() as opened:
+        page.click(".hx-shift >> text=Last 8 hours")
+    report = opened.value
+    report.wait_for_selector("h1:has-text('Shift report')")
+    text = report.inner_text("article")
+    assert "operator: Mirror 7 is dirty" in text
+    for title in ("Production", "Availability", "Calibrations", "Alarms", "Work done", "Notes (1)"):
+        assert title in text
+    found = report.request.get(f"{field.address}api/v1/report").json()
+    assert found["production"][0]["energy"] > 0
+    assert 0 < found["availability"] <= 1
+    assert f"{found['production'][0]['energy'] / 3.6e9:.1f}"[:3] in text
+    report.emulate_media(media="print")
+    assert not report.locator("form").is_visible()
+
+
+def test_a_viewer_writes_no_note(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    page = enter("viewer")
+    page.click(".hx-tabs >> text=Shift")
+    page.wait_for_selector("text=Hand-over notes")
+    assert not page.locator("[name=note]").count()
