@@ -69,6 +69,7 @@ NEEDED = {
     ("GET", "pictures-to-mark/{identity}"): "engineer",
     ("GET", "heliostats/{name}/why"): "viewer",
     ("GET", "journal"): "viewer",
+    ("GET", "heliostats/{name}/versions"): "viewer",
     ("GET", "report"): "viewer",
     ("POST", "notes"): "operator",
     ("GET", "accounts"): "engineer",

@@ -56,3 +56,43 @@ def test_a_viewer_writes_no_note(field: LiveConsole, enter: Callable[..., Any]) 
     page.click(".hx-tabs >> text=Shift")
     page.wait_for_selector("text=Hand-over notes")
     assert not page.locator("[name=note]").count()
+
+
+def test_versions_side_by_side_and_one_brought_back(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    name, operations = field.live.names[0], field.live.operations
+    page = enter("engineer")
+    page.fill(".hx-query", name)
+    page.keyboard.press("Enter")
+    page.click(".hx-orders >> text=Stow")
+    field.until(lambda: operations.viewer.heliostat(name).state == "STOWED")
+    page.click(".hx-authority >> text=Take command")
+    page.wait_for_selector(".hx-authority >> text=You have command")
+    page.click(".hx-tabs >> text=Heliostat")
+    page.click("text=Versions…")
+    page.wait_for_selector("dialog th:has-text('version 0')")
+    for value in ("0.5", "1.5"):
+        page.fill("dialog [name=tilt_east]", value)
+        page.click("dialog >> text=Store new values")
+        page.wait_for_selector("dialog .hx-told.bad:has-text('give the reason')")
+        assert page.input_value("dialog [name=tilt_east]") == value
+        page.fill("dialog [name=reason]", "levelled")
+        page.click("dialog >> text=Store new values")
+        page.wait_for_selector("dialog .hx-told:not(.bad):has-text('done')")
+    page.click("dialog >> text='Close'")
+    last = field.call(lambda: field.live.plant.beliefs.record(name))
+    assert last.parameters["tilt_east"] == pytest.approx(1.5e-3)
+    with task(page, "versions side by side and one brought back"):
+        page.click("text=Versions…")
+        page.wait_for_selector("dialog >> text=/The beam moves by [0-9.]+ mm RMS/")
+        (row,) = page.locator("dialog tr:has-text('tilt_east')").all_inner_texts()
+        assert row.split()[1:6:2][:2] == ["0.500", "1.500"]
+        page.fill("dialog [name=reason]", "the level was wrong")
+        page.click(f"dialog >> text=Bring back version {last.version - 1}")
+        page.wait_for_selector("dialog .hx-told:not(.bad):has-text('done')")
+    again = field.call(lambda: field.live.plant.beliefs.record(name))
+    assert again.version == last.version + 1
+    assert again.parameters["tilt_east"] == pytest.approx(0.5e-3)
+    page.click("dialog >> text='Close'")
+    page.click(".hx-authority >> text=Release")

@@ -634,6 +634,48 @@ def _show_parameters(answer: dict[str, Any], as_json: bool) -> None:
 
 
 @app.command()
+def versions(
+    context: typer.Context,
+    heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
+    first: Annotated[int, typer.Argument(min=0, max=1_000_000_000, help="0: the plant file.")],
+    second: Annotated[
+        int | None,
+        typer.Argument(
+            min=0, max=1_000_000_000, help="Else the version in use.", show_default=False
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare two versions of a heliostat's error parameters, and the change of its beam."""
+    path = f"heliostats/{quote(heliostat, safe='')}"
+    with _client(context) as client:
+        if second is None:
+            second = client.get(f"{path}/parameters")["version"]
+        answer = client.get(f"{path}/versions?first={first}&second={second}")
+    if as_json:
+        print_json(answer)
+        return
+    rows = []
+    for one in answer["parameters"]:
+        unit, size = _SHOWN[one["unit"]]
+        values = [one[key] for key in ("first", "first_sigma", "second", "second_sigma")]
+        shown = ["" if v is None else f"{v / size:.3f}" for v in values]
+        change = (one["second"] - one["first"]) / size
+        rows.append((one["name"], *shown, f"{change:+.3f}", unit))
+    for which in ("first", "second"):
+        one = answer[which]
+        at = "" if one["at"] is None else f"{_utc(one['at'])}, {one['sightings']} sightings "
+        print(f"version {one['version']}: {at}{one['person']} {one['note']}".rstrip())
+    head = ("parameter", f"version {first}", "σ", f"version {second}", "σ", "change", "unit")
+    print_table(head, rows, answer["heliostat"])
+    if answer["beam_rms"] is not None:
+        print(
+            f"the beam moves by {1e3 * answer['beam_rms']:.1f} mm RMS at its aim today, at most "
+            f"{1e3 * answer['beam_most']:.1f} mm"
+        )
+
+
+@app.command()
 def photograph(
     context: typer.Context,
     target: Annotated[str, typer.Argument(help="Target.")],

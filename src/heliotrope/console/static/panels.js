@@ -4,6 +4,8 @@ import { cividis, colourOf, dark } from "./palette.js";
 import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, span, table } from "./dom.js";
 import { act } from "./orders.js";
 import { markCorners } from "./marking.js";
+import { compareVersions } from "./versions.js";
+import { t } from "./words.js";
 
 const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
 const canCommand = () => me.role !== "viewer";
@@ -145,7 +147,7 @@ function heliostatView(one, why) {
     one.drives.length ? table([["Axis", (d) => d.axis], ["Count", (d) => count(d.count), "num"], ["Goal", (d) => count(d.goal), "num"],
       ["Angle (°)", (d) => degrees(d.angle, 3), "num"], ["Goal (°)", (d) => degrees(d.goal_angle, 3), "num"]],
       one.drives.map((d, i) => ({ ...d, axis: ["primary", "secondary"][i] }))) : h("p", { className: "hx-hint" }, "unknown while stale"),
-    h("h3", {}, "Parameters"),
+    h("div", { className: "hx-row" }, h("h3", {}, t("Parameters")), h("button", { className: "hx-button", onclick: () => act(() => compareVersions(one.name), t("versions"), false) }, t("Versions…"))),
     table([["Name", (p) => p[0]], ["Value", (p) => parameter(p[1].value, p[1].unit), "num"], ["σ", (p) => parameter(p[1].sigma, p[1].unit), "num"],
       ["Nominal", (p) => parameter(p[1].nominal, p[1].unit), "num"], ["", (p) => (p[1].unit === "rad" ? "mrad" : p[1].unit)]], Object.entries(one.parameters)),
     h("h3", {}, `Errors of its sightings (${one.history.length}), mrad`), h("canvas", { className: "hx-chart small" }),

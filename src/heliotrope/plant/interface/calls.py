@@ -33,6 +33,7 @@ from heliotrope.plant.operations.marking import MarksView, PictureToMark
 from heliotrope.plant.operations.report import ShiftReport
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.operations.typed_parameters import ParametersView
+from heliotrope.plant.operations.versions import ParameterComparison
 from heliotrope.plant.operations.zero import lock_position, zero
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.orders.tickets import Ticket
@@ -569,6 +570,16 @@ async def parameters(desk: Desk, who: Person, order: orders.Named) -> Parameters
     (asked now for an operator, else as last compared), and earlier versions.
     """
     return await desk.operations.parameters.view(order.name, who)
+
+
+@_call("GET heliostats/{name}/versions", "calibration")
+async def versions(desk: Desk, order: orders.TwoVersions) -> ParameterComparison:
+    """Return two versions of a heliostat's parameters side by side, with σ.
+
+    `?first=3&second=5`; 0 is the plant file. `beam_rms` and `beam_most`: change of the beam at its
+    aim over the suns of this day, m.
+    """
+    return await desk.operations.parameters.compare(order.name, order.first, order.second)
 
 
 @_call("POST parameters", "calibration", ENGINEER)

@@ -198,6 +198,14 @@ class ParameterOrder(Strict):
     reason: Annotated[Words, Field(min_length=1)]
 
 
+class TwoVersions(Strict):
+    """A heliostat and two versions of its parameters; 0: those of the plant file."""
+
+    name: Name
+    first: Annotated[int, Field(ge=0, le=2**31)] = 0
+    second: Annotated[int, Field(ge=0, le=2**31)] = 0
+
+
 #: A pixel of a picture, right and down.
 PixelOf = Annotated[list[Coordinate], Field(min_length=2, max_length=2)]
 
