@@ -96,3 +96,24 @@ def test_versions_side_by_side_and_one_brought_back(
     assert again.parameters["tilt_east"] == pytest.approx(0.5e-3)
     page.click("dialog >> text='Close'")
     page.click(".hx-authority >> text=Release")
+
+
+def test_calibrate_now_shows_its_progress_and_its_result(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    name = field.live.names[3]
+    page = enter("operator", viewport={"width": 820, "height": 1180})
+    page.fill(".hx-query", name)
+    page.keyboard.press("Enter")
+    with task(page, "calibrate one now, to its result"):
+        page.click(".hx-tabs >> text=Heliostat")
+        page.click("text=Calibrate now")
+        page.wait_for_selector("h3:has-text('Calibration under way')")
+        page.wait_for_selector("h3:has-text('Last calibration')")
+        page.wait_for_selector(".hx-result dt:has-text('Beam error before')")
+    (last, *_) = sorted(
+        field.call(lambda: field.live.operations.viewer.heliostat(name)).results,
+        key=lambda entry: -entry.at,
+    )
+    assert f"{1e3 * last.after:.2f} mrad" in page.inner_text(".hx-result")
+    assert last.text in page.inner_text(".hx-result")

@@ -93,7 +93,8 @@ export function heliostat(box) {
     }
     const name = encodeURIComponent(store.field.names[store.focus]);
     const [one, why, kept] = await Promise.all([api("GET", `heliostats/${name}`), api("GET", `heliostats/${name}/why`), api("GET", `photographs?heliostat=${name}&limit=40`)]);
-    body.replaceChildren(...heliostatView(one, why), ...keptView(kept, one.history));
+    const ticket = await askedFor(one.name);
+    body.replaceChildren(...heliostatView(one, why, calibrationView(one, kept, ticket)), ...keptView(kept, one.history));
     const canvas = body.querySelector("canvas");
     if (canvas && one.history.length) chart(canvas, [
       { points: one.history.map((s) => [s.at, 1e3 * s.error]), colour: colourOf("APPROACHING"), dots: true },
@@ -123,15 +124,44 @@ function whyView(why) {
     ...why.alarms.map((a) => h("p", { className: severe[a.severity] ?? "" }, a.text)));
 }
 
-function heliostatView(one, why) {
+// Calibrations asked for on this page, by heliostat, followed to their ends.
+const asked = new Map();
+async function calibrate(name, search) {
+  const ticket = await api("POST", "calibration/next", search ? { heliostat: name, search } : { heliostat: name });
+  asked.set(name, { identity: ticket.identity, since: store.head.utc });
+  return ticket;
+}
+async function askedFor(name) {
+  const known = asked.get(name);
+  if (!known) return null;
+  return { ...known, ...await api("GET", `commands/${encodeURIComponent(known.identity)}`).catch(() => ({ finished: true, text: "" })) };
+}
+
+// How far a calibration is that was asked for; then its result, with the first and the last photograph of its visit.
+function calibrationView(one, kept, ticket) {
+  const running = ticket && !ticket.finished, [last, before] = one.results.toSorted((a, b) => b.at - a.at);
+  const parts = ticket && (running || !ticket.good) && ticket.text ? [h("p", { className: running ? "" : "bad", role: "status" }, running ? h("progress", {}) : "", " ", ticket.text, running ? ` (${span(store.head.utc - ticket.since)})` : "")] : [];
+  if (last && !running) {
+    const mine = kept.filter((p) => p.at <= last.at + 1 && p.at > (before?.at ?? 0)).toSorted((a, b) => a.at - b.at), pictures = [...new Set([mine[0], mine.at(-1)])].filter(Boolean);
+    const sighting = (p) => one.history.find((s) => Math.abs(s.at - p.at) < 0.5);
+    parts.push(facts([[t("Result"), last.outcome.replaceAll("_", " "), last.outcome === "calibrated" ? "" : "warn"], [t("At"), `${moment(last.at)}, ${last.target}`], [t("Beam error before"), `${mrad(last.before)} mrad`], [t("after"), `${mrad(last.after)} mrad`], [t("Photographs used"), count(last.new)]]),
+      h("p", { className: "hx-hint" }, last.text),
+      pictures.length ? h("div", { className: "hx-two" }, pictures.map((p, i) => h("figure", {}, h("a", { href: `/api/v1/photographs/${p.identity}`, target: "_blank", rel: "noopener" }, h("img", { src: `/api/v1/photographs/${p.identity}`, alt: t("Photograph of {target} at {at}", { target: p.target, at: clock(p.at) }), loading: "lazy" })),
+        h("figcaption", { className: "hx-hint" }, `${i ? t("last") : t("first")}, ${clock(p.at)}${sighting(p) ? `, ${mrad(sighting(p).error)} mrad` : ""}`)))) : "");
+  }
+  return parts.length ? h("section", { className: "hx-result" }, h("h3", {}, running ? t("Calibration under way") : t("Last calibration")), parts) : "";
+}
+
+function heliostatView(one, why, calibration) {
   const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none" : p.map((v) => number(v, 1)).join(", "));
   return [
     h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
     whyView(why),
     canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: "Automatic control calibrates it as soon as a target is free",
-      onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name }), `calibrate ${one.name}`) }, "Calibrate now"),
+      onclick: () => act(() => calibrate(one.name, false), `calibrate ${one.name}`) }, "Calibrate now"),
     h("button", { className: "hx-button", title: "Automatic control searches its beam on a target until the camera sees it move with its aim; nothing is changed",
-      onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name, search: true }), `search ${one.name}`) }, "Search its beam")) : "",
+      onclick: () => act(() => calibrate(one.name, true), `search ${one.name}`) }, "Search its beam")) : "",
+    calibration,
     facts([["Cluster", one.cluster], ["Heard", one.live ? `${number(one.age, 1)} s ago` : `${span(one.age)} ago`],
       ["Fault", one.live ? one.fault : "unknown", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
       ["Aim E, N, U (m)", point(one.aim)], ["Standby E, N, U (m)", point(one.standby)],
