@@ -117,3 +117,42 @@ def test_calibrate_now_shows_its_progress_and_its_result(
     )
     assert f"{1e3 * last.after:.2f} mrad" in page.inner_text(".hx-result")
     assert last.text in page.inner_text(".hx-result")
+
+
+def test_aim_a_group_at_a_point_of_the_flux_picture(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    names, operations = field.live.names[6:8], field.live.operations
+    receiver = operations.plant.design.receivers[0]
+    page = enter("operator")
+    page.click(".hx-authority >> text=Take command")
+    page.wait_for_selector(".hx-authority >> text=You have command")
+    page.fill(".hx-query", " ".join(names))
+    page.keyboard.press("Enter")
+    page.wait_for_selector("dt:has-text('Intercept')")
+    with task(page, "aim a group at a point of the receiver"):
+        flux = page.locator(".hx-flux")
+        box = flux.bounding_box()
+        # A quarter of the picture right of its middle, which ends 84 px before the canvas.
+        flux.click(position={"x": 0.75 * (box["width"] - 84), "y": 0.5 * (box["height"] - 22)})
+        page.wait_for_selector("dialog h2:has-text('Aim: 2 heliostats')")
+        page.click("dialog button >> text='Aim'")
+        said(page, "AIM")
+    # The picture shows more than the aperture: half a cell beyond the outermost centres.
+    right = operations.receiver_flux(receiver.name).right
+    wanted = receiver.point(0.5 * (right[-1] + 0.5 * (right[1] - right[0])), 0.0)
+    field.until(
+        lambda: all(
+            abs(operations.viewer.heliostat(name).aim - wanted).max() < 0.05 for name in names
+        )
+    )
+    page.click(".hx-orders >> text=Aim…")
+    page.select_option("dialog [name=where]", receiver.name)
+    page.fill("dialog [name=right]", "99")
+    page.click("dialog button >> text='Aim'")
+    said(page, "a point 99 m right of its middle is not on it; give at most")
+    page.click(".hx-orders >> text=Aim…")
+    page.select_option("dialog [name=where]", "standby")
+    page.click("dialog button >> text='Aim'")
+    said(page, "IDLE")
+    page.click(".hx-authority >> text=Release")

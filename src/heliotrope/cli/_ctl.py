@@ -455,14 +455,34 @@ def command(
 @app.command()
 def aim(
     context: typer.Context,
-    where: Annotated[str, typer.Argument(help="A receiver, a target, or east,north,up in m.")],
+    where: Annotated[
+        str, typer.Argument(help="A receiver, a target, standby, or east,north,up in m.")
+    ],
     heliostats: Whom = None,
     everybody: All = False,
+    right: Annotated[
+        float | None,
+        typer.Option(
+            min=-1e5,
+            max=1e5,
+            help="On the unrolled receiver, right of its middle as seen from outside, m.",
+            show_default=False,
+        ),
+    ] = None,
+    up: Annotated[
+        float | None,
+        typer.Option(min=-1e5, max=1e5, help="The same above its middle, m.", show_default=False),
+    ] = None,
     wait: Wait = 60.0,
 ) -> None:
-    """Aim heliostats at a receiver, a target or a point."""
+    """Aim heliostats at a receiver or a point of it, a target, standby or a point."""
     names = _names(heliostats, everybody)
     order: dict[str, Any] = {"heliostats": names, "where": where}
+    if where == "standby":
+        _give(context, "IDLE", names, (), wait)
+        return
+    if right is not None or up is not None:
+        order |= {"right": right or 0.0, "up": up or 0.0}
     if "," in where:
         if not names:
             raise InputError("ctl: a point needs named heliostats, not --all")

@@ -2,7 +2,7 @@
 import { api, me, store } from "./live.js";
 import { cividis, colourOf, dark } from "./palette.js";
 import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, span, table } from "./dom.js";
-import { act } from "./orders.js";
+import { act, aim } from "./orders.js";
 import { markCorners } from "./marking.js";
 import { compareVersions } from "./versions.js";
 import { t } from "./words.js";
@@ -17,10 +17,12 @@ const SENSORS = { dni: ["Direct sunlight", "W/m²", 1, 0], receiver_flux_nominal
 
 export function plant(box) {
   const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), sensors = h("div");
-  const name = store.field.receivers[0];
-  const figures = h("div");
+  const { receivers } = store.field, figures = h("div");
+  let [name] = receivers;
+  const choice = h("select", { ariaLabel: t("Receiver"), onchange: () => { name = choice.value; predict(); } }, receivers.map((one) => h("option", { value: one }, one)));
   box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light, sensors,
-    ...(name ? [h("h3", {}, `Predicted flux on ${name}`), figures, flux] : []));
+    ...(name ? [h("h3", {}, t("Predicted flux on {name}", { name: receivers.length > 1 ? "" : name })), receivers.length > 1 ? choice : "", figures, flux,
+      canCommand() ? h("p", { className: "hx-hint" }, t("Click on the picture to aim the heliostats of the scope at that point.")) : ""] : []));
   let seen = null;
   const show = () => {
     const head = store.head;
@@ -48,16 +50,30 @@ export function plant(box) {
   };
   const draw = () => { if (seen) drawFlux(flux, seen); };
   const off = [store.on("frame", show), store.on("theme", () => { show(); draw(); })];
-  if (name) off.push(refreshed(async () => {
+  const predict = async () => {
     seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`);
     const peak = Math.max(0, ...seen.flux.flat());
     figures.replaceChildren(facts([["Power", `${number(seen.power / 1e6, 2)} MW`],
       ["Intercept", seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],
       ["Peak", `${number(peak / 1e3, 0)} kW/m²`], ["Heliostats on it", count(seen.heliostats)]]));
     draw();
-  }, { every: 10 }));
+  };
+  if (name) off.push(refreshed(predict, { every: 10 }));
+  flux.onclick = (event) => {
+    const point = seen && canCommand() ? fluxPoint(flux, seen, event) : null;
+    if (point) aim(seen.receiver, ...point);
+  };
   show();
   return () => off.forEach((end) => end());
+}
+
+const halfOf = (centres) => centres.at(-1) + 0.5 * (centres[1] - centres[0]);
+
+// The point of the unrolled receiver under the pointer, m right of and above its middle; null beside the picture.
+function fluxPoint(canvas, view, event) {
+  const box = canvas.getBoundingClientRect(), scale = canvas.width / box.width;
+  const x = ((event.clientX - box.left) * scale) / (canvas.width - 84), y = ((event.clientY - box.top) * scale) / (canvas.height - 22);
+  return x >= 0 && x <= 1 && y >= 0 && y <= 1 ? [(2 * x - 1) * halfOf(view.right), (1 - 2 * y) * halfOf(view.up)] : null;
 }
 
 function drawFlux(canvas, view) {
@@ -77,8 +93,7 @@ function drawFlux(canvas, view) {
   for (let i = 0; i < high; i++) { c.fillStyle = `rgb(${cividis(1 - i / high).join(",")})`; c.fillRect(wide + 12, i, 12, 1); }
   c.fillStyle = ink; c.font = "11px system-ui, sans-serif"; c.textAlign = "left";
   c.fillText(`${(peak / 1e3).toFixed(0)}`, wide + 28, 10); c.fillText("kW/m²", wide + 28, 24); c.fillText("0", wide + 28, high);
-  const half = (a) => a.at(-1) + 0.5 * (a[1] - a[0]);
-  c.fillText(`${(2 * half(view.right)).toFixed(1)} × ${(2 * half(view.up)).toFixed(1)} m, seen from the field`, 0, high + 16);
+  c.fillText(`${(2 * halfOf(view.right)).toFixed(1)} × ${(2 * halfOf(view.up)).toFixed(1)} m, seen from the field`, 0, high + 16);
 }
 
 export function heliostat(box) {

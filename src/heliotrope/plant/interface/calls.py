@@ -421,12 +421,17 @@ def one_command(desk: Desk, order: orders.OneCommand) -> TicketState:
 
 @_call("POST aim", "commands", OPERATOR, body=orders.AimOrder, pack=orders.pack_points)
 def aim(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> Later[TicketState]:
-    """Aim heliostats at a receiver or a target by name, or at points."""
+    """Aim heliostats at a receiver or a target by name, or at points.
+
+    `right` and `up`: a point of the unrolled receiver, m from its middle as seen from outside.
+    """
     if bool(order.where) == bool(order.points):
         raise InputError("aim: give either where (a receiver or target) or points")
     here, token = desk.operations, desk.token_of(who)
+    placed = order.right is not None or order.up is not None
+    place = (order.right or 0.0, order.up or 0.0) if placed else None
     if order.where:
-        ticket = here.aim_at(who, token, order.heliostats, order.where)
+        ticket = here.aim_at(who, token, order.heliostats, order.where, place)
     else:
         ticket = here.aim(who, token, orders.points_of(order, blob))
     return Later(lambda: desk.recorded(ticket))

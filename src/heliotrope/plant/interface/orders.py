@@ -278,9 +278,14 @@ class CommandOrder(SomeHeliostats):
 
 
 class AimOrder(SomeHeliostats):
-    """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m."""
+    """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m.
+
+    `right` and `up`: place on the unrolled receiver from its middle as seen from outside, m.
+    """
 
     where: Words = ""
+    right: Coordinate | None = None
+    up: Coordinate | None = None
     points: Points = {}
 
 
@@ -294,6 +299,8 @@ class PointsOrder(SomeHeliostats):
     """`AimOrder` or `StandbyOrder` on its way: names of the points in the blob."""
 
     where: Words = ""
+    right: Coordinate | None = None
+    up: Coordinate | None = None
     points: Names = []
 
 

@@ -577,17 +577,44 @@ class Operations:
         self._told(person, ticket)
         return ticket
 
-    def aim_at(self, person: Person, token: int, heliostats: Sequence[str], where: str) -> Ticket:
-        """Aim heliostats at a receiver (as the design says) or at a target, by its name.
+    def aim_at(
+        self,
+        person: Person,
+        token: int,
+        heliostats: Sequence[str],
+        where: str,
+        place: tuple[float, float] | None = None,
+    ) -> Ticket:
+        """Aim heliostats at a receiver or target by its name, or at a point of a receiver.
+
+        Parameters
+        ----------
+        person, token
+            The person commanding, and the token of the command authority.
+        heliostats
+            Names; () for all.
+        where
+            Receiver or target: the first receiver as the design says, others at their centres.
+        place
+            Point of the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
 
         Raises
         ------
+        InputError
+            If the point is not on the receiver, or ``where`` is a target.
         UnknownNameError
             If there is no receiver or target of that name.
         """
         names = tuple(heliostats) or self.names
-        if where in self.receivers:
+        points: Mapping[str, npt.ArrayLike]
+        if place is not None:
+            if where not in self.receivers:
+                raise InputError(f"aim: right and up are of a receiver, and {where!r} is none")
+            points = dict.fromkeys(names, self.plant.design.receiver(where).point(*place))
+        elif where in self.receivers[:1]:
             points = self.plant.default_aims(names)
+        elif where in self.receivers:
+            points = dict.fromkeys(names, self.plant.design.receiver(where).center)
         elif where in self.targets:
             center = self.plant.design.target(where).center
             points = dict.fromkeys(names, center)

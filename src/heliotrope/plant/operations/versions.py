@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliotrope import sun
-from heliotrope.geometry import FloatArray, reflect
+from heliotrope.geometry import FloatArray, as_float, reflect
 from heliotrope.mechanism import track
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import TrackingStatus
@@ -95,4 +95,4 @@ def beam_change(
     path, away = reflect(suns, pose.normal), aim - pose.vertex
     missed = np.linalg.norm(np.cross(path, away), axis=-1)
     tracks = found.chosen(found.status) == TrackingStatus.OK.value
-    return np.asarray(np.where(tracks, missed, np.nan))
+    return as_float(np.where(tracks, missed, np.nan))
