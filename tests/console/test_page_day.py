@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER, said, task
+from support.pages import NEEDS_BROWSER, orders_counted, said, task, until
 
 pytestmark = NEEDS_BROWSER
 
@@ -156,3 +156,25 @@ def test_aim_a_group_at_a_point_of_the_flux_picture(
     page.click("dialog button >> text='Aim'")
     said(page, "IDLE")
     page.click(".hx-authority >> text=Release")
+
+
+def test_the_wall_screen_has_nothing_to_click_but_emergency(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page = enter("viewer", viewport={"width": 1920, "height": 1080})
+    page.goto(f"{field.address}wall")
+    page.wait_for_selector(".hx-large dd:has-text('MW')")
+    page.wait_for_selector(".hx-legend b")
+    until(page, "heliotrope.store.live")
+    page.wait_for_selector(".hx-side >> text=/No alarms|▲|○/")
+    page.mouse.click(600, 500)
+    assert not page.evaluate("heliotrope.store.selection.size")
+    focused = []
+    for _ in range(3):
+        page.keyboard.press("Tab")
+        focused.append(page.evaluate("document.activeElement.id || 'none'"))
+    assert set(focused) <= {"emergency", "none"}
+    words = orders_counted(page)
+    page.click("#emergency")
+    page.wait_for_selector("#emergency-said:has-text('ordered: DEFOCUS')")
+    assert len(words) == 1

@@ -21,7 +21,13 @@ _KINDS = {
     ".svg": "image/svg+xml",
 }
 #: Address and file of each page but the sign-in's.
-PAGES = {"/": "console", "/emergency": "emergency", "/account": "account", "/report": "report"}
+PAGES = {
+    "/": "console",
+    "/emergency": "emergency",
+    "/account": "account",
+    "/report": "report",
+    "/wall": "wall",
+}
 #: What stands in the HTML for the folder of the files.
 _FOLDER = "/console/static/"
 

@@ -1,8 +1,9 @@
 // The tabs of the page.
 import { api, me, store } from "./live.js";
-import { cividis, colourOf, dark } from "./palette.js";
+import { colourOf, dark } from "./palette.js";
 import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, span, table } from "./dom.js";
 import { act, aim } from "./orders.js";
+import { drawFlux, fluxPoint } from "./showing.js";
 import { markCorners } from "./marking.js";
 import { compareVersions } from "./versions.js";
 import { t } from "./words.js";
@@ -65,35 +66,6 @@ export function plant(box) {
   };
   show();
   return () => off.forEach((end) => end());
-}
-
-const halfOf = (centres) => centres.at(-1) + 0.5 * (centres[1] - centres[0]);
-
-// The point of the unrolled receiver under the pointer, m right of and above its middle; null beside the picture.
-function fluxPoint(canvas, view, event) {
-  const box = canvas.getBoundingClientRect(), scale = canvas.width / box.width;
-  const x = ((event.clientX - box.left) * scale) / (canvas.width - 84), y = ((event.clientY - box.top) * scale) / (canvas.height - 22);
-  return x >= 0 && x <= 1 && y >= 0 && y <= 1 ? [(2 * x - 1) * halfOf(view.right), (1 - 2 * y) * halfOf(view.up)] : null;
-}
-
-function drawFlux(canvas, view) {
-  const rows = view.flux.length, columns = view.flux[0].length, peak = Math.max(1, ...view.flux.flat());
-  const c = canvas.getContext("2d"), high = 190, aspect = (view.right.at(-1) - view.right[0]) / Math.max(0.1, view.up.at(-1) - view.up[0]);
-  const room = canvas.parentElement.clientWidth - 90, wide = Math.round(Math.max(120, Math.min(room, high * aspect)));
-  canvas.width = wide + 84; canvas.height = high + 22;
-  const image = new ImageData(columns, rows);
-  for (let y = 0; y < rows; y++) for (let x = 0; x < columns; x++) {
-    const [r, g, b] = cividis(view.flux[rows - 1 - y][x] / peak);
-    image.data.set([r, g, b, 255], 4 * (y * columns + x));
-  }
-  const small = h("canvas", { width: columns, height: rows });
-  small.getContext("2d").putImageData(image, 0, 0);
-  c.drawImage(small, 0, 0, wide, high);
-  const ink = dark() ? "#c9d1d9" : "#24292f";
-  for (let i = 0; i < high; i++) { c.fillStyle = `rgb(${cividis(1 - i / high).join(",")})`; c.fillRect(wide + 12, i, 12, 1); }
-  c.fillStyle = ink; c.font = "11px system-ui, sans-serif"; c.textAlign = "left";
-  c.fillText(`${(peak / 1e3).toFixed(0)}`, wide + 28, 10); c.fillText("kW/m²", wide + 28, 24); c.fillText("0", wide + 28, high);
-  c.fillText(`${(2 * halfOf(view.right)).toFixed(1)} × ${(2 * halfOf(view.up)).toFixed(1)} m, seen from the field`, 0, high + 16);
 }
 
 export function heliostat(box) {

@@ -71,7 +71,7 @@ def suns_of_day(at: float, site: Site) -> FloatArray:
     """Return unit vectors to the suns of a day (UTC, with a time in it, POSIX s) above 10°."""
     times = at // _DAY * _DAY + np.arange(0.0, _DAY, _STEP)
     found = sun.vector(times, site)
-    return found[found[:, 2] > np.sin(_LOWEST)]
+    return as_float(found[found[:, 2] > np.sin(_LOWEST)])
 
 
 def beam_change(
