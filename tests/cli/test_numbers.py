@@ -78,6 +78,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "ctl command": ("GOTO", "A1"),
     "ctl aim": ("0,0,10", "A1"),
     "ctl versions": ("A1", "1"),
+    "ctl trend": (),
     "ctl journal": (),
     "ctl calibrate": ("A1",),
     "ctl parameters": ("A1",),

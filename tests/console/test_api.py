@@ -71,6 +71,8 @@ NEEDED = {
     ("GET", "journal"): "viewer",
     ("GET", "heliostats/{name}/versions"): "viewer",
     ("GET", "report"): "viewer",
+    ("GET", "trends"): "viewer",
+    ("GET", "trend"): "viewer",
     ("POST", "notes"): "operator",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",

@@ -178,3 +178,32 @@ def test_the_wall_screen_has_nothing_to_click_but_emergency(
     page.click("#emergency")
     page.wait_for_selector("#emergency-said:has-text('ordered: DEFOCUS')")
     assert len(words) == 1
+
+
+def test_trends_are_zoomed_moved_and_saved(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    field.until(lambda: produced(field))
+    page = enter("viewer", viewport={"width": 1440, "height": 900})
+    page.goto(f"{field.address}trends")
+    page.wait_for_selector(".hx-trend .u-over")
+    with page.expect_download() as saved:
+        page.click("text=Save as CSV")
+    lines = saved.value.path().read_text().splitlines()
+    assert lines[0].startswith("time,power.receiver low (MW)")
+    assert len(lines) > 2
+    with task(page, "a second quantity, zoomed by a drag"):
+        page.select_option("[aria-label=Quantity]", "available")
+        page.click("text='Add'")
+        page.wait_for_selector(".hx-trend h2:has-text('available')")
+        asked = "new URLSearchParams(location.search).get('{}')"
+        width = f"{asked.format('until')} - {asked.format('since')}"
+        before = page.evaluate(width)
+        box = page.locator(".hx-trend .u-over").first.bounding_box()
+        y = box["y"] + 0.5 * box["height"]
+        page.mouse.move(box["x"] + 0.9 * box["width"], y)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.999 * box["width"], y, steps=4)
+        page.mouse.up()
+        until(page, f"{width} < {0.2 * before}")
+    page.click("[aria-label=Earlier]")
+    page.click("[aria-label='Remove available']")
+    page.wait_for_selector(".hx-trend h2:has-text('available')", state="detached")

@@ -5,14 +5,17 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from heliotrope.calibration.record import CalibrationOutcome
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.plant.operations.report import period, report
+from heliotrope.plant.operations.trends import quantities, trend
 from heliotrope.safety import Alarm, Severity
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import NOTE, Event, PlantFigures, VisitEntry
+from heliotrope.store.telemetry import Look, Telemetry
 
 START = datetime(2026, 6, 21, 6, tzinfo=UTC).timestamp()
 
@@ -76,3 +79,45 @@ def test_a_time_ends_after_it_begins_and_is_at_most_a_month() -> None:
     for since, until in ((START, START), (START - 32 * 86_400.0, 0.0)):
         with pytest.raises(InputError, match="at most 31 days"):
             period(since, until, START)
+
+
+def test_a_trend_is_thinned_to_intervals_with_their_extremes(
+    keeper: Keeper, tmp_path: Path
+) -> None:
+    for minute in range(600):
+        keeper.record(PlantFigures(START + 60.0 * minute, {"power.R": float(minute)}))
+    found = trend(keeper, None, "power.R", "", START, START + 36_000.0, 10)
+    assert (found.unit, len(found.at)) == ("W", 10)
+    assert found.low[0] == 0.0
+    assert found.high[0] == 59.0
+    assert found.mean[0] == pytest.approx(29.5)
+    assert found.high[-1] == 599.0
+    whole = trend(keeper, None, "power.R", "", START, START + 300.0, 10)
+    assert whole.mean.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert [one.name for one in quantities(keeper, START + 600.0)][:1] == ["power.R"]
+
+
+def test_a_trend_of_one_heliostat_comes_from_its_visits_and_its_telemetry(
+    keeper: Keeper, tmp_path: Path
+) -> None:
+    keeper.record(
+        VisitEntry("A", "west", START, START + 9.0, CalibrationOutcome.CALIBRATED, error_after=1e-3)
+    )
+    found = trend(keeper, None, "error_after", "A", START, START + 60.0, 10)
+    assert (found.at.tolist(), found.mean.tolist()) == ([START + 9.0], [1e-3])
+    kept = Telemetry(tmp_path / "telemetry", ["A", "B"], ["STOWED"], inline=True)
+    zeros = np.zeros(2, np.uint8)
+    for minute in range(3):
+        counts = np.array([[100 + minute, 7], [0, 0]], np.int32)
+        look = Look(zeros, zeros, zeros.astype(np.uint16), counts, np.zeros(2))
+        kept.take(START + 60.0 * minute, look)
+    kept.close()
+    found = trend(keeper, kept.folder, "primary", "A", START, START + 120.0, 10)
+    assert (found.at - START).tolist() == [0.0, 60.0]
+    assert found.mean.tolist() == [100.0, 101.0]
+    with pytest.raises(InputError, match="archives no telemetry"):
+        trend(keeper, None, "primary", "A", START, START + 120.0, 10)
+    with pytest.raises(UnknownNameError, match="quantity of a heliostat 'mood'"):
+        trend(keeper, None, "mood", "A", START, START + 120.0, 10)
+    with pytest.raises(InputError, match="at most 400 days"):
+        trend(keeper, None, "power.R", "", START, START, 10)

@@ -408,6 +408,45 @@ def _line(one: dict[str, Any]) -> str:
 
 
 @app.command()
+def trend(
+    context: typer.Context,
+    quantity: Annotated[
+        str, typer.Argument(help="Name of a quantity; none: list them.", show_default=False)
+    ] = "",
+    heliostat: Annotated[str, typer.Option(help="Of this heliostat.", show_default=False)] = "",
+    since: Annotated[
+        str, typer.Option(help="From this time, ISO 8601; else a day before.", show_default=False)
+    ] = "",
+    until: Annotated[
+        str, typer.Option(help="Before this time; else now.", show_default=False)
+    ] = "",
+    points: Annotated[int, typer.Option(min=10, max=5000, help="Most points.")] = 1000,
+) -> None:
+    """Print a quantity over time as CSV: least, mean and largest value."""
+    import csv
+    import sys
+    from urllib.parse import urlencode
+
+    with _client(context) as client:
+        if not quantity:
+            rows = [
+                (one["name"], one["unit"], "heliostat" if one["heliostat"] else "plant")
+                for one in client.get("trends")
+            ]
+            print_table(("quantity", "unit", "of"), rows)
+            return
+        asked = {"quantity": quantity, "heliostat": heliostat, "points": points}
+        for name, moment in (("since", since), ("until", until)):
+            if moment:
+                asked[name] = f"{parse_time(moment).timestamp():.3f}"
+        answer = client.get(f"trend?{urlencode(asked)}")
+    columns = [answer[key] for key in ("low", "mean", "high")]
+    rows = list(zip(map(_utc, answer["at"]), *columns, strict=True))
+    head = ("time", *(f"{name} ({answer['unit']})" for name in ("low", "mean", "high")))
+    csv.writer(sys.stdout).writerows((head, *rows))
+
+
+@app.command()
 def note(
     context: typer.Context,
     text: Annotated[str, typer.Argument(help="What the next shift has to know.")],

@@ -26,6 +26,7 @@ PAGES = {
     "/emergency": "emergency",
     "/account": "account",
     "/report": "report",
+    "/trends": "trends",
     "/wall": "wall",
 }
 #: What stands in the HTML for the folder of the files.

@@ -85,7 +85,7 @@ function tabs() {
 
 // The person's menu, which any press elsewhere closes.
 function menu(box) {
-  const does = { ...people, factor: () => location.assign("/account"), wall: () => window.open("/wall", "_blank", "noopener"), async leave() { await api("DELETE", "session"); location.assign("/login"); } };
+  const does = { ...people, factor: () => location.assign("/account"), trends: () => window.open("/trends", "_blank", "noopener"), wall: () => window.open("/wall", "_blank", "noopener"), async leave() { await api("DELETE", "session"); location.assign("/login"); } };
   const summary = box.querySelector("summary");
   summary.textContent = `${me.name} · ${me.role}`;
   for (const item of box.querySelectorAll("button")) {

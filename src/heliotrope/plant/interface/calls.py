@@ -32,6 +32,7 @@ from heliotrope.plant.operations import views
 from heliotrope.plant.operations.marking import MarksView, PictureToMark
 from heliotrope.plant.operations.report import ShiftReport
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.plant.operations.trends import Quantity, Trend
 from heliotrope.plant.operations.typed_parameters import ParametersView
 from heliotrope.plant.operations.versions import ParameterComparison
 from heliotrope.plant.operations.zero import lock_position, zero
@@ -299,6 +300,23 @@ async def report(desk: Desk, order: orders.Period) -> ShiftReport:
     hours. Energy and power are predicted.
     """
     return await desk.operations.report(order.since, order.until)
+
+
+@_call("GET trends", "logs")
+async def trends(desk: Desk) -> tuple[Quantity, ...]:
+    """Return the quantities that have trends, of the plant and of each heliostat."""
+    return await desk.operations.quantities()
+
+
+@_call("GET trend", "logs")
+async def trend(desk: Desk, order: orders.TrendOrder) -> Trend:
+    """Return a quantity over time: least, mean and largest value in intervals.
+
+    `?quantity=power.receiver&since=…&until=…` in POSIX seconds; with `heliostat`, one of its own.
+    """
+    return await desk.operations.trend(
+        order.quantity, order.heliostat, order.since, order.until, order.points
+    )
 
 
 @_call("POST notes", "logs", OPERATOR)

@@ -112,6 +112,14 @@ class Period(Strict):
     until: Moment = 0.0
 
 
+class TrendOrder(Period):
+    """A quantity over a time; `until` 0: now, and `since` 0: a day before."""
+
+    quantity: Annotated[str, Field(min_length=1, max_length=100)]
+    heliostat: Annotated[str, Field(max_length=64)] = ""
+    points: Annotated[int, Field(ge=10, le=5000)] = 1000
+
+
 class NoteOrder(Strict):
     """A note for other people."""
 

@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy.typing as npt
@@ -39,6 +40,7 @@ from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.report import ShiftReport, period, report
 from heliotrope.plant.operations.security import SecurityLog
+from heliotrope.plant.operations.trends import Quantity, Trend, quantities, trend
 from heliotrope.plant.operations.typed_parameters import TypedParameters
 from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
@@ -59,6 +61,7 @@ T = TypeVar("T")
 _TAKES_FROM_AUTOMATIC = messages.having("manual")
 _GIVES_TO_AUTOMATIC = messages.having("automatic")
 
+_DAY = 86_400.0
 #: Time between predictions of the flux, s.
 _FLUX_EVERY = 5.0
 #: Time between looks after the security events, s.
@@ -116,6 +119,8 @@ class Operations:
     ----------
     plant, logbook, automatic, viewer, security, pictures, parameters, marking
         See their classes: whoever reads the plant asks them.
+    telemetry
+        Folder of the telemetry; None: none is archived.
     """
 
     def __init__(
@@ -136,6 +141,7 @@ class Operations:
         self.security = SecurityLog(logbook, plant.clock)
         self.viewer = Viewer(plant, self.automatic)
         self.parameters = TypedParameters(plant, logbook, records)
+        self.telemetry: Path | None = None
         self._history = History(plant, records, self._figures)
         self._records = records
         self._flux: dict[str, _Cached] = {}
@@ -256,6 +262,35 @@ class Operations:
         return await self._read(
             "report",
             lambda records: report(name, records, first, last, now, AUTOMATIC.name),
+        )
+
+    async def quantities(self) -> tuple[Quantity, ...]:
+        """Return the quantities that have trends.
+
+        Raises
+        ------
+        InputError
+            If the plant keeps no records.
+        """
+        now = self.plant.clock.utc().timestamp()
+        return await self._read("trends", lambda records: quantities(records, now))
+
+    async def trend(
+        self, quantity: str, heliostat: str, since: float, until: float, points: int
+    ) -> Trend:
+        """Return a quantity of the plant or of a heliostat over time; see `trends.trend`.
+
+        Without an end: until now; without a beginning: the day before it.
+        """
+        if heliostat:
+            self.plant.field.place(heliostat)
+        until = until or self.plant.clock.utc().timestamp()
+        since = since or until - _DAY
+        return await self._read(
+            "trend",
+            lambda records: trend(
+                records, self.telemetry, quantity, heliostat, since, until, points
+            ),
         )
 
     def note(self, person: Person, text: str) -> None:
