@@ -88,6 +88,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "keys tls": ("none", "--name", "a.example.org"),
     "ctl command": ("GOTO", "A1"),
     "ctl aim": ("0,0,10", "A1"),
+    "ctl versions": ("A1", "1"),
+    "ctl trend": (),
     "ctl journal": (),
     "ctl calibrate": ("A1",),
     "ctl parameters": ("A1",),

@@ -127,6 +127,18 @@ def test_an_earlier_version_is_listed_and_brought_back(tmp_path: Path) -> None:
             bench.plant.authority.keep(ENGINEER, token)
         (earlier,) = (await typed.view(NAME, ENGINEER)).earlier
         assert (earlier.version, earlier.note, earlier.values["tilt_east"]) == (1, "first", 0.004)
+        compared = await typed.compare(NAME, 1, 2)
+        (tilt,) = (one for one in compared.parameters if one.name == "tilt_east")
+        assert (tilt.first, tilt.second, compared.in_use) == (0.004, 0.001, 2)
+        assert tilt.first_sigma == bench.plant.beliefs.nominal(NAME).parameter("tilt_east").prior
+        # A mirror turned by 3 mrad turns its beam by up to twice that.
+        aim = bench.plant.default_aims((NAME,))[NAME]
+        path = np.linalg.norm(aim - bench.plant.beliefs.present(NAME).pose(np.zeros(2)).vertex)
+        assert 0.5 * 3e-3 * path < compared.beam_rms <= compared.beam_most < 2.01 * 3e-3 * path
+        assert (await typed.compare(NAME, 2, 2)).beam_most < 1e-6
+        assert (await typed.compare(NAME, 0, 2)).first.note == "plant file"
+        with pytest.raises(UnknownNameError, match="version of P1A '9'"):
+            await typed.compare(NAME, 1, 9)
         ticket = await typed.restore(ENGINEER, token, NAME, 1, "the level was wrong")
         assert await ticket.end(20.0), ticket.text
         record = bench.plant.beliefs.record(NAME)

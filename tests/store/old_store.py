@@ -35,6 +35,7 @@ NAN = float("nan")
 #: Links hold digests of the records of the other tables; nothing writes "plan"; others came later.
 LATER = (
     "password_due", "second_factor", "recovery_code", "flight", "learning", "outlook", "timetable",
+    "figures",
     "plan",
 )  # fmt: skip
 TABLES = [

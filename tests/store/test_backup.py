@@ -34,6 +34,7 @@ from heliotrope.store.records import (
     LearningEntry,
     Lockout,
     Outlook,
+    PlantFigures,
     StoreError,
     TimetableRecord,
     VisitEntry,
@@ -68,6 +69,7 @@ def fill(keeper: Keeper, seen: Sightings, key_file: Path) -> None:
     keeper.record(LearningEntry("field", 1, 1.0, "anna", 3, 10, 0.5, "{}"))
     keeper.record(Outlook(1.0, 2, 3e-4, None, (FieldPoint(1.0, 1e-3, 2e-3),), "not today"))
     keeper.record(TimetableRecord(1.0, "anna", "[]"))
+    keeper.record(PlantFigures(1.0, {"power.R": 2e6}))
     keeper.record_event(Event(1.0, "test", "hello", values={"x": float("nan")}))
     keeper.record_alarm(Alarm("wind", "", Severity.ALARM, "too much"), 1.0)
     keeper.hold([Lockout(Kind.HELIOSTAT, "B", "anna", "broken", 5.0)])
@@ -232,6 +234,7 @@ def test_a_backup_of_an_earlier_program_is_migrated(tmp_path: Path) -> None:
     file = tmp_path / "backup" / "store.sqlite"
     with closing(sqlite3.connect(file)) as raw:
         raw.execute("DROP TABLE account_link")
+        raw.execute("DROP TABLE figures")
         raw.execute("UPDATE alembic_version SET version_num = '0011'")
         row = (
             hashlib.sha256(token.encode()).hexdigest(),

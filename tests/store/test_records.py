@@ -31,6 +31,7 @@ from heliotrope.store.records import (
     Kind,
     Lockout,
     Outlook,
+    PlantFigures,
     StoreError,
     VisitEntry,
 )
@@ -259,6 +260,30 @@ class TestSchedule:
         confirm(keeper)
         assert keeper.outlooks(5.0) == [better, replace(first, made=6.0)]
         assert keeper.outlooks(5.5) == [replace(first, made=6.0)]
+
+    def test_figures_of_a_time_oldest_first(self, keeper: Keeper) -> None:
+        rows = [PlantFigures(at, {"power.R": at, "reading.dni": math.nan}) for at in (9.0, 5.0)]
+        for row in rows:
+            keeper.record(row)
+        confirm(keeper)
+        first, last = keeper.figures(5.0, 10.0)
+        assert (first.at, last.at, last.values["power.R"]) == (5.0, 9.0, 9.0)
+        assert math.isnan(first.values["reading.dni"])
+        assert [row.at for row in keeper.figures(5.0, 9.0)] == [5.0]
+        keeper.forget_events(6.0)
+        confirm(keeper)
+        assert [row.at for row in keeper.figures(0.0, 99.0)] == [9.0]
+
+    def test_visits_and_alarms_of_a_time(self, keeper: Keeper) -> None:
+        for at in (10.0, 20.0):
+            keeper.record(VisitEntry("A", "west", at - 5, at, CalibrationOutcome.NO_BEAM))
+        keeper.record_alarm(Alarm("wind", "", Severity.ALARM, "gust"), 10.0)
+        keeper.record_alarm(Alarm("wind", "", Severity.ALARM, "", active=False), 15.0)
+        keeper.record_alarm(Alarm("flux", "", Severity.ALARM, "high"), 30.0)
+        confirm(keeper)
+        assert [v.finished for v in keeper.visits(since=15.0, until=25.0)] == [20.0]
+        assert [a.condition for a in keeper.alarms(since=14.0, until=20.0)] == ["wind"]
+        assert [a.condition for a in keeper.alarms(since=16.0, until=31.0)] == ["flux"]
 
     def test_campaigns(self, keeper: Keeper) -> None:
         begun = CampaignEntry("spring", 5.0, model="malan8", expected={"rms": 0.3, "odd": math.nan})

@@ -324,7 +324,9 @@ def journal(
     context: typer.Context,
     since: Annotated[str, typer.Option(help="From this time, ISO 8601.", show_default=False)] = "",
     until: Annotated[str, typer.Option(help="Before this time.", show_default=False)] = "",
-    kind: Annotated[str, typer.Option(help="event, alarm or command.", show_default=False)] = "",
+    kind: Annotated[
+        str, typer.Option(help="event, alarm, command or note.", show_default=False)
+    ] = "",
     person: Annotated[str, typer.Option(help="Person.", show_default=False)] = "",
     heliostat: Annotated[str, typer.Option(help="Heliostat.", show_default=False)] = "",
     text: Annotated[str, typer.Option(help="Text in it, in any case.", show_default=False)] = "",
@@ -354,6 +356,105 @@ def journal(
         print("  ".join(row))
     if not rows:
         print("nothing is found")
+
+
+@app.command()
+def report(
+    context: typer.Context,
+    since: Annotated[
+        str, typer.Option(help="From this time, ISO 8601; else 8 h before.", show_default=False)
+    ] = "",
+    until: Annotated[
+        str, typer.Option(help="Before this time; else now.", show_default=False)
+    ] = "",
+    as_json: Json = False,
+) -> None:
+    """Print the report of a shift: production, availability, calibrations, alarms, work, notes."""
+    given = {"since": since, "until": until}
+    times = [f"{name}={parse_time(at).timestamp():.3f}" for name, at in given.items() if at]
+    with _client(context) as client:
+        answer = client.get("?".join(filter(None, ("report", "&".join(times)))))
+    if as_json:
+        print_json(answer)
+        return
+    print(f"{answer['plant']}, {_utc(answer['since'])} to {_utc(answer['until'])}")
+    hours = answer["recorded"] / 3600.0
+    print(f"figures are kept for {hours:.1f} h of it, {answer['daylight'] / 3600.0:.1f} h by day")
+    for one in answer["production"]:
+        print(
+            f"{one['receiver']}: {one['energy'] / 3.6e9:.3f} MWh predicted, at most "
+            f"{one['peak'] / 1e6:.2f} MW at {_utc(one['peak_at'])}"
+        )
+    if answer["availability"] is not None:
+        print(f"availability {answer['availability']:.1%}; not available:")
+        print_table(
+            ("reason", "heliostat hours"),
+            [(why, "-" if s is None else f"{s / 3600:.1f}") for why, s in answer["lacks"].items()],
+        )
+    rows = [(name.replace("_", " "), str(count)) for name, count in answer["outcomes"].items()]
+    print_table(("visits", "number"), rows, "calibrations")
+    for name in ("alarms", "locks", "work", "notes"):
+        print(f"{name}: {len(answer[name])}")
+        for one in answer[name]:
+            print(f"  {_utc(one.get('at') or one.get('raised') or one['since'])}  {_line(one)}")
+
+
+def _line(one: dict[str, Any]) -> str:
+    """Return an alarm, a lock or an entry of the journal in one line."""
+    if "who" in one:
+        return f"{one['kind']} {one['name']}: {one['reason']} ({one['who']})"
+    over = f"; over at {_utc(one['cleared'])}" if one.get("cleared") else ""
+    return f"{one.get('condition', '')} {one['text']}{over}".strip()
+
+
+@app.command()
+def trend(
+    context: typer.Context,
+    quantity: Annotated[
+        str, typer.Argument(help="Name of a quantity; none: list them.", show_default=False)
+    ] = "",
+    heliostat: Annotated[str, typer.Option(help="Of this heliostat.", show_default=False)] = "",
+    since: Annotated[
+        str, typer.Option(help="From this time, ISO 8601; else a day before.", show_default=False)
+    ] = "",
+    until: Annotated[
+        str, typer.Option(help="Before this time; else now.", show_default=False)
+    ] = "",
+    points: Annotated[int, typer.Option(min=10, max=5000, help="Most points.")] = 1000,
+) -> None:
+    """Print a quantity over time as CSV: least, mean and largest value."""
+    import csv
+    import sys
+    from urllib.parse import urlencode
+
+    with _client(context) as client:
+        if not quantity:
+            rows = [
+                (one["name"], one["unit"], "heliostat" if one["heliostat"] else "plant")
+                for one in client.get("trends")
+            ]
+            print_table(("quantity", "unit", "of"), rows)
+            return
+        asked = {"quantity": quantity, "heliostat": heliostat, "points": points}
+        for name, moment in (("since", since), ("until", until)):
+            if moment:
+                asked[name] = f"{parse_time(moment).timestamp():.3f}"
+        answer = client.get(f"trend?{urlencode(asked)}")
+    columns = [answer[key] for key in ("low", "mean", "high")]
+    rows = list(zip(map(_utc, answer["at"]), *columns, strict=True))
+    head = ("time", *(f"{name} ({answer['unit']})" for name in ("low", "mean", "high")))
+    csv.writer(sys.stdout).writerows((head, *rows))
+
+
+@app.command()
+def note(
+    context: typer.Context,
+    text: Annotated[str, typer.Argument(help="What the next shift has to know.")],
+) -> None:
+    """Keep a note for the next shift, in the journal and the report."""
+    with _client(context) as client:
+        client.ask("POST", "notes", {"text": text})
+    print("noted")
 
 
 @app.command()
@@ -393,14 +494,34 @@ def command(
 @app.command()
 def aim(
     context: typer.Context,
-    where: Annotated[str, typer.Argument(help="A receiver, a target, or east,north,up in m.")],
+    where: Annotated[
+        str, typer.Argument(help="A receiver, a target, standby, or east,north,up in m.")
+    ],
     heliostats: Whom = None,
     everybody: All = False,
+    right: Annotated[
+        float | None,
+        typer.Option(
+            min=-1e5,
+            max=1e5,
+            help="On the unrolled receiver, right of its middle as seen from outside, m.",
+            show_default=False,
+        ),
+    ] = None,
+    up: Annotated[
+        float | None,
+        typer.Option(min=-1e5, max=1e5, help="The same above its middle, m.", show_default=False),
+    ] = None,
     wait: Wait = 60.0,
 ) -> None:
-    """Aim heliostats at a receiver, a target or a point."""
+    """Aim heliostats at a receiver or a point of it, a target, standby or a point."""
     names = _names(heliostats, everybody)
     order: dict[str, Any] = {"heliostats": names, "where": where}
+    if where == "standby":
+        _give(context, "IDLE", names, (), wait)
+        return
+    if right is not None or up is not None:
+        order |= {"right": right or 0.0, "up": up or 0.0}
     if "," in where:
         if not names:
             raise InputError("ctl: a point needs named heliostats, not --all")
@@ -569,6 +690,48 @@ def _show_parameters(answer: dict[str, Any], as_json: bool) -> None:
     ]
     if lines:
         print_table(("earlier version", "time", "person", "sightings", "note"), lines)
+
+
+@app.command()
+def versions(
+    context: typer.Context,
+    heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
+    first: Annotated[int, typer.Argument(min=0, max=1_000_000_000, help="0: the plant file.")],
+    second: Annotated[
+        int | None,
+        typer.Argument(
+            min=0, max=1_000_000_000, help="Else the version in use.", show_default=False
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare two versions of a heliostat's error parameters, and the change of its beam."""
+    path = f"heliostats/{quote(heliostat, safe='')}"
+    with _client(context) as client:
+        if second is None:
+            second = client.get(f"{path}/parameters")["version"]
+        answer = client.get(f"{path}/versions?first={first}&second={second}")
+    if as_json:
+        print_json(answer)
+        return
+    rows = []
+    for one in answer["parameters"]:
+        unit, size = _SHOWN[one["unit"]]
+        values = [one[key] for key in ("first", "first_sigma", "second", "second_sigma")]
+        shown = ["" if v is None else f"{v / size:.3f}" for v in values]
+        change = (one["second"] - one["first"]) / size
+        rows.append((one["name"], *shown, f"{change:+.3f}", unit))
+    for which in ("first", "second"):
+        one = answer[which]
+        at = "" if one["at"] is None else f"{_utc(one['at'])}, {one['sightings']} sightings "
+        print(f"version {one['version']}: {at}{one['person']} {one['note']}".rstrip())
+    head = ("parameter", f"version {first}", "σ", f"version {second}", "σ", "change", "unit")
+    print_table(head, rows, answer["heliostat"])
+    if answer["beam_rms"] is not None:
+        print(
+            f"the beam moves by {1e3 * answer['beam_rms']:.1f} mm RMS at its aim today, at most "
+            f"{1e3 * answer['beam_most']:.1f} mm"
+        )
 
 
 @app.command()

@@ -14,7 +14,21 @@ STATIC = Path(__file__).with_name("static")
 _CLICKING = Path(__file__).parents[1] / "imaging" / "targets" / "clicking.js"
 #: Smaller answers are not compressed, bytes.
 SMALL = 1024
-_KINDS = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+_KINDS = {
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".json": "application/json",
+    ".svg": "image/svg+xml",
+}
+#: Address and file of each page but the sign-in's.
+PAGES = {
+    "/": "console",
+    "/emergency": "emergency",
+    "/account": "account",
+    "/report": "report",
+    "/trends": "trends",
+    "/wall": "wall",
+}
 #: What stands in the HTML for the folder of the files.
 _FOLDER = "/console/static/"
 

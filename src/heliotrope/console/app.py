@@ -17,7 +17,7 @@ from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Resp
 from heliotrope import __version__
 from heliotrope.console import accounts, api, factor
 from heliotrope.console._attempts import SignInFailures
-from heliotrope.console._files import Files, page
+from heliotrope.console._files import PAGES, Files, page
 from heliotrope.console.auth import Caller, Console, introduced
 from heliotrope.console.by_proxy import ByProxy
 from heliotrope.console.connections import FOUND
@@ -46,8 +46,6 @@ ABOUT = (
 )
 
 ROUTERS = (api.router, accounts.router, factor.router)
-#: Address and file of each page but the sign-in's.
-PAGES = {"/": "console", "/emergency": "emergency", "/account": "account"}
 #: Address of the one-time link.
 ENTER = "/enter"
 #: Errors of a request that the answer lists, and their longest texts, characters.

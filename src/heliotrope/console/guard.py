@@ -15,6 +15,7 @@ from starlette.responses import JSONResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from heliotrope.console import bodies
+from heliotrope.console._files import PAGES
 from heliotrope.console.auth import AtLeast, Caller, Console, caller, refused
 from heliotrope.console.connections import FOUND
 from heliotrope.console.edge import Edge
@@ -139,7 +140,7 @@ class Guard:
     def _dress(self, console: Console, scope: Scope, headers: Any) -> None:
         """Add the safe headers."""
         path, policy = scope["path"], POLICY
-        if path in ("/", "/emergency", "/account"):
+        if path in PAGES:
             urgent = _urgent(console, scope)
             policy = policy.replace("connect-src 'self'", f"connect-src 'self' {urgent}")
         headers["Content-Security-Policy"] = policy
@@ -149,7 +150,7 @@ class Guard:
         headers["Cross-Origin-Opener-Policy"] = "same-origin"
         headers["Cross-Origin-Resource-Policy"] = "same-origin"
         headers["Permissions-Policy"] = "camera=(), microphone=(), geolocation=()"
-        if path.startswith("/api/") or path in ("/", "/login", "/enter", "/emergency", "/account"):
+        if path.startswith("/api/") or path in (*PAGES, "/login", "/enter"):
             headers.setdefault("Cache-Control", "no-store")
         if console.settings.tls:
             headers["Strict-Transport-Security"] = "max-age=31536000"
@@ -175,11 +176,11 @@ async def _check_body(scope: Scope, body: bytes) -> None:
 
 def _elsewhere(path: str, who: Caller | None) -> str | None:
     """Return the page to which a caller must go before the one that was asked for."""
-    if path not in ("/", "/account"):
+    if path not in PAGES or path == "/emergency":
         return None
     if who is None or who.by != "session":
         return "/login"
-    return "/account" if who.owes and path == "/" else None
+    return "/account" if who.owes and path != "/account" else None
 
 
 def _is_emergency(scope: Scope) -> bool:

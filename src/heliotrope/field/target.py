@@ -204,6 +204,44 @@ class Receiver(Value):
         normal = normalize(self.normal, f"receiver {self.name}: normal")
         object.__setattr__(self, "normal", normal)
 
+    def point(self, right: float, up: float) -> FloatArray:
+        """Return a point of the surface, ENU m, (3,), by its place on the unrolled surface.
+
+        Parameters
+        ----------
+        right, up
+            Lengths along the surface from its middle as seen from outside, m. The middle of a full
+            cylinder is where its normal points, or north.
+
+        Raises
+        ------
+        InputError
+            If it is not on the surface.
+        """
+        turns = {"convex_cylinder": self.opening_angle, "external_cylinder": 2.0 * np.pi}
+        turn, radius = turns.get(self.kind, 0.0), self.radius or 0.5 * self.width
+        half = 0.5 * (radius * turn if turn else self.width)
+        for word, value, most in (("right", right, half), ("up", up, 0.5 * self.height)):
+            if not abs(value) <= most + 1e-9:
+                raise InputError(
+                    f"receiver {self.name}: a point {value:g} m {word} of its middle is not on it; "
+                    f"give at most {most:.4g} m"
+                )
+        if not turn:
+            return self.face.point((right, up))
+        full = self.kind == "external_cylinder"
+        upright = np.array([0.0, 0.0, 1.0])
+        if full:
+            flat = np.array([*self.normal[:2], 0.0])
+            front = normalize(flat) if np.linalg.norm(flat) > 1e-6 else np.array([0.0, 1.0, 0.0])
+            axis, middle = upright, self.center
+        else:
+            front, axis = self.normal, normalize(upright - self.normal[2] * self.normal)
+            middle = self.center - radius * front
+        angle, side = right / radius, np.cross(axis, front)
+        out = np.cos(angle) * front + np.sin(angle) * side
+        return as_vectors(middle + radius * out + up * axis, "point")
+
     @cached_property
     def face(self) -> Target:
         """The aperture of a planar receiver as a surface that a camera sees.

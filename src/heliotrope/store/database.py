@@ -20,7 +20,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from heliotrope.store.records import StoreError
 
 #: Revision of the tables that this program knows.
-HEAD = "0012"
+HEAD = "0013"
 FILE = "store.sqlite"
 #: Modes of the folders and files of a plant: for its user alone.
 _PRIVATE_FOLDER, PRIVATE = 0o700, 0o600

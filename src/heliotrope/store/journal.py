@@ -7,7 +7,14 @@ from sqlalchemy import ColumnElement, Connection, String, cast, or_, select
 
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
-from heliotrope.store.records import AlarmEntry, AuditEntry, Event, JournalEntry, JournalQuery
+from heliotrope.store.records import (
+    NOTE,
+    AlarmEntry,
+    AuditEntry,
+    Event,
+    JournalEntry,
+    JournalQuery,
+)
 
 _EVENT, _ALARM, _AUDIT = tables.event.c, tables.alarm.c, tables.audit.c
 #: Heliostats of a command that are named; of more, their number is.
@@ -16,8 +23,8 @@ _NAMED = 5
 
 def search(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
     """Return the entries that a query asks for, the latest first."""
-    parts = {"event": _events, "alarm": _alarms, "command": _commands}
-    kinds = [query.kind] if query.kind else parts
+    parts = {"event": _events, "alarm": _alarms, "command": _commands, NOTE: _events}
+    kinds = [query.kind] if query.kind else ["event", "alarm", "command"]
     found = [entry for kind in kinds for entry in parts[kind](connection, query)]
     return sorted(found, key=lambda entry: -entry.at)[: query.limit]
 
@@ -40,15 +47,24 @@ def _events(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
     # An event of a person, or about a heliostat, begins with the name.
     by = [_EVENT.text.istartswith(f"{query.person}: ", autoescape=True)] if query.person else []
     about = _has(query.heliostat, _EVENT.heliostat, _EVENT.text)
+    notes = [_EVENT.source == NOTE] if query.kind == NOTE else []
     wanted = select(tables.event).where(
-        *_within(_EVENT.at, query), *by, *about, *_has(query.text, _EVENT.text, _EVENT.source)
+        *notes,
+        *_within(_EVENT.at, query),
+        *by,
+        *about,
+        *_has(query.text, _EVENT.text, _EVENT.source),
     )
     found = rows.records(
         connection, Event, wanted.order_by(_EVENT.number.desc()).limit(query.limit)
     )
     return [
-        JournalEntry(one.at, "event", one.source, one.text, one.severity.value) for one in found
+        JournalEntry(one.at, _kind(one), one.source, one.text, one.severity.value) for one in found
     ]
+
+
+def _kind(event: Event) -> str:
+    return NOTE if event.source == NOTE else "event"
 
 
 def _alarms(connection: Connection, query: JournalQuery) -> list[JournalEntry]:

@@ -36,6 +36,7 @@ from heliotrope.store.records import (
     LearningEntry,
     Lockout,
     Outlook,
+    PlantFigures,
     StoreError,
     TimetableRecord,
     VisitEntry,
@@ -52,6 +53,7 @@ _FACTS: dict[type[Fact], tuple[Table, Callable[[Connection, Table, list[rows.Row
     LearningEntry: (tables.learning, rows.insert),
     TimetableRecord: (tables.timetable, rows.replace),
     Outlook: (tables.outlook, rows.replace),
+    PlantFigures: (tables.figures, rows.replace),
 }
 #: With more names than this a query reads all rows, which are then filtered.
 _MANY = 500
@@ -295,11 +297,21 @@ class Keeper:
         with self.database.reading() as connection:
             return [Outlook.of(*row) for row in connection.execute(query)]
 
-    def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
-        """Return the measurements, the latest first."""
-        query = select(tables.visit).order_by(tables.visit.c.number.desc()).limit(limit)
+    def figures(self, since: float, until: float) -> list[PlantFigures]:
+        """Return the figures of the plant from a time to before another, oldest first."""
+        f = tables.figures.c
+        query = select(tables.figures).where(f.at >= since, f.at < until).order_by(f.at)
+        return self._records(PlantFigures, query)
+
+    def visits(
+        self, limit: int = 100, heliostat: str = "", *, since: float = 0.0, until: float = 1e11
+    ) -> list[VisitEntry]:
+        """Return the measurements that finished within a time, the latest first."""
+        v = tables.visit.c
+        query = select(tables.visit).where(v.finished >= since, v.finished < until)
+        query = query.order_by(v.number.desc()).limit(limit)
         if heliostat:
-            query = query.where(tables.visit.c.heliostat == heliostat)
+            query = query.where(v.heliostat == heliostat)
         return self._records(VisitEntry, query)
 
     def campaigns(self) -> list[CampaignEntry]:
@@ -370,10 +382,20 @@ class Keeper:
             query = query.where(e.number < before)
         return self._records(Event, query.order_by(e.number.desc()).limit(limit))
 
-    def alarms(self, limit: int = 100, *, standing: bool = False) -> list[AlarmEntry]:
-        """Return alarms, the latest first; with standing, without those over and acknowledged."""
+    def alarms(
+        self,
+        limit: int = 100,
+        *,
+        standing: bool = False,
+        since: float = 0.0,
+        until: float = 1e11,
+    ) -> list[AlarmEntry]:
+        """Return alarms that were active within a time, the latest first; see `Records`."""
         a = tables.alarm.c
-        query = select(tables.alarm).order_by(a.number.desc()).limit(limit)
+        query = select(tables.alarm).where(
+            a.raised < until, a.cleared.is_(None) | (a.cleared >= since)
+        )
+        query = query.order_by(a.number.desc()).limit(limit)
         if standing:
             query = query.where(a.cleared.is_(None) | a.acknowledged.is_(None))
         return self._records(AlarmEntry, query)
@@ -384,7 +406,7 @@ class Keeper:
             return journal.search(connection, query)
 
     def forget_events(self, before: float) -> None:
-        """Remove events and predictions up to a time, and alarms over and acknowledged by then."""
+        """Remove events, predictions and figures up to a time, and alarms over by then."""
         a = tables.alarm.c
         over = and_(a.cleared < before, a.acknowledged < before)
 
@@ -392,6 +414,7 @@ class Keeper:
             chain.forget_events(connection, before)
             connection.execute(delete(tables.alarm).where(over))
             connection.execute(delete(tables.outlook).where(tables.outlook.c.made < before))
+            connection.execute(delete(tables.figures).where(tables.figures.c.at < before))
 
         self.writer.put(work)
 

@@ -395,6 +395,22 @@ class Outlook:
 
 
 @dataclass(frozen=True)
+class PlantFigures:
+    """Figures of the whole plant at one moment.
+
+    Attributes
+    ----------
+    at
+        POSIX s.
+    values
+        Figures by name, SI; NaN where one is not known. See `plant.operations.history`.
+    """
+
+    at: float
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class AuditEntry:
     """One accepted command, as `plant.orders.audit.Record`; times are ISO 8601."""
 
@@ -419,7 +435,7 @@ class JournalQuery:
     since, until
         Times, POSIX s; the later one is excluded.
     kind
-        "event", "alarm" or "command"; "" for all.
+        "event", "alarm", "command" or "note"; "" for all. Notes are events, too.
     person, heliostat, text
         Person, heliostat, and a text in any case; "" for any.
     but
@@ -447,7 +463,7 @@ class JournalEntry:
     at
         POSIX s.
     kind
-        "event", "alarm" or "command".
+        "event", "alarm", "command" or "note".
     what
         Source of an event, condition of an alarm, name of a command.
     text
@@ -463,8 +479,18 @@ class JournalEntry:
     severity: str = ""
 
 
+#: Source of an event that is a person's note.
+NOTE = "note"
 #: A record that is one row of its own table.
-Fact = VisitEntry | CampaignEntry | FlightEntry | LearningEntry | TimetableRecord | Outlook
+Fact = (
+    VisitEntry
+    | CampaignEntry
+    | FlightEntry
+    | LearningEntry
+    | TimetableRecord
+    | Outlook
+    | PlantFigures
+)
 
 
 class Records(Protocol):
@@ -508,7 +534,7 @@ class Records(Protocol):
         ...
 
     def record(self, fact: Fact) -> None:
-        """Record a fact; a campaign, a timetable or an outlook replaces the one of its key."""
+        """Record a fact; those with a time or name as their key replace the one of that key."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -585,8 +611,14 @@ class Records(Protocol):
         """
         ...
 
-    def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
-        """Return the measurements, the latest first."""
+    def figures(self, since: float, until: float) -> list[PlantFigures]:
+        """Return the figures of the plant from a time to before another, oldest first."""
+        ...
+
+    def visits(
+        self, limit: int = 100, heliostat: str = "", *, since: float = 0.0, until: float = 1e11
+    ) -> list[VisitEntry]:
+        """Return the measurements that finished within a time, the latest first."""
         ...
 
     def campaigns(self) -> list[CampaignEntry]:
@@ -620,8 +652,18 @@ class Records(Protocol):
         """Return events of at least a severity, the latest first; before a number if given."""
         ...
 
-    def alarms(self, limit: int = 100, *, standing: bool = False) -> list[AlarmEntry]:
-        """Return alarms, the latest first; with standing, without those over and acknowledged."""
+    def alarms(
+        self,
+        limit: int = 100,
+        *,
+        standing: bool = False,
+        since: float = 0.0,
+        until: float = 1e11,
+    ) -> list[AlarmEntry]:
+        """Return alarms that were active within a time, the latest first.
+
+        With standing, without those over and acknowledged.
+        """
         ...
 
     def journal(self, query: JournalQuery) -> list[JournalEntry]:

@@ -306,6 +306,14 @@ outlook = Table(
     _text("document"),
 )
 
+#: Figures of the whole plant, one row a minute.
+figures = Table(
+    "figures",
+    metadata,
+    Column("at", Double, primary_key=True),
+    Column("values", FiguresByName, nullable=False),
+)
+
 visit = Table(
     "visit",
     metadata,

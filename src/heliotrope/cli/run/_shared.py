@@ -292,6 +292,7 @@ async def archive(live: PlantAssembly, shown: Shown) -> AsyncIterator[None]:
         yield
         return
     kept = Telemetry(shown.data / "telemetry", live.operations.names, states.STATES)
+    live.operations.telemetry = kept.folder
 
     async def look() -> None:
         while True:

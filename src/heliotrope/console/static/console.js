@@ -2,11 +2,13 @@
 import { api, me, rowsWhere, store } from "./live.js";
 import { CLICKS, FieldMap, SHAPES } from "./map.js";
 import { heliostats } from "./table.js";
+import { shift } from "./shift.js";
 import { VIEWS } from "./palette.js";
 import * as panels from "./panels.js";
 import * as people from "./people.js";
 import { act, bar, say, whoCommands } from "./orders.js";
-import { ask, count, degrees, h, span } from "./dom.js";
+import { ask, count, h } from "./dom.js";
+import { alertText, headOf } from "./showing.js";
 
 function map(box) {
   const view = h("select", { title: "Colour by (V)", onchange: () => store.emit("view", view.value) },
@@ -30,23 +32,6 @@ function map(box) {
   new FieldMap(field);
 }
 
-function head(box) {
-  const day = h("b", { className: "hx-day" }), time = h("b"), speed = h("span", { className: "hx-hint" }), sun = h("span", { className: "hx-sun" }), live = h("span", { className: "hx-live" });
-  box.append(h("span", { className: "hx-name" }, store.field.plant), live, day, time, speed, sun);
-  const show = () => {
-    const now = store.head;
-    if (!now) return;
-    day.textContent = now.at.slice(0, 10);
-    time.textContent = `${now.at.slice(11, 19)} UTC`;
-    speed.textContent = Math.abs(now.pace - 1) > 0.05 ? `simulated at ${now.pace.toPrecision(2)} × real time` : "";
-    sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
-  };
-  const mark = () => { live.textContent = store.live ? "● live" : "✕ NOT LIVE"; live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };
-  store.on("frame", show);
-  store.on("live", mark);
-  mark(); show();
-}
-
 function badge(box) {
   store.on("frame", (now) => { box.textContent = now.alarms ? String(now.alarms) : ""; });
 }
@@ -68,12 +53,10 @@ function alert(box) {
   const resume = h("button", { className: "hx-button", onclick: async () => {
     if (await ask("Resume automatic control? It raises the heliostats that it had.", [], "Resume")) await act(() => api("POST", "automatic/resume"), "Resume");
   } }, "Resume");
-  box.append(text, viewer ? "" : back, viewer ? "" : resume);
+  alertText(box, text);
+  box.append(viewer ? "" : back, viewer ? "" : resume);
   store.on("frame", (now) => {
-    box.classList.toggle("on", now.emergency || Boolean(now.resume));
-    box.classList.toggle("waits", !now.emergency);
     back.hidden = !now.emergency || !now.order.calls.length; resume.hidden = now.emergency ? now.order.calls.length > 0 : !now.resume;
-    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)} · ${now.order.basis}${now.order.calls.length ? "" : " · when the causes have gone, Resume ends it and gives the field back to automatic control"}` : now.resume;
   });
 }
 
@@ -88,7 +71,7 @@ function tabs() {
     panel.replaceChildren(box);
     panel.scrollTop = 0;
     panel.ariaLabel = button.firstChild.textContent;
-    end = { ...panels, heliostats }[button.dataset.tab](box);
+    end = { ...panels, heliostats, shift }[button.dataset.tab](box);
   };
   buttons.forEach((button, i) => {
     button.onclick = () => open(button);
@@ -102,7 +85,7 @@ function tabs() {
 
 // The person's menu, which any press elsewhere closes.
 function menu(box) {
-  const does = { ...people, factor: () => location.assign("/account"), async leave() { await api("DELETE", "session"); location.assign("/login"); } };
+  const does = { ...people, factor: () => location.assign("/account"), trends: () => window.open("/trends", "_blank", "noopener"), wall: () => window.open("/wall", "_blank", "noopener"), async leave() { await api("DELETE", "session"); location.assign("/login"); } };
   const summary = box.querySelector("summary");
   summary.textContent = `${me.name} · ${me.role}`;
   for (const item of box.querySelectorAll("button")) {
@@ -127,8 +110,8 @@ store.confirm = async () => {
 };
 menu(part("menu"));
 bar(part("bar"));
-store.begun.then(() => {
-  map(part("map")); head(part("head")); whoCommands(part("authority")); alert(part("alert")); badge(part("badge"));
+store.start().then(() => {
+  map(part("map")); headOf(part("head")); whoCommands(part("authority")); alert(part("alert")); badge(part("badge"));
   tabs();
 });
 

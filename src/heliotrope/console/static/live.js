@@ -114,7 +114,6 @@ class Store extends EventTarget {
 }
 
 export const store = new Store();
-store.begun = Promise.resolve().then(() => store.start());
 
 export class ApiError extends Error {
   constructor(status, text) { super(text); this.status = status; }

@@ -1,6 +1,7 @@
 // The command bar: scope, command, result. Everything goes through the API.
 import { api, me, store } from "./live.js";
 import { ask, count, h } from "./dom.js";
+import { t } from "./words.js";
 
 export const say = (text, bad) => store.emit("said", { text, bad });
 
@@ -79,6 +80,18 @@ async function lockPosition() {
   if (sure) await act(() => api("POST", "commands", { command: "LOCK_POSITION", heliostats: [name] }), `Lock position ${name}`);
 }
 
+// At a receiver, a target, standby, or a point of the unrolled receiver (as the flux picture gives it).
+export async function aim(where, right, up) {
+  const places = [...store.field.receivers, ...store.field.targets], standby = t("standby"), at = (value) => (value === undefined ? "" : value.toFixed(2));
+  await order("AIM", t("Aim"), (heliostats, v) => {
+    if (v.where === standby) return plainly("IDLE")(heliostats);
+    const point = v.right || v.up ? { right: Number(v.right), up: Number(v.up) } : {};
+    return api("POST", "aim", { heliostats, where: v.where, ...point });
+  }, [{ name: "where", label: t("At"), options: where ? [where] : [...places, standby] },
+    { name: "right", label: t("On a receiver: right of its middle, seen from outside (m)"), type: "number", value: at(right), required: false },
+    { name: "up", label: t("above its middle (m)"), type: "number", value: at(up), required: false }]);
+}
+
 const plainly = (name) => (heliostats) => api("POST", "commands", { command: name, heliostats });
 const ORDERS = [
   ["Stow", "S", (f) => order("STOW", "Stow", (heliostats) => api("POST", "stow", { heliostats })), "safe"],
@@ -87,8 +100,7 @@ const ORDERS = [
   ["Track", "", () => order("TRACK", "Track", plainly("TRACK"), null, true)],
   ["Standby", "", () => order("IDLE", "Standby", plainly("IDLE"))],
   ["Refocus", "", () => order("REFOCUS", "Refocus", plainly("REFOCUS"), null, true)],
-  ["Aim…", "", () => order("AIM", "Aim", (heliostats, v) => api("POST", "aim", { heliostats, where: v.where }),
-    [{ name: "where", label: "At", options: [...store.field.receivers, ...store.field.targets] }])],
+  ["Aim…", "", () => aim()],
   ["Jog…", "", () => order("JOG", "Jog", (heliostats, v) => api("POST", "commands", { command: "JOG", heliostats, values: [v.axis === "primary" ? 0 : 1, Number(v.steps)] }),
     [{ name: "axis", label: "Axis", options: ["primary", "secondary"] }, { name: "steps", label: "Steps (up and east positive)", type: "number", value: "100" }]), "engineer"],
   ["Lock", "", () => order("LOCK", "Lock", plainly("LOCK"))],

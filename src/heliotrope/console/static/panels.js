@@ -1,9 +1,12 @@
 // The tabs of the page.
 import { api, me, store } from "./live.js";
-import { cividis, colourOf, dark } from "./palette.js";
+import { colourOf, dark } from "./palette.js";
 import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, span, table } from "./dom.js";
-import { act } from "./orders.js";
+import { act, aim } from "./orders.js";
+import { drawFlux, fluxPoint } from "./showing.js";
 import { markCorners } from "./marking.js";
+import { compareVersions } from "./versions.js";
+import { t } from "./words.js";
 
 const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
 const canCommand = () => me.role !== "viewer";
@@ -15,10 +18,12 @@ const SENSORS = { dni: ["Direct sunlight", "W/m²", 1, 0], receiver_flux_nominal
 
 export function plant(box) {
   const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), sensors = h("div");
-  const name = store.field.receivers[0];
-  const figures = h("div");
+  const { receivers } = store.field, figures = h("div");
+  let [name] = receivers;
+  const choice = h("select", { ariaLabel: t("Receiver"), onchange: () => { name = choice.value; predict(); } }, receivers.map((one) => h("option", { value: one }, one)));
   box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light, sensors,
-    ...(name ? [h("h3", {}, `Predicted flux on ${name}`), figures, flux] : []));
+    ...(name ? [h("h3", {}, t("Predicted flux on {name}", { name: receivers.length > 1 ? "" : name })), receivers.length > 1 ? choice : "", figures, flux,
+      canCommand() ? h("p", { className: "hx-hint" }, t("Click on the picture to aim the heliostats of the scope at that point.")) : ""] : []));
   let seen = null;
   const show = () => {
     const head = store.head;
@@ -46,37 +51,21 @@ export function plant(box) {
   };
   const draw = () => { if (seen) drawFlux(flux, seen); };
   const off = [store.on("frame", show), store.on("theme", () => { show(); draw(); })];
-  if (name) off.push(refreshed(async () => {
+  const predict = async () => {
     seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`);
     const peak = Math.max(0, ...seen.flux.flat());
     figures.replaceChildren(facts([["Power", `${number(seen.power / 1e6, 2)} MW`],
       ["Intercept", seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],
       ["Peak", `${number(peak / 1e3, 0)} kW/m²`], ["Heliostats on it", count(seen.heliostats)]]));
     draw();
-  }, { every: 10 }));
+  };
+  if (name) off.push(refreshed(predict, { every: 10 }));
+  flux.onclick = (event) => {
+    const point = seen && canCommand() ? fluxPoint(flux, seen, event) : null;
+    if (point) aim(seen.receiver, ...point);
+  };
   show();
   return () => off.forEach((end) => end());
-}
-
-function drawFlux(canvas, view) {
-  const rows = view.flux.length, columns = view.flux[0].length, peak = Math.max(1, ...view.flux.flat());
-  const c = canvas.getContext("2d"), high = 190, aspect = (view.right.at(-1) - view.right[0]) / Math.max(0.1, view.up.at(-1) - view.up[0]);
-  const room = canvas.parentElement.clientWidth - 90, wide = Math.round(Math.max(120, Math.min(room, high * aspect)));
-  canvas.width = wide + 84; canvas.height = high + 22;
-  const image = new ImageData(columns, rows);
-  for (let y = 0; y < rows; y++) for (let x = 0; x < columns; x++) {
-    const [r, g, b] = cividis(view.flux[rows - 1 - y][x] / peak);
-    image.data.set([r, g, b, 255], 4 * (y * columns + x));
-  }
-  const small = h("canvas", { width: columns, height: rows });
-  small.getContext("2d").putImageData(image, 0, 0);
-  c.drawImage(small, 0, 0, wide, high);
-  const ink = dark() ? "#c9d1d9" : "#24292f";
-  for (let i = 0; i < high; i++) { c.fillStyle = `rgb(${cividis(1 - i / high).join(",")})`; c.fillRect(wide + 12, i, 12, 1); }
-  c.fillStyle = ink; c.font = "11px system-ui, sans-serif"; c.textAlign = "left";
-  c.fillText(`${(peak / 1e3).toFixed(0)}`, wide + 28, 10); c.fillText("kW/m²", wide + 28, 24); c.fillText("0", wide + 28, high);
-  const half = (a) => a.at(-1) + 0.5 * (a[1] - a[0]);
-  c.fillText(`${(2 * half(view.right)).toFixed(1)} × ${(2 * half(view.up)).toFixed(1)} m, seen from the field`, 0, high + 16);
 }
 
 export function heliostat(box) {
@@ -91,7 +80,8 @@ export function heliostat(box) {
     }
     const name = encodeURIComponent(store.field.names[store.focus]);
     const [one, why, kept] = await Promise.all([api("GET", `heliostats/${name}`), api("GET", `heliostats/${name}/why`), api("GET", `photographs?heliostat=${name}&limit=40`)]);
-    body.replaceChildren(...heliostatView(one, why), ...keptView(kept, one.history));
+    const ticket = await askedFor(one.name);
+    body.replaceChildren(...heliostatView(one, why, calibrationView(one, kept, ticket)), ...keptView(kept, one.history));
     const canvas = body.querySelector("canvas");
     if (canvas && one.history.length) chart(canvas, [
       { points: one.history.map((s) => [s.at, 1e3 * s.error]), colour: colourOf("APPROACHING"), dots: true },
@@ -121,15 +111,44 @@ function whyView(why) {
     ...why.alarms.map((a) => h("p", { className: severe[a.severity] ?? "" }, a.text)));
 }
 
-function heliostatView(one, why) {
+// Calibrations asked for on this page, by heliostat, followed to their ends.
+const asked = new Map();
+async function calibrate(name, search) {
+  const ticket = await api("POST", "calibration/next", search ? { heliostat: name, search } : { heliostat: name });
+  asked.set(name, { identity: ticket.identity, since: store.head.utc });
+  return ticket;
+}
+async function askedFor(name) {
+  const known = asked.get(name);
+  if (!known) return null;
+  return { ...known, ...await api("GET", `commands/${encodeURIComponent(known.identity)}`).catch(() => ({ finished: true, text: "" })) };
+}
+
+// How far a calibration is that was asked for; then its result, with the first and the last photograph of its visit.
+function calibrationView(one, kept, ticket) {
+  const running = ticket && !ticket.finished, [last, before] = one.results.toSorted((a, b) => b.at - a.at);
+  const parts = ticket && (running || !ticket.good) && ticket.text ? [h("p", { className: running ? "" : "bad", role: "status" }, running ? h("progress", {}) : "", " ", ticket.text, running ? ` (${span(store.head.utc - ticket.since)})` : "")] : [];
+  if (last && !running) {
+    const mine = kept.filter((p) => p.at <= last.at + 1 && p.at > (before?.at ?? 0)).toSorted((a, b) => a.at - b.at), pictures = [...new Set([mine[0], mine.at(-1)])].filter(Boolean);
+    const sighting = (p) => one.history.find((s) => Math.abs(s.at - p.at) < 0.5);
+    parts.push(facts([[t("Result"), last.outcome.replaceAll("_", " "), last.outcome === "calibrated" ? "" : "warn"], [t("At"), `${moment(last.at)}, ${last.target}`], [t("Beam error before"), `${mrad(last.before)} mrad`], [t("after"), `${mrad(last.after)} mrad`], [t("Photographs used"), count(last.new)]]),
+      h("p", { className: "hx-hint" }, last.text),
+      pictures.length ? h("div", { className: "hx-two" }, pictures.map((p, i) => h("figure", {}, h("a", { href: `/api/v1/photographs/${p.identity}`, target: "_blank", rel: "noopener" }, h("img", { src: `/api/v1/photographs/${p.identity}`, alt: t("Photograph of {target} at {at}", { target: p.target, at: clock(p.at) }), loading: "lazy" })),
+        h("figcaption", { className: "hx-hint" }, `${i ? t("last") : t("first")}, ${clock(p.at)}${sighting(p) ? `, ${mrad(sighting(p).error)} mrad` : ""}`)))) : "");
+  }
+  return parts.length ? h("section", { className: "hx-result" }, h("h3", {}, running ? t("Calibration under way") : t("Last calibration")), parts) : "";
+}
+
+function heliostatView(one, why, calibration) {
   const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none" : p.map((v) => number(v, 1)).join(", "));
   return [
     h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
     whyView(why),
     canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: "Automatic control calibrates it as soon as a target is free",
-      onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name }), `calibrate ${one.name}`) }, "Calibrate now"),
+      onclick: () => act(() => calibrate(one.name, false), `calibrate ${one.name}`) }, "Calibrate now"),
     h("button", { className: "hx-button", title: "Automatic control searches its beam on a target until the camera sees it move with its aim; nothing is changed",
-      onclick: () => act(() => api("POST", "calibration/next", { heliostat: one.name, search: true }), `search ${one.name}`) }, "Search its beam")) : "",
+      onclick: () => act(() => calibrate(one.name, true), `search ${one.name}`) }, "Search its beam")) : "",
+    calibration,
     facts([["Cluster", one.cluster], ["Heard", one.live ? `${number(one.age, 1)} s ago` : `${span(one.age)} ago`],
       ["Fault", one.live ? one.fault : "unknown", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
       ["Aim E, N, U (m)", point(one.aim)], ["Standby E, N, U (m)", point(one.standby)],
@@ -145,7 +164,7 @@ function heliostatView(one, why) {
     one.drives.length ? table([["Axis", (d) => d.axis], ["Count", (d) => count(d.count), "num"], ["Goal", (d) => count(d.goal), "num"],
       ["Angle (°)", (d) => degrees(d.angle, 3), "num"], ["Goal (°)", (d) => degrees(d.goal_angle, 3), "num"]],
       one.drives.map((d, i) => ({ ...d, axis: ["primary", "secondary"][i] }))) : h("p", { className: "hx-hint" }, "unknown while stale"),
-    h("h3", {}, "Parameters"),
+    h("div", { className: "hx-row" }, h("h3", {}, t("Parameters")), h("button", { className: "hx-button", onclick: () => act(() => compareVersions(one.name), t("versions"), false) }, t("Versions…"))),
     table([["Name", (p) => p[0]], ["Value", (p) => parameter(p[1].value, p[1].unit), "num"], ["σ", (p) => parameter(p[1].sigma, p[1].unit), "num"],
       ["Nominal", (p) => parameter(p[1].nominal, p[1].unit), "num"], ["", (p) => (p[1].unit === "rad" ? "mrad" : p[1].unit)]], Object.entries(one.parameters)),
     h("h3", {}, `Errors of its sightings (${one.history.length}), mrad`), h("canvas", { className: "hx-chart small" }),

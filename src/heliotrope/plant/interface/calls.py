@@ -30,8 +30,11 @@ from heliotrope.plant.interface.tickets import TicketState
 from heliotrope.plant.operations import bus_frames as bus
 from heliotrope.plant.operations import views
 from heliotrope.plant.operations.marking import MarksView, PictureToMark
+from heliotrope.plant.operations.report import ShiftReport
 from heliotrope.plant.operations.security import SecurityEvent
+from heliotrope.plant.operations.trends import Quantity, Trend
 from heliotrope.plant.operations.typed_parameters import ParametersView
+from heliotrope.plant.operations.versions import ParameterComparison
 from heliotrope.plant.operations.zero import lock_position, zero
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.orders.tickets import Ticket
@@ -284,9 +287,42 @@ def events(desk: Desk, order: orders.Some) -> tuple[views.EventRow, ...]:
 async def journal(desk: Desk, order: orders.Journal) -> tuple[JournalEntry, ...]:
     """Return events, alarms and commands of all days from the store, the latest first.
 
-    `since` and `until` are POSIX seconds; `kind` is `event`, `alarm` or `command`.
+    `since` and `until` are POSIX seconds; `kind` is `event`, `alarm`, `command` or `note`.
     """
     return tuple(await desk.operations.journal(JournalQuery(**order.model_dump())))
+
+
+@_call("GET report", "logs")
+async def report(desk: Desk, order: orders.Period) -> ShiftReport:
+    """Return the report of a time: production, availability, calibrations, alarms, work, notes.
+
+    `since` and `until` are POSIX seconds, at most 31 days apart; 0 or left out: the last eight
+    hours. Energy and power are predicted.
+    """
+    return await desk.operations.report(order.since, order.until)
+
+
+@_call("GET trends", "logs")
+async def trends(desk: Desk) -> tuple[Quantity, ...]:
+    """Return the quantities that have trends, of the plant and of each heliostat."""
+    return await desk.operations.quantities()
+
+
+@_call("GET trend", "logs")
+async def trend(desk: Desk, order: orders.TrendOrder) -> Trend:
+    """Return a quantity over time: least, mean and largest value in intervals.
+
+    `?quantity=power.receiver&since=…&until=…` in POSIX seconds; with `heliostat`, one of its own.
+    """
+    return await desk.operations.trend(
+        order.quantity, order.heliostat, order.since, order.until, order.points
+    )
+
+
+@_call("POST notes", "logs", OPERATOR)
+def note_for_people(desk: Desk, who: Person, order: orders.NoteOrder) -> None:
+    """Keep a note for the next shift; the journal and the report show it."""
+    desk.operations.note(who, order.text)
 
 
 @_call("GET packets", "logs", fresh=FRESH)
@@ -403,12 +439,17 @@ def one_command(desk: Desk, order: orders.OneCommand) -> TicketState:
 
 @_call("POST aim", "commands", OPERATOR, body=orders.AimOrder, pack=orders.pack_points)
 def aim(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> Later[TicketState]:
-    """Aim heliostats at a receiver or a target by name, or at points."""
+    """Aim heliostats at a receiver or a target by name, or at points.
+
+    `right` and `up`: a point of the unrolled receiver, m from its middle as seen from outside.
+    """
     if bool(order.where) == bool(order.points):
         raise InputError("aim: give either where (a receiver or target) or points")
     here, token = desk.operations, desk.token_of(who)
+    placed = order.right is not None or order.up is not None
+    place = (order.right or 0.0, order.up or 0.0) if placed else None
     if order.where:
-        ticket = here.aim_at(who, token, order.heliostats, order.where)
+        ticket = here.aim_at(who, token, order.heliostats, order.where, place)
     else:
         ticket = here.aim(who, token, orders.points_of(order, blob))
     return Later(lambda: desk.recorded(ticket))
@@ -552,6 +593,16 @@ async def parameters(desk: Desk, who: Person, order: orders.Named) -> Parameters
     (asked now for an operator, else as last compared), and earlier versions.
     """
     return await desk.operations.parameters.view(order.name, who)
+
+
+@_call("GET heliostats/{name}/versions", "calibration")
+async def versions(desk: Desk, order: orders.TwoVersions) -> ParameterComparison:
+    """Return two versions of a heliostat's parameters side by side, with σ.
+
+    `?first=3&second=5`; 0 is the plant file. `beam_rms` and `beam_most`: change of the beam at its
+    aim over the suns of this day, m.
+    """
+    return await desk.operations.parameters.compare(order.name, order.first, order.second)
 
 
 @_call("POST parameters", "calibration", ENGINEER)

@@ -98,11 +98,32 @@ class Journal(Some):
 
     since: Moment = 0.0
     until: Moment = 1e11
-    kind: Literal["", "event", "alarm", "command"] = ""
+    kind: Literal["", "event", "alarm", "command", "note"] = ""
     person: Annotated[str, Field(max_length=64)] = ""
     heliostat: Annotated[str, Field(max_length=64)] = ""
     text: Annotated[str, Field(max_length=100)] = ""
     but: Annotated[str, Field(max_length=64, description="Whose commands are left out.")] = ""
+
+
+class Period(Strict):
+    """A time; `until` 0: now, and `since` 0: eight hours before."""
+
+    since: Moment = 0.0
+    until: Moment = 0.0
+
+
+class TrendOrder(Period):
+    """A quantity over a time; `until` 0: now, and `since` 0: a day before."""
+
+    quantity: Annotated[str, Field(min_length=1, max_length=100)]
+    heliostat: Annotated[str, Field(max_length=64)] = ""
+    points: Annotated[int, Field(ge=10, le=5000)] = 1000
+
+
+class NoteOrder(Strict):
+    """A note for other people."""
+
+    text: Annotated[str, Field(min_length=1, max_length=1000, pattern=f"^{_LETTER}*$")]
 
 
 class SomePackets(Some):
@@ -185,6 +206,14 @@ class ParameterOrder(Strict):
     reason: Annotated[Words, Field(min_length=1)]
 
 
+class TwoVersions(Strict):
+    """A heliostat and two versions of its parameters; 0: those of the plant file."""
+
+    name: Name
+    first: Annotated[int, Field(ge=0, le=2**31)] = 0
+    second: Annotated[int, Field(ge=0, le=2**31)] = 0
+
+
 #: A pixel of a picture, right and down.
 PixelOf = Annotated[list[Coordinate], Field(min_length=2, max_length=2)]
 
@@ -257,9 +286,14 @@ class CommandOrder(SomeHeliostats):
 
 
 class AimOrder(SomeHeliostats):
-    """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m."""
+    """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m.
+
+    `right` and `up`: place on the unrolled receiver from its middle as seen from outside, m.
+    """
 
     where: Words = ""
+    right: Coordinate | None = None
+    up: Coordinate | None = None
     points: Points = {}
 
 
@@ -273,6 +307,8 @@ class PointsOrder(SomeHeliostats):
     """`AimOrder` or `StandbyOrder` on its way: names of the points in the blob."""
 
     where: Words = ""
+    right: Coordinate | None = None
+    up: Coordinate | None = None
     points: Names = []
 
 

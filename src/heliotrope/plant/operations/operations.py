@@ -16,7 +16,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
 import numpy.typing as npt
 
@@ -30,13 +31,16 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import ORDERED, EmergencyOrder
 from heliotrope.plant.field.lockouts import TOWER
-from heliotrope.plant.operations.automatic import AutomaticControl
+from heliotrope.plant.operations.automatic import AUTOMATIC, AutomaticControl
 from heliotrope.plant.operations.errands import Errands
 from heliotrope.plant.operations.explaining import explain
+from heliotrope.plant.operations.history import History, figures
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.operations.report import ShiftReport, period, report
 from heliotrope.plant.operations.security import SecurityLog
+from heliotrope.plant.operations.trends import Quantity, Trend, quantities, trend
 from heliotrope.plant.operations.typed_parameters import TypedParameters
 from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
@@ -49,12 +53,15 @@ from heliotrope.plant.orders.authority import Grant, Person, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import Act
-from heliotrope.store.records import JournalEntry, JournalQuery, Kind, Records
+from heliotrope.store.records import NOTE, JournalEntry, JournalQuery, Kind, Records
+
+T = TypeVar("T")
 
 #: Commands that take heliostats from automatic control, and that give them to it.
 _TAKES_FROM_AUTOMATIC = messages.having("manual")
 _GIVES_TO_AUTOMATIC = messages.having("automatic")
 
+_DAY = 86_400.0
 #: Time between predictions of the flux, s.
 _FLUX_EVERY = 5.0
 #: Time between looks after the security events, s.
@@ -112,6 +119,8 @@ class Operations:
     ----------
     plant, logbook, automatic, viewer, security, pictures, parameters, marking
         See their classes: whoever reads the plant asks them.
+    telemetry
+        Folder of the telemetry; None: none is archived.
     """
 
     def __init__(
@@ -132,6 +141,8 @@ class Operations:
         self.security = SecurityLog(logbook, plant.clock)
         self.viewer = Viewer(plant, self.automatic)
         self.parameters = TypedParameters(plant, logbook, records)
+        self.telemetry: Path | None = None
+        self._history = History(plant, records, self._figures)
         self._records = records
         self._flux: dict[str, _Cached] = {}
         self._closing = asyncio.Event()
@@ -143,7 +154,8 @@ class Operations:
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
-            beside = [group.create_task(self._look()), group.create_task(self._follow())]
+            parts = (self._look(), self._follow(), self._history.run())
+            beside = [group.create_task(part) for part in parts]
             await self._closing.wait()
             self.automatic.stop()
             work.cancel()
@@ -235,10 +247,77 @@ class Operations:
         InputError
             If the plant keeps no records.
         """
+        return await self._read("journal", lambda records: records.journal(query))
+
+    async def report(self, since: float, until: float) -> ShiftReport:
+        """Return the report of a time; see `report.period`.
+
+        Raises
+        ------
+        InputError
+            If the plant keeps no records, or the time is not one.
+        """
+        name, now = self.plant.design.name, self.plant.clock.utc().timestamp()
+        first, last = period(since, until, now)
+        return await self._read(
+            "report",
+            lambda records: report(name, records, first, last, now, AUTOMATIC.name),
+        )
+
+    async def quantities(self) -> tuple[Quantity, ...]:
+        """Return the quantities that have trends.
+
+        Raises
+        ------
+        InputError
+            If the plant keeps no records.
+        """
+        now = self.plant.clock.utc().timestamp()
+        return await self._read("trends", lambda records: quantities(records, now))
+
+    async def trend(
+        self, quantity: str, heliostat: str, since: float, until: float, points: int
+    ) -> Trend:
+        """Return a quantity of the plant or of a heliostat over time; see `trends.trend`.
+
+        Without an end: until now; without a beginning: the day before it.
+        """
+        if heliostat:
+            self.plant.field.place(heliostat)
+        until = until or self.plant.clock.utc().timestamp()
+        since = since or until - _DAY
+        return await self._read(
+            "trend",
+            lambda records: trend(
+                records, self.telemetry, quantity, heliostat, since, until, points
+            ),
+        )
+
+    def note(self, person: Person, text: str) -> None:
+        """Keep a person's note, such as one for the next shift, in the journal.
+
+        Raises
+        ------
+        RefusedError
+            If the person is a viewer.
+        InputError
+            If it is empty.
+        """
+        _operator(person, "note")
+        if not text.strip():
+            raise InputError("note: it is empty; write what the next shift has to know")
+        self._tell(person, text.strip(), NOTE)
+
+    async def _read(self, what: str, read: Callable[[Records], T]) -> T:
+        """Return what a thread reads from the store, with the latest records in it."""
         if self._records is None:
-            raise InputError("journal: this plant keeps no records; run it with a data folder")
+            raise InputError(f"{what}: this plant keeps no records; run it with a data folder")
         await self._records.confirm()
-        return await asyncio.to_thread(self._records.journal, query)
+        return await asyncio.to_thread(read, self._records)
+
+    def _figures(self) -> dict[str, float]:
+        power = {name: self.receiver_flux(name).power for name in self.receivers}
+        return figures(self.viewer.frame(), self.summary(), self.sun(), power)
 
     # -- light -----------------------------------------------------------------------------
 
@@ -533,17 +612,44 @@ class Operations:
         self._told(person, ticket)
         return ticket
 
-    def aim_at(self, person: Person, token: int, heliostats: Sequence[str], where: str) -> Ticket:
-        """Aim heliostats at a receiver (as the design says) or at a target, by its name.
+    def aim_at(
+        self,
+        person: Person,
+        token: int,
+        heliostats: Sequence[str],
+        where: str,
+        place: tuple[float, float] | None = None,
+    ) -> Ticket:
+        """Aim heliostats at a receiver or target by its name, or at a point of a receiver.
+
+        Parameters
+        ----------
+        person, token
+            The person commanding, and the token of the command authority.
+        heliostats
+            Names; () for all.
+        where
+            Receiver or target: the first receiver as the design says, others at their centres.
+        place
+            Point of the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
 
         Raises
         ------
+        InputError
+            If the point is not on the receiver, or ``where`` is a target.
         UnknownNameError
             If there is no receiver or target of that name.
         """
         names = tuple(heliostats) or self.names
-        if where in self.receivers:
+        points: Mapping[str, npt.ArrayLike]
+        if place is not None:
+            if where not in self.receivers:
+                raise InputError(f"aim: right and up are of a receiver, and {where!r} is none")
+            points = dict.fromkeys(names, self.plant.design.receiver(where).point(*place))
+        elif where in self.receivers[:1]:
             points = self.plant.default_aims(names)
+        elif where in self.receivers:
+            points = dict.fromkeys(names, self.plant.design.receiver(where).center)
         elif where in self.targets:
             center = self.plant.design.target(where).center
             points = dict.fromkeys(names, center)

@@ -19,6 +19,13 @@ from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.versions import (
+    ComparedParameter,
+    ParameterComparison,
+    ParameterVersion,
+    beam_change,
+    suns_of_day,
+)
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.settings import CycleSettings
@@ -128,6 +135,57 @@ class TypedParameters:
             if one.version != version
         ]
         return ParametersView(heliostat, version, stored, tuple(states), tuple(earlier[::-1]))
+
+    async def compare(self, heliostat: str, first: int, second: int) -> ParameterComparison:
+        """Compare two versions of a heliostat's parameters; 0: those of the plant file.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such heliostat or version.
+        """
+        group, nominal = (
+            self._plant.design.find(heliostat)[0],
+            self._plant.beliefs.nominal(heliostat),
+        )
+        kept = {one.version: one for one in await self._history(heliostat)}
+        last = self._plant.beliefs.record(heliostat)
+        if last is not None:
+            kept[last.version] = last
+        for version in (first, second):
+            if version and version not in kept:
+                raise UnknownNameError(f"version of {heliostat}", str(version), map(str, kept))
+        file = self._file(heliostat)
+        known = [kept.get(version) for version in (first, second)]
+        values = [file if one is None else one.parameters for one in known]
+        sigmas = [{} if one is None else _sigmas(one) for one in known]
+        rows = [
+            ComparedParameter(
+                name,
+                group.mechanism.parameter(name).unit,
+                values[0].get(name, 0.0),
+                sigmas[0].get(name, np.nan),
+                values[1].get(name, 0.0),
+                sigmas[1].get(name, np.nan),
+            )
+            for name in group.mechanism.parameters
+        ]
+        machines = [nominal.with_parameters(each) for each in values]
+        row = self._plant.field.place(heliostat)
+        aim = self._plant.aims[row]
+        aim = aim if np.isfinite(aim).all() else self._plant.default_aims((heliostat,))[heliostat]
+        suns = suns_of_day(self._utc(), self._plant.design.site)
+        change = beam_change(machines[0], machines[1], suns, aim)
+        change = change[np.isfinite(change)]
+        return ParameterComparison(
+            heliostat,
+            0 if last is None else last.version,
+            _version(first, known[0]),
+            _version(second, known[1]),
+            tuple(rows),
+            float(np.sqrt(np.mean(change**2))) if len(change) else np.nan,
+            float(change.max()) if len(change) else np.nan,
+        )
 
     async def _stored(self, heliostat: str, who: Person) -> str:
         if who.role < Role.OPERATOR:
@@ -265,3 +323,14 @@ class TypedParameters:
         )
         self._log.event("command", person.name, f"PARAMETERS {name}: {shown} ({reason.strip()})")
         return ticket
+
+
+def _sigmas(record: HeliostatCalibration) -> dict[str, float]:
+    """Return the standard deviations of a version's parameters at the time of its fit."""
+    return {name: float(v) for name, v in zip(record.names, record.sigma, strict=True)}
+
+
+def _version(number: int, record: HeliostatCalibration | None) -> ParameterVersion:
+    if record is None:
+        return ParameterVersion(number, float("nan"), "", "plant file", 0)
+    return ParameterVersion(number, record.at, record.person, record.note, len(record.sightings))

@@ -1,0 +1,60 @@
+// What the page and the wall screen both show: the head, what is open, and the flux on a receiver.
+import { store } from "./live.js";
+import { cividis, dark } from "./palette.js";
+import { count, degrees, h } from "./dom.js";
+
+export function headOf(box) {
+  const day = h("b", { className: "hx-day" }), time = h("b"), speed = h("span", { className: "hx-hint" }), sun = h("span", { className: "hx-sun" }), live = h("span", { className: "hx-live" });
+  box.append(h("span", { className: "hx-name" }, store.field.plant), live, day, time, speed, sun);
+  const show = () => {
+    const now = store.head;
+    if (!now) return;
+    day.textContent = now.at.slice(0, 10);
+    time.textContent = `${now.at.slice(11, 19)} UTC`;
+    speed.textContent = Math.abs(now.pace - 1) > 0.05 ? `simulated at ${now.pace.toPrecision(2)} × real time` : "";
+    sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
+  };
+  const mark = () => { live.textContent = store.live ? "● live" : "✕ NOT LIVE"; live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };
+  store.on("frame", show);
+  store.on("live", mark);
+  mark(); show();
+}
+
+// The emergency, or why automatic control waits, in one line.
+export function alertText(box, text = h("span")) {
+  box.append(text);
+  store.on("frame", (now) => {
+    box.classList.toggle("on", now.emergency || Boolean(now.resume));
+    box.classList.toggle("waits", !now.emergency);
+    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)} · ${now.order.basis}${now.order.calls.length ? "" : " · when the causes have gone, Resume ends it and gives the field back to automatic control"}` : now.resume;
+  });
+}
+
+const halfOf = (centres) => centres.at(-1) + 0.5 * (centres[1] - centres[0]);
+
+// The point of the unrolled receiver under the pointer, m right of and above its middle; null beside the picture.
+export function fluxPoint(canvas, view, event) {
+  const box = canvas.getBoundingClientRect(), scale = canvas.width / box.width;
+  const x = ((event.clientX - box.left) * scale) / (canvas.width - 84), y = ((event.clientY - box.top) * scale) / (canvas.height - 22);
+  return x >= 0 && x <= 1 && y >= 0 && y <= 1 ? [(2 * x - 1) * halfOf(view.right), (1 - 2 * y) * halfOf(view.up)] : null;
+}
+
+export function drawFlux(canvas, view) {
+  const rows = view.flux.length, columns = view.flux[0].length, peak = Math.max(1, ...view.flux.flat());
+  const c = canvas.getContext("2d"), high = 190, aspect = (view.right.at(-1) - view.right[0]) / Math.max(0.1, view.up.at(-1) - view.up[0]);
+  const room = canvas.parentElement.clientWidth - 90, wide = Math.round(Math.max(120, Math.min(room, high * aspect)));
+  canvas.width = wide + 84; canvas.height = high + 22;
+  const image = new ImageData(columns, rows);
+  for (let y = 0; y < rows; y++) for (let x = 0; x < columns; x++) {
+    const [r, g, b] = cividis(view.flux[rows - 1 - y][x] / peak);
+    image.data.set([r, g, b, 255], 4 * (y * columns + x));
+  }
+  const small = h("canvas", { width: columns, height: rows });
+  small.getContext("2d").putImageData(image, 0, 0);
+  c.drawImage(small, 0, 0, wide, high);
+  const ink = dark() ? "#c9d1d9" : "#24292f";
+  for (let i = 0; i < high; i++) { c.fillStyle = `rgb(${cividis(1 - i / high).join(",")})`; c.fillRect(wide + 12, i, 12, 1); }
+  c.fillStyle = ink; c.font = "11px system-ui, sans-serif"; c.textAlign = "left";
+  c.fillText(`${(peak / 1e3).toFixed(0)}`, wide + 28, 10); c.fillText("kW/m²", wide + 28, 24); c.fillText("0", wide + 28, high);
+  c.fillText(`${(2 * halfOf(view.right)).toFixed(1)} × ${(2 * halfOf(view.up)).toFixed(1)} m, seen from the field`, 0, high + 16);
+}

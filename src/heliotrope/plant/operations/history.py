@@ -1,0 +1,105 @@
+"""Figures of the whole plant over time: taken every minute, kept in the store.
+
+The report of a shift and the trends are made of them. A figure has the name of its kind, and after
+a full stop what it is of: ``power.RECEIVER`` (W), ``state.TRACKING`` and ``state.stale`` (number of
+heliostats), ``reading.dni`` (in the unit of the safety table).
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.views import STALE_STATE, FieldFrame, Summary, SunView
+from heliotrope.store.records import PlantFigures, Records, StoreError
+
+#: Time between two rows of figures, s.
+EVERY = 60.0
+#: Digits that a figure keeps.
+_DIGITS = 5
+#: States from which a heliostat does no work until a person has seen to it.
+_OUT_OF_ORDER = (states.FAULT, states.UNCONFIGURED)
+#: Unit of a kind of figure; those of readings are the safety table's.
+UNITS = {
+    "power": "W",
+    "state": "",
+    "available": "",
+    "faulty": "",
+    "unheard": "",
+    "out_of_service": "",
+    "calibrated": "",
+    "error_median": "rad",
+    "error_p90": "rad",
+    "open_alarms": "",
+    "sun_elevation": "rad",
+    "reading": "",
+}
+
+
+def figures(
+    frame: FieldFrame, summary: Summary, light: SunView, power: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the figures of a plant at one moment.
+
+    Parameters
+    ----------
+    frame, summary, light
+        The field, the plant, and the sun.
+    power
+        Predicted power into each receiver, W.
+    """
+    stale = frame.state == STALE_STATE
+    faulty = ~stale & np.isin(frame.state, _OUT_OF_ORDER)
+    known = frame.error[np.isfinite(frame.error)]
+    found = {
+        "available": float((~stale & ~faulty & ~frame.held).sum()),
+        "faulty": float((faulty & ~frame.held).sum()),
+        "unheard": float((stale & ~frame.held).sum()),
+        "out_of_service": float(frame.held.sum()),
+        "calibrated": float(len(known)),
+        "error_median": float(np.median(known)) if len(known) else np.nan,
+        "error_p90": float(np.percentile(known, 90)) if len(known) else np.nan,
+        "open_alarms": float(summary.alarms),
+        "sun_elevation": light.elevation,
+    }
+    found |= {f"power.{name}": value for name, value in power.items()}
+    found |= {f"state.{name}": float(count) for name, count in summary.states.items()}
+    found |= {f"reading.{name}": float(value) for name, value in summary.readings.items()}
+    return {name: float(f"{value:.{_DIGITS}g}") for name, value in found.items()}
+
+
+class History:
+    """Takes figures of a plant every minute.
+
+    Parameters
+    ----------
+    plant
+        The controller.
+    records
+        The store; None: nothing is kept.
+    now
+        Returns the figures; see `figures`.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        records: Records | None,
+        now: Callable[[], Mapping[str, float]],
+    ) -> None:
+        self._plant, self._records, self._now = plant, records, now
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        while self._records is not None:
+            self.take(self._records)
+            await sleep_until(self._plant.clock, self._plant.now() + EVERY)
+
+    def take(self, records: Records) -> None:
+        """Take one row; the minute is missing where the store takes no more, which is alarmed."""
+        try:
+            records.record(PlantFigures(self._plant.clock.utc().timestamp(), self._now()))
+        except StoreError:
+            return

@@ -1,0 +1,98 @@
+"""Two versions of a heliostat's error parameters side by side, and what they change of its beam."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope import sun
+from heliotrope.geometry import FloatArray, as_float, reflect
+from heliotrope.mechanism import track
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.tracking import TrackingStatus
+from heliotrope.sun import Site
+
+#: Suns of a day at which beams are compared: time between them, s, and lowest elevation, rad.
+_STEP, _LOWEST = 1800.0, np.radians(10.0)
+_DAY = 86_400.0
+
+
+@dataclass(frozen=True)
+class ParameterVersion:
+    """A version: its number (0: the plant file), POSIX s, person, note and number of sightings."""
+
+    version: int
+    at: float
+    person: str
+    note: str
+    sightings: int
+
+
+@dataclass(frozen=True)
+class ComparedParameter:
+    """A parameter in two versions with its standard deviations; NaN where it is not fitted."""
+
+    name: str
+    unit: str
+    first: float
+    first_sigma: float
+    second: float
+    second_sigma: float
+
+
+@dataclass(frozen=True)
+class ParameterComparison:
+    """Two versions of a heliostat's parameters.
+
+    Attributes
+    ----------
+    heliostat
+        Name.
+    in_use
+        Version in use; 0 before the first.
+    first, second
+        The versions.
+    parameters
+        Each parameter in both.
+    beam_rms, beam_most
+        Change of the beam at its aim, m, RMS and largest over the suns of this day above 10°: what
+        the first brings to its aim misses it by that under the second. NaN where it tracks none.
+    """
+
+    heliostat: str
+    in_use: int
+    first: ParameterVersion
+    second: ParameterVersion
+    parameters: tuple[ComparedParameter, ...]
+    beam_rms: float
+    beam_most: float
+
+
+def suns_of_day(at: float, site: Site) -> FloatArray:
+    """Return unit vectors to the suns of a day (UTC, with a time in it, POSIX s) above 10°."""
+    times = at // _DAY * _DAY + np.arange(0.0, _DAY, _STEP)
+    found = sun.vector(times, site)
+    return as_float(found[found[:, 2] > np.sin(_LOWEST)])
+
+
+def beam_change(
+    first: Mechanism, second: Mechanism, suns: FloatArray, aim: FloatArray
+) -> FloatArray:
+    """Return by how far a beam misses its aim, m, (T,): NaN where the first does not track.
+
+    Parameters
+    ----------
+    first
+        The mechanism that sets the counts, batch shape (1,).
+    second
+        The mechanism that turns the mirror, batch shape (1,).
+    suns, aim
+        Unit vectors to the sun, (T, 3), and the aim, m, (3,), ENU.
+    """
+    if not len(suns):
+        return np.zeros(0)
+    found = track(first, suns, aim)
+    pose = second.pose(found.best_counts)
+    path, away = reflect(suns, pose.normal), aim - pose.vertex
+    missed = np.linalg.norm(np.cross(path, away), axis=-1)
+    tracks = found.chosen(found.status) == TrackingStatus.OK.value
+    return as_float(np.where(tracks, missed, np.nan))

@@ -1,0 +1,16 @@
+"""Figures of the whole plant over time: power, readings, states, errors."""
+
+from alembic import op
+from sqlalchemy import JSON, Column, Double
+
+revision = "0013"
+down_revision = "0012"
+
+
+def upgrade() -> None:
+    """Make the table."""
+    op.create_table(
+        "figures",
+        Column("at", Double, primary_key=True),
+        Column("values", JSON, nullable=False),
+    )

@@ -1,0 +1,209 @@
+"""What an operator does all day, in a browser: each task with its clicks and seconds."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from support.live_console import LiveConsole
+from support.pages import NEEDS_BROWSER, orders_counted, said, task, until
+
+pytestmark = NEEDS_BROWSER
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """Twelve heliostats at eight times the speed of real time."""
+    made = LiveConsole(tmp_path_factory.mktemp("day"), 12, speed=8.0)
+    yield made
+    made.close()
+
+
+def produced(field: LiveConsole) -> bool:
+    """Whether figures are kept in which a receiver gets power."""
+    rows = field.keeper.figures(0.0, 1e11)
+    return any(value > 0.0 for row in rows for name, value in row.values.items() if "power" in name)
+
+
+def test_a_note_and_the_report_of_the_shift(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    field.until(lambda: produced(field))
+    page = enter("operator", viewport={"width": 820, "height": 1180})
+    with task(page, "hand-over note"):
+        page.click(".hx-tabs >> text=Shift")
+        page.fill("[name=note]", "Mirror 7 is dirty,\nwash it tomorrow")
+        page.click("text=Keep note")
+        page.wait_for_selector("td:has-text('operator: Mirror 7 is dirty, wash it tomorrow')")
+    said(page, "note: done")
+    assert not page.input_value("[name=note]")
+    with task(page, "shift report"), page.context.expect_page() as opened:
+        page.click(".hx-shift >> text=Last 8 hours")
+    report = opened.value
+    report.wait_for_selector("h1:has-text('Shift report')")
+    text = report.inner_text("article")
+    assert "operator: Mirror 7 is dirty" in text
+    for title in ("Production", "Availability", "Calibrations", "Alarms", "Work done", "Notes (1)"):
+        assert title in text
+    found = report.request.get(f"{field.address}api/v1/report").json()
+    assert found["production"][0]["energy"] > 0
+    assert 0 < found["availability"] <= 1
+    assert f"{found['production'][0]['energy'] / 3.6e9:.1f}"[:3] in text
+    report.emulate_media(media="print")
+    assert not report.locator("form").is_visible()
+
+
+def test_a_viewer_writes_no_note(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    page = enter("viewer")
+    page.click(".hx-tabs >> text=Shift")
+    page.wait_for_selector("text=Hand-over notes")
+    assert not page.locator("[name=note]").count()
+
+
+def test_versions_side_by_side_and_one_brought_back(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    name, operations = field.live.names[0], field.live.operations
+    page = enter("engineer")
+    page.fill(".hx-query", name)
+    page.keyboard.press("Enter")
+    page.click(".hx-orders >> text=Stow")
+    field.until(lambda: operations.viewer.heliostat(name).state == "STOWED")
+    page.click(".hx-authority >> text=Take command")
+    page.wait_for_selector(".hx-authority >> text=You have command")
+    page.click(".hx-tabs >> text=Heliostat")
+    page.click("text=Versions…")
+    page.wait_for_selector("dialog th:has-text('version 0')")
+    for value in ("0.5", "1.5"):
+        page.fill("dialog [name=tilt_east]", value)
+        page.click("dialog >> text=Store new values")
+        page.wait_for_selector("dialog .hx-told.bad:has-text('give the reason')")
+        assert page.input_value("dialog [name=tilt_east]") == value
+        page.fill("dialog [name=reason]", "levelled")
+        page.click("dialog >> text=Store new values")
+        page.wait_for_selector("dialog .hx-told:not(.bad):has-text('done')")
+    page.click("dialog >> text='Close'")
+    last = field.call(lambda: field.live.plant.beliefs.record(name))
+    assert last.parameters["tilt_east"] == pytest.approx(1.5e-3)
+    with task(page, "versions side by side and one brought back"):
+        page.click("text=Versions…")
+        page.wait_for_selector("dialog >> text=/The beam moves by [0-9.]+ mm RMS/")
+        (row,) = page.locator("dialog tr:has-text('tilt_east')").all_inner_texts()
+        assert row.split()[1:6:2][:2] == ["0.500", "1.500"]
+        page.fill("dialog [name=reason]", "the level was wrong")
+        page.click(f"dialog >> text=Bring back version {last.version - 1}")
+        page.wait_for_selector("dialog .hx-told:not(.bad):has-text('done')")
+    again = field.call(lambda: field.live.plant.beliefs.record(name))
+    assert again.version == last.version + 1
+    assert again.parameters["tilt_east"] == pytest.approx(0.5e-3)
+    page.click("dialog >> text='Close'")
+    page.click(".hx-authority >> text=Release")
+
+
+def test_calibrate_now_shows_its_progress_and_its_result(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    name = field.live.names[3]
+    page = enter("operator", viewport={"width": 820, "height": 1180})
+    page.fill(".hx-query", name)
+    page.keyboard.press("Enter")
+    with task(page, "calibrate one now, to its result"):
+        page.click(".hx-tabs >> text=Heliostat")
+        page.click("text=Calibrate now")
+        page.wait_for_selector("h3:has-text('Calibration under way')")
+        page.wait_for_selector("h3:has-text('Last calibration')")
+        page.wait_for_selector(".hx-result dt:has-text('Beam error before')")
+    (last, *_) = sorted(
+        field.call(lambda: field.live.operations.viewer.heliostat(name)).results,
+        key=lambda entry: -entry.at,
+    )
+    assert f"{1e3 * last.after:.2f} mrad" in page.inner_text(".hx-result")
+    assert last.text in page.inner_text(".hx-result")
+
+
+def test_aim_a_group_at_a_point_of_the_flux_picture(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    names, operations = field.live.names[6:8], field.live.operations
+    receiver = operations.plant.design.receivers[0]
+    page = enter("operator")
+    page.click(".hx-authority >> text=Take command")
+    page.wait_for_selector(".hx-authority >> text=You have command")
+    page.fill(".hx-query", " ".join(names))
+    page.keyboard.press("Enter")
+    page.wait_for_selector("dt:has-text('Intercept')")
+    with task(page, "aim a group at a point of the receiver"):
+        flux = page.locator(".hx-flux")
+        box = flux.bounding_box()
+        # A quarter of the picture right of its middle, which ends 84 px before the canvas.
+        flux.click(position={"x": 0.75 * (box["width"] - 84), "y": 0.5 * (box["height"] - 22)})
+        page.wait_for_selector("dialog h2:has-text('Aim: 2 heliostats')")
+        page.click("dialog button >> text='Aim'")
+        said(page, "AIM")
+    # The picture shows more than the aperture: half a cell beyond the outermost centres.
+    right = operations.receiver_flux(receiver.name).right
+    wanted = receiver.point(0.5 * (right[-1] + 0.5 * (right[1] - right[0])), 0.0)
+    field.until(
+        lambda: all(
+            abs(operations.viewer.heliostat(name).aim - wanted).max() < 0.05 for name in names
+        )
+    )
+    page.click(".hx-orders >> text=Aim…")
+    page.select_option("dialog [name=where]", receiver.name)
+    page.fill("dialog [name=right]", "99")
+    page.click("dialog button >> text='Aim'")
+    said(page, "a point 99 m right of its middle is not on it; give at most")
+    page.click(".hx-orders >> text=Aim…")
+    page.select_option("dialog [name=where]", "standby")
+    page.click("dialog button >> text='Aim'")
+    said(page, "IDLE")
+    page.click(".hx-authority >> text=Release")
+
+
+def test_the_wall_screen_has_nothing_to_click_but_emergency(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page = enter("viewer", viewport={"width": 1920, "height": 1080})
+    page.goto(f"{field.address}wall")
+    page.wait_for_selector(".hx-large dd:has-text('MW')")
+    page.wait_for_selector(".hx-legend b")
+    until(page, "heliotrope.store.live")
+    page.wait_for_selector(".hx-side >> text=/No alarms|▲|○/")
+    page.mouse.click(600, 500)
+    assert not page.evaluate("heliotrope.store.selection.size")
+    focused = []
+    for _ in range(3):
+        page.keyboard.press("Tab")
+        focused.append(page.evaluate("document.activeElement.id || 'none'"))
+    assert set(focused) <= {"emergency", "none"}
+    words = orders_counted(page)
+    page.click("#emergency")
+    page.wait_for_selector("#emergency-said:has-text('ordered: DEFOCUS')")
+    assert len(words) == 1
+
+
+def test_trends_are_zoomed_moved_and_saved(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    field.until(lambda: produced(field))
+    page = enter("viewer", viewport={"width": 1440, "height": 900})
+    page.goto(f"{field.address}trends")
+    page.wait_for_selector(".hx-trend .u-over")
+    with page.expect_download() as saved:
+        page.click("text=Save as CSV")
+    lines = saved.value.path().read_text().splitlines()
+    assert lines[0].startswith("time,power.receiver low (MW)")
+    assert len(lines) > 2
+    with task(page, "a second quantity, zoomed by a drag"):
+        page.select_option("[aria-label=Quantity]", "available")
+        page.click("text='Add'")
+        page.wait_for_selector(".hx-trend h2:has-text('available')")
+        asked = "new URLSearchParams(location.search).get('{}')"
+        width = f"{asked.format('until')} - {asked.format('since')}"
+        before = page.evaluate(width)
+        box = page.locator(".hx-trend .u-over").first.bounding_box()
+        y = box["y"] + 0.5 * box["height"]
+        page.mouse.move(box["x"] + 0.9 * box["width"], y)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.999 * box["width"], y, steps=4)
+        page.mouse.up()
+        until(page, f"{width} < {0.2 * before}")
+    page.click("[aria-label=Earlier]")
+    page.click("[aria-label='Remove available']")
+    page.wait_for_selector(".hx-trend h2:has-text('available')", state="detached")
