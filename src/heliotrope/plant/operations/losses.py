@@ -80,7 +80,7 @@ class Losses:
         live, up = field.live(now), field.among(states.BEAM_OUT, now) & ~there & ~at_stow
         # Only an order locks a heliostat: a person's, or a visit's that writes parameters.
         held = field.among((states.LOCKED,), now)
-        lost = live & ~up & ~held & self._up
+        lost: Mask = live & ~up & ~held & self._up
         lost |= ~self._seen & field.among(states.LEAVING, now)
         lost &= wanted & ~self._plant.ledger.off(self._up_at, now)
         # A heliostat that is not heard, or is locked, keeps what was seen of it last.
