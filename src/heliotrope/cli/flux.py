@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from heliotrope.optics import FieldOptics, FluxTable, PlantFlux
     from heliotrope.optics.scene import Tower
 
+#: Suns of a table that are shown on the screen.
+SHOWN = 12
 #: Words for the efficiencies, in the order of the light.
 _WORDS = {
     "cosine": "cosine",
@@ -446,9 +448,11 @@ def _print_table(table: "FluxTable", order: _Order) -> None:
             f"{1e-6 * one['power_w']:.4g}",
             f"{1e-3 * one['peak_w_m2']:.4g}",
         ]
-        for one in records
+        for one in records[:SHOWN]
     ]
     print_table(
         heads, rows, title=f"{table.plant}: mean optical efficiency {100 * table.mean:.2f} %"
     )
+    if len(records) > SHOWN:
+        print(f"and {len(records) - SHOWN:,} more; --csv FILE writes them all")
     order.print_files()
