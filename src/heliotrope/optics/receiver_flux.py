@@ -25,7 +25,7 @@ from heliotrope.optics import _image_kernels as kernels
 from heliotrope.optics.attenuation import air_model
 from heliotrope.optics.beam import SUN_SIGMA
 from heliotrope.optics.scene import Mirrors, Scene
-from heliotrope.optics.shading import IntArray, Lit, Shading
+from heliotrope.optics.shading import IntArray, Lit, Shading, parts_of
 from heliotrope.optics.sun_shape import SunShape
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 from heliotrope.parallel import run_blocks
@@ -155,8 +155,7 @@ class FieldFlux:
         """
         changed = self._shading.move(rows, mirrors)
         self._cast(changed, -1.0)
-        begin = self._shading.lit.begin
-        parts = np.concatenate([np.arange(begin[i], begin[i + 1]) for i in changed] or [rows[:0]])
+        parts = parts_of(self._shading.lit.begin, changed)
         self._table[changed] = self._shading.table[changed]
         self._moments[parts] = self._shading.lit.moments[parts]
         self.scene = self.scene.with_mirrors(mirrors)

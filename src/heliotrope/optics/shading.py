@@ -140,19 +140,33 @@ class Shading:
             All mirrors, (H,), in their new poses.
         """
         table, ways, reaches = _rows(mirrors, self._sun, rows)
+        touched = self._touched(rows)
         self.table[rows], self._ways[rows], self._reaches[rows] = table, ways, reaches
         if np.abs(table[:, :3] - self._places[rows]).max(initial=0.0) > SLACK:
-            before = self._touched(rows)
             self._look()
-            changed = np.flatnonzero(before | self._touched(rows))
+            touched |= self._touched(rows)
         else:
-            before = self._touched(rows)
-            spans, near = self._candidates(rows)
-            self._spans[rows] = spans + len(self._near)
-            self._near = np.concatenate([self._near, near])
-            changed = np.flatnonzero(before)
-        self._clip(changed)
-        return changed
+            self._replace(rows)
+        looked = np.flatnonzero(touched)
+        parts = parts_of(self.parts[3], looked)
+        before = self._moments[parts]
+        self._clip(looked)
+        # Most that might be hidden are not, and their light stays as it was.
+        changed = np.zeros(len(touched), dtype=np.bool_)
+        changed[rows] = True
+        altered = (self._moments[parts] != before).any(axis=1)
+        counts = np.diff(self.parts[3])[looked]
+        changed[np.repeat(looked, counts)[altered]] = True
+        return np.flatnonzero(changed)
+
+    def _replace(self, rows: IntArray) -> None:
+        """Find the candidates of some mirrors anew."""
+        spans, near = self._candidates(rows)
+        self._spans[rows] = spans + len(self._near)
+        self._near = np.concatenate([self._near, near])
+        if len(self._near) > 2 * int((self._spans[:, 2] - self._spans[:, 0]).sum()) + 1024:
+            # What is left of lists that were replaced.
+            self._spans, self._near = self._candidates(np.arange(len(self.table)))
 
     def _touched(self, rows: IntArray) -> npt.NDArray[np.bool_]:
         """Return the mask of mirrors that are in ``rows`` or have one of them as candidate."""
@@ -169,6 +183,15 @@ class Shading:
             self._spans,
         )  # fmt: skip
         return [corners[a:b] for a, b in pairwise(begins)]
+
+
+def parts_of(begin: IntArray, rows: IntArray) -> IntArray:
+    """Return the rows of the parts of some mirrors; ``begin`` (H + 1,) as in `Lit`."""
+    counts = begin[rows + 1] - begin[rows]
+    ends = np.cumsum(counts)
+    return np.arange(int(ends[-1]) if len(rows) else 0) + np.repeat(
+        begin[rows] - ends + counts, counts
+    )
 
 
 def _rows(
