@@ -54,6 +54,16 @@ def test_json_is_what_the_library_computes(flux: Any) -> None:
     assert got["heliostats"][3]["lit"] == pytest.approx(known.efficiencies.lit[3])
 
 
+def test_facets_are_canted_at_a_time(flux: Any) -> None:
+    words = ("--facets=3x2", "--canting=2026-09-02T10:00Z", "--json")
+    code, out, err = flux("--time=2026-09-02T15:00Z", *words)
+    assert code == 0, err
+    plant = ht.example_plant()
+    noon = ht.sun.vector("2026-09-02T10:00Z", plant.site)
+    known = ht.flux(plant, "2026-09-02T15:00Z", facets=(3, 2), canting=noon)
+    assert json.loads(out)["peak_w_m2"] == pytest.approx(known.peak)
+
+
 def test_files_are_written_and_named(flux: Any, tmp_path: Path) -> None:
     code, out, err = flux(
         SUN, "--csv=h.csv", "--map=m.csv", "--netcdf=f.nc", "--picture=p.png", "--by=cosine"
@@ -100,6 +110,8 @@ def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
         ((SUN, "--air=fog"), "air 'fog': known models"),
         ((SUN, "--sun-shape=disk"), "sun shape 'disk'; known"),
         ((SUN, "--focus=near"), "--focus 'near': give slant, flat, or a focal length"),
+        ((SUN, "--facets=5"), "--facets '5': give columns and rows such as 5x7"),
+        ((SUN, "--facets=5x7", "--canting=noon"), "time 'noon' is not ISO 8601"),
         ((SUN, "--cells=0x4"), "--cells '0x4': give rows and columns such as 20x56"),
         ((SUN, "--tower=1,2,3"), "--tower '1,2,3': give four numbers in m"),
         ((SUN, "--tower=0,-24,30,9"), "stands inside a tower of radius 30.0 m; move it"),
