@@ -137,3 +137,15 @@ def test_a_campaign(tmp_path: Path) -> None:
     # 360 heliostats: the RMS itself is known to about 4 %.
     assert 0.85 < kept / promised < 1.2
     assert found.charts == 5
+
+
+def test_the_flux_of_a_field(tmp_path: Path) -> None:
+    pytest.importorskip("embreex")
+    found = Executed(EXAMPLES / "notebooks" / "flux.ipynb", tmp_path)
+    apart, noise = found.numbers(r"differs by (-?[\d.]+) %, the rays' standard error is ([\d.]+) %")
+    assert abs(apart) < 4.0 * noise + 0.1
+    assert noise < 0.2
+    (mean,) = found.numbers(r"mean optical efficiency ([\d.]+) %")
+    assert 60.0 < mean < 85.0
+    assert found.charts == 2
+    assert (tmp_path / "flux.nc").stat().st_size > 10_000

@@ -1,6 +1,7 @@
 """The pictures of `heliotrope.plot`: they draw what they are given, on the axes they are given."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import timedelta
 from functools import cache
 
@@ -149,6 +150,36 @@ def test_a_drift_shows_one_unit_with_its_band(ax: Axes) -> None:
         plot.drift(TIMES, values, spread, names, shown=["tilt_nort"], ax=ax)
 
 
+@cache
+def light() -> ht.optics.PlantFlux:
+    return ht.flux(ht.example_plant(), sun=(0.1, 0.6, 0.8))
+
+
+def test_a_receiver_is_drawn_in_kilowatts(ax: Axes) -> None:
+    view = light().maps[0]
+    plot.receiver_map(view, ax=ax)
+    (mesh,) = [c for c in ax.collections if isinstance(c, QuadMesh)]
+    np.testing.assert_allclose(
+        np.asarray(mesh.get_array()).reshape(view.flux.shape), 1e-3 * view.flux
+    )
+    assert f"peak {1e-3 * view.flux.max():.4g} kW/m²" in ax.get_title()
+
+
+def test_a_field_is_coloured_by_any_efficiency(ax: Axes) -> None:
+    plot.efficiency_map(light(), "cosine", ax=ax)
+    (dots,) = [c for c in ax.collections if isinstance(c, PathCollection)]
+    np.testing.assert_allclose(dots.get_array(), 100.0 * light().efficiencies.cosine)
+    shares = light().efficiencies.cosine
+    assert dots.get_clim() == pytest.approx((100 * shares.min(), 100 * shares.max()))
+
+
+def test_field_and_receiver_are_drawn_in_space(pyplot: object) -> None:
+    ax = plot.flux_3d(light())
+    assert len(ax.collections) == 2  # the heliostats and the cells of the receiver
+    figure = plot.flux_figure(light(), "lit")
+    assert len(figure.axes) == 5  # three pictures and two scales
+
+
 def test_without_axes_new_ones_are_made(pyplot: object) -> None:
     first = plot.residuals(np.arange(3), np.zeros((3, 2)))
     second = plot.ellipses(np.zeros((3, 2)))
@@ -188,6 +219,12 @@ def test_a_mechanism_has_a_slider_of_time() -> None:
                 np.zeros((3, 2)), groups=[plot.Group(np.ones(2, bool), "C0", "all")], ax=ax
             ),
             r"groups: the mask of 'all' has shape \(2,\)",
+        ),
+        (lambda ax: plot.efficiency_map(light(), "glare", ax=ax), "efficiency 'glare'"),
+        (lambda ax: plot.flux_3d(light(), "glare", ax=ax), "efficiency 'glare'"),
+        (
+            lambda ax: plot.receiver_map(replace(light().maps[0], up=np.zeros(1)), ax=ax),
+            "a mesh cannot be unrolled",
         ),
         (lambda ax: plot.field_map(np.zeros((3, 3)), [1.0], ax=ax), r"values: shape \(1,\)"),
         (lambda ax: plot.year_map([0.0], [0.0], [1.0], ax=ax), r"rms: shape \(1,\)"),

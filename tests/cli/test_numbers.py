@@ -52,7 +52,8 @@ WRITTEN = {
     "--by-slot": "", "--clear": "0.5",
     "--aim": "0,0,13", "--sun": "0,-0.6,0.8", "--site": "37,-5,100", "--at": "0,0,0",
     "--home": "0,0,0", "--led": "0,0,0", "--elevations": "35,50", "--rtk-mm": "6,6,8",
-    "--tower": "0,0,1,10", "--focus": "80", "--cells": "4x8",
+    "--tower": "0,0,1,10", "--focus": "80", "--cells": "4x8", "--facets": "3x2",
+    "--canting": "90",
     "--offset-mm": "0,0,0", "--size": "640x480", "--prior": "tilt_north=0.005",
 }  # fmt: skip
 #: Least words of each command that has numbers; ctl and store fail for want of a plant, later.

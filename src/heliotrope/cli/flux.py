@@ -1,7 +1,7 @@
 """``heliotrope flux``: what each heliostat puts on the receiver, and what is lost where."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from heliotrope.optics import FieldOptics, FluxTable, PlantFlux
     from heliotrope.optics.scene import Tower
 
+#: Suns of a table that are shown on the screen.
+SHOWN = 12
 #: Words for the efficiencies, in the order of the light.
 _WORDS = {
     "cosine": "cosine",
@@ -87,6 +89,16 @@ def flux(
     focus: Annotated[
         str, typer.Option(help="slant, flat, or the focal length of all mirrors, m.")
     ] = "slant",
+    facets: Annotated[
+        str | None, typer.Option(help="Columns and rows of equal facets, such as 5x7.")
+    ] = None,
+    canting: Annotated[
+        str,
+        typer.Option(
+            help="Of these facets: slant, a focal length in m, or the time at which they are "
+            "canted off axis."
+        ),
+    ] = "slant",
     cells: Annotated[
         str | None, typer.Option(help="Rows and columns of each receiver, such as 20x56.")
     ] = None,
@@ -128,6 +140,7 @@ def flux(
         reflectivity=reflectivity,
         clean=clean,
         focus=_focus(focus),
+        facets=None if facets is None else _facets(facets),
         cells=_cells(cells),
         towers=tuple(_tower(text) for text in tower or ()),
     )
@@ -144,6 +157,7 @@ def flux(
     )
     order.check(field, table=every is not None or year, year=year)
     plant = open_plant(field, None if site is None else parse_site(site))
+    order = replace(order, light=replace(light, canting=_canting(canting, plant)))
     if year:
         _year(plant, order, any_of={"--time": time, "--sun": sun, "--every": every}, rays=rays)
     elif every is not None:
@@ -194,6 +208,24 @@ def _focus(text: str) -> Literal["slant", "flat"] | float:
     refusal = f"--focus {shown(text)}: give slant, flat, or a focal length from 0.1 to 1e5 m"
     (length,) = parse_numbers(text, refusal, least=0.1, most=1e5)
     return length
+
+
+def _facets(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", text, re.ASCII)
+    if match is None:
+        raise InputError(f"--facets {shown(text)}: give columns and rows such as 5x7")
+    return int(match[1]), int(match[2])
+
+
+def _canting(text: str, plant: "Plant") -> Any:
+    from heliotrope.sun import vector
+
+    if text == "slant":
+        return text
+    if re.fullmatch(r"[\d.]+", text, re.ASCII):
+        refusal = f"--canting {shown(text)}: give slant, 0.1 to 1e5 m, or a time"
+        return parse_numbers(text, refusal, least=0.1, most=1e5)[0]
+    return vector(parse_time(text), plant.site)
 
 
 def _cells(text: str | None) -> tuple[int, int] | None:
@@ -446,9 +478,11 @@ def _print_table(table: "FluxTable", order: _Order) -> None:
             f"{1e-6 * one['power_w']:.4g}",
             f"{1e-3 * one['peak_w_m2']:.4g}",
         ]
-        for one in records
+        for one in records[:SHOWN]
     ]
     print_table(
         heads, rows, title=f"{table.plant}: mean optical efficiency {100 * table.mean:.2f} %"
     )
+    if len(records) > SHOWN:
+        print(f"and {len(records) - SHOWN:,} more; --csv FILE writes them all")
     order.print_files()

@@ -4,14 +4,18 @@
 - `beam`: the sun's angular radius, the width of a beam and its strength along its axis. Every other
   module takes these from there.
 - `offsets`: where an imperfect heliostat throws its beam (Malan's error model as a forward model).
-- `intercept` and `flux`: the share of a beam, and the flux of a field, on a receiver.
+- `intercept` and `flux`: the share of a beam, and the flux of round beams, on a receiver.
+- `scene`, `surfaces`, `shading` and `receiver_flux`: the engine, from mirrors to the flux in cells;
+  `rays` is a second opinion, and `canting` tilts facets.
+- `plant_flux` and `flux_files`: efficiencies and flux of a plant at a sun, a day or a year, and
+  their files.
 - `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation.
 - `obstruction`: the elements that neighbours shade and block, and how far that moves a centroid.
 - `coverage`: the share of a grid's cells that polygons cover (a function of the same name, so it
   stays there).
 - `keep_out`: beams that enter forbidden volumes; `glare`: the hazard to eyes, for information only.
 
-Begin with `image_offsets` for a tracking error, `predict_flux` for a receiver.
+Begin with `image_offsets` for a tracking error, `field_flux` for a plant.
 """
 
 from heliotrope.optics.attenuation import AIR_MODELS, air_loss
@@ -31,7 +35,15 @@ from heliotrope.optics.beam import (
     crossing,
     mean_concentration,
 )
+from heliotrope.optics.canting import canted
 from heliotrope.optics.flux import CELLS, FluxView, predict_flux
+from heliotrope.optics.flux_files import (
+    write_heliostats,
+    write_map,
+    write_netcdf,
+    write_sam,
+    write_solartherm,
+)
 from heliotrope.optics.glare import (
     DAYLIGHT,
     Eye,
@@ -74,6 +86,7 @@ from heliotrope.optics.plant_flux import (
     flux_day,
     flux_year,
 )
+from heliotrope.optics.rays import RayTrace, trace
 from heliotrope.optics.sun_shape import SUN_SHAPES, Gaussians, SunShape, sun_profile
 
 __all__ = [
@@ -105,12 +118,14 @@ __all__ = [
     "MirrorOptics",
     "Neighbours",
     "PlantFlux",
+    "RayTrace",
     "SunShape",
     "Sweep",
     "Way",
     "air_loss",
     "beam_sigma",
     "beams",
+    "canted",
     "centroid_shift",
     "clearance",
     "concentration",
@@ -141,4 +156,10 @@ __all__ = [
     "sun_profile",
     "sweep",
     "target_offsets",
+    "trace",
+    "write_heliostats",
+    "write_map",
+    "write_netcdf",
+    "write_sam",
+    "write_solartherm",
 ]

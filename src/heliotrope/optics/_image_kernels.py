@@ -28,7 +28,7 @@ DEEP = 16.0
 #: Parts whose images differ in place by less than this share of the blur are merged.
 CLOSE = 0.7
 FLAT, ROUND = 0, 1
-_FAST = {**OPTIONS, "fastmath": {"contract", "nsz", "arcp"}}
+_FAST = {**OPTIONS, "fastmath": {"contract", "nsz", "arcp", "nnan"}}
 
 
 @njit(**INLINED)
@@ -68,14 +68,32 @@ def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+@njit(**INLINED)
+def _row(a, table, k):
+    """Scalar product with a row of a table, without a view of it, which would cost more."""
+    return a[0] * table[k, 0] + a[1] * table[k, 1] + a[2] * table[k, 2]
+
+
+@njit(**INLINED)
+def _of(a, row, k):
+    """Scalar product of a vector, or of a row of two axes, with three numbers of a row."""
+    return a[0] * row[k] + a[1] * row[k + 1] + a[2] * row[k + 2]
+
+
+@njit(**INLINED)
+def _axis(axes, e, row, k):
+    """Scalar product of an axis with three numbers of a row."""
+    return axes[e, 0] * row[k] + axes[e, 1] * row[k + 1] + axes[e, 2] * row[k + 2]
+
+
 @njit(**INNER)
 def _turn(row, sun, cosine, axes, into):
     """Write the place of the ray (2) by a tilt of the normal (2), at distance 1."""
     for j in range(2):
-        axis = row[3 + 3 * j : 6 + 3 * j]
-        along = _dot(axis, sun)
+        k = 3 + 3 * j
+        along = _of(sun, row, k)
         for e in range(2):
-            into[e, j] = 2.0 * (along * _dot(axes[e], row[9:12]) + cosine * _dot(axes[e], axis))
+            into[e, j] = 2.0 * (along * _axis(axes, e, row, 9) + cosine * _axis(axes, e, row, k))
 
 
 @njit(**INNER)
@@ -93,9 +111,8 @@ def _blur(row, sun, cosine, axes, slope, pointing, turn):
 def _spread(turn, axes, row, t, curve, into):
     """Write A: the place of the ray (2) by the place on the part (2), at distance t."""
     for j in range(2):
-        axis = row[3 + 3 * j : 6 + 3 * j]
         for e in range(2):
-            into[e, j] = _dot(axes[e], axis) - t * curve * turn[e, j]
+            into[e, j] = _axis(axes, e, row, 3 + 3 * j) - t * curve * turn[e, j]
 
 
 @njit(**INNER)
@@ -198,19 +215,25 @@ def _distance(row, ray, shape):
     return max(0.0, t - math.sqrt(max(radius * radius - beside, 0.0) / flat))
 
 
+@njit(**INLINED)
+def _width(axes, e, wides, k):
+    return axes[e, 0] * wides[k, 0] + axes[e, 1] * wides[k, 1] + axes[e, 2] * wides[k, 2]
+
+
 @njit(**INNER)
 def _columns(row, ray, axes, t, shape, columns, seen):
     """Write the visible columns: index, place (2), step along it (2), width (2) and weight."""
     kind, middle, axis, normal, radius = shape
     bases, wides, means, edges, angles = columns
-    ups = (_dot(axes[0], axis), _dot(axes[1], axis))
+    ups = (_row(axis, axes, 0), _row(axis, axes, 1))
     count = 0
     level, facing = 0.0, 0.0
+    other = -_row(ray, edges, 0)
     for k in range(len(bases)):
-        one, other = -_dot(ray, edges[k]), -_dot(ray, edges[k + 1])
+        one, other = other, -_row(ray, edges, k + 1)
         if one <= 0.0 and other <= 0.0:
             continue
-        weight, narrow = -_dot(ray, means[k]), 1.0
+        weight, narrow = -_row(ray, means, k), 1.0
         x, y, z = bases[k, 0], bases[k, 1], bases[k, 2]
         if kind == ROUND and (one < 0.0 or other < 0.0):
             # Only the part of the column that the light reaches.
@@ -242,7 +265,7 @@ def _columns(row, ray, axes, t, shape, columns, seen):
         for e in range(2):
             seen[1 + e, count] = scale * (x * axes[e, 0] + y * axes[e, 1] + z * axes[e, 2])
             seen[3 + e, count] = scale * ups[e]
-            seen[5 + e, count] = narrow * scale * _dot(axes[e], wides[k])
+            seen[5 + e, count] = narrow * scale * _width(axes, e, wides, k)
         seen[7, count] = weight * scale * scale
         count += 1
     return count
@@ -251,49 +274,50 @@ def _columns(row, ray, axes, t, shape, columns, seen):
 @njit(**_FAST)
 def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
     """Add one Gaussian to the visible cells; returns the first and the last row that it reaches."""
-    value, ratio, shrink, up, down = room
+    value, ratio, shrink, up, down, peak = room
     box = step * step / 12.0
-    most, first, last = -1e300, 1e300, -1e300
-    middle, heaviest = 0.0, -1e300
+    power /= 2.0 * math.pi
     for k in range(count):
         du, dv, wu, wv = seen[3, k], seen[4, k], seen[5, k], seen[6, k]
         a = uu + box * du * du + wu * wu
         b = uv + box * du * dv + wu * wv
         c = vv + box * dv * dv + wv * wv
-        det = a * c - b * b
-        inverse = 1.0 / det
+        inverse = 1.0 / (a * c - b * b)
         pu, pv = seen[1, k] - u, seen[2, k] - v
         alpha = (du * du * c - 2.0 * du * dv * b + dv * dv * a) * inverse
         beta = (du * pu * c - (du * pv + dv * pu) * b + dv * pv * a) * inverse
         gamma = (pu * pu * c - 2.0 * pu * pv * b + pv * pv * a) * inverse
         value[k], ratio[k], shrink[k] = gamma, beta, alpha
-        up[k] = power * seen[7, k] / (2.0 * math.pi * math.sqrt(det))
-        down[k] = gamma - beta * beta / alpha
+        up[k] = power * seen[7, k] * math.sqrt(inverse)
+        peak[k] = -beta / alpha
+        down[k] = gamma + beta * peak[k]
+    flattest, first, last = 1e300, 1e300, -1e300
+    middle, nearest = 0.0, 2.0 * DEEP
     for k in range(count):
         if down[k] < 2.0 * DEEP:
-            at = -ratio[k] / shrink[k]
-            reach = math.sqrt((2.0 * DEEP - down[k]) / shrink[k])
-            first, last = min(first, at - reach), max(last, at + reach)
-            if -down[k] > heaviest:
-                heaviest, middle = -down[k], at
+            first, last = min(first, peak[k]), max(last, peak[k])
+            flattest = min(flattest, shrink[k])
+            if down[k] < nearest:
+                nearest, middle = down[k], peak[k]
     if last < first:
         return rows, -1
-    begin = max(0, math.ceil((first - low) / step))
-    end = min(rows - 1, math.floor((last - low) / step))
+    reach = math.sqrt((2.0 * DEEP - nearest) / flattest)
+    begin = max(0, math.ceil((first - reach - low) / step))
+    end = min(rows - 1, math.floor((last + reach - low) / step))
     if end < begin:
         return rows, -1
     start = min(end, max(begin, math.floor((middle - low) / step + 0.5)))
-    z = low + start * step
+    z, most = low + start * step, 0.0
     for k in range(count):
         alpha, beta, gamma = shrink[k], ratio[k], value[k]
-        if down[k] >= 2.0 * DEEP:
-            value[k], ratio[k], shrink[k] = 0.0, 0.0, 0.0
-            up[k] = 0.0
-            continue
-        value[k] = -0.5 * (alpha * z * z + 2.0 * beta * z + gamma)
-        ratio[k] = -0.5 * step * (alpha * (2.0 * z + step) + 2.0 * beta)
-        shrink[k] = -alpha * step * step
-        most = max(most, abs(value[k]), abs(ratio[k]), abs(shrink[k]))
+        at = -0.5 * (alpha * z * z + 2.0 * beta * z + gamma)
+        by = -0.5 * step * (alpha * (2.0 * z + step) + 2.0 * beta)
+        far = down[k] >= 2.0 * DEEP
+        up[k] = 0.0 if far else up[k]
+        value[k] = -1.0 if far else at
+        ratio[k] = -1.0 if far else by
+        shrink[k] = -1.0 if far else -alpha * step * step
+        most = max(most, -value[k], abs(ratio[k]))
     if most < 40.0:
         for k in range(count):
             value[k] = up[k] * _exp(value[k])
@@ -302,8 +326,8 @@ def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
     else:
         for k in range(count):
             value[k] = up[k] * math.exp(max(value[k], -700.0))
-            ratio[k] = math.exp(min(ratio[k], 700.0))
-            shrink[k] = math.exp(shrink[k])
+            ratio[k] = math.exp(min(max(ratio[k], -700.0), 700.0))
+            shrink[k] = math.exp(max(shrink[k], -700.0))
     for k in range(count):
         # The ratio downwards: the product of both is the ratio of ratios.
         down[k] = shrink[k] / ratio[k]
@@ -323,6 +347,31 @@ def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
     return begin, end
 
 
+@njit(**_FAST)
+def _gather(seen, count, begin, end, local, sign, flux, sums):
+    """Add the visible cells to the flux, clear them, and return their sum."""
+    for k in range(count):
+        sums[k] = 0.0
+    start = 0
+    while start < count:
+        # Columns that lie side by side; those of a cylinder may pass over its end.
+        column, stop = int(seen[0, start]), start + 1
+        while stop < count and int(seen[0, stop]) == column + stop - start:
+            stop += 1
+        for r in range(begin, end + 1):
+            line, into = local[r, start:stop], flux[r, column : column + stop - start]
+            part = sums[start:stop]
+            for k in range(stop - start):
+                into[k] += sign * line[k]
+                part[k] += line[k]
+                line[k] = 0.0
+        start = stop
+    total = 0.0
+    for k in range(count):
+        total += sums[k]
+    return total
+
+
 @njit(**OPTIONS)
 def cast(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, surfaces, moments,
          shape, columns, grid, sign, flux, out):  # fmt: skip
@@ -337,7 +386,10 @@ def cast(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, 
     low, step, number, area = grid
     wide = len(columns[0])
     seen, local = np.empty((8, wide)), np.zeros((number, wide))
-    room = (np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide))
+    room = (
+        np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide),
+        np.empty(wide),
+    )  # fmt: skip
     ray, axes = np.empty(3), np.empty((2, 3))
     turn, work = np.empty((2, 2)), (np.empty((2, 2)), np.empty((2, 2)), np.empty(2))
     most = 1
@@ -380,15 +432,7 @@ def cast(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, 
                     seen, visible, low, step, number, local, room,
                 )  # fmt: skip
                 begin, end = min(begin, a), max(end, b)
-        caught = 0.0
-        for r in range(begin, end + 1):
-            line, into = local[r], flux[r]
-            for k in range(visible):
-                value = line[k]
-                caught += value
-                into[int(seen[0, k])] += sign * value
-                line[k] = 0.0
-        out[i, 1] = caught * area
+        out[i, 1] = area * _gather(seen, visible, begin, end, local, sign, flux, room[0])
 
 
 @njit(**OPTIONS)
@@ -513,7 +557,7 @@ def hide(first, last, ways, cells, corners, hidden):
         way = ways[d]
         for k in range(len(cells)):
             hidden[d, k] = False
-            if _dot(way, cells[k, 3:6]) >= 0.0:
+            if _of(way, cells[k], 3) >= 0.0:
                 hidden[d, k] = True
                 continue
             for j in range(len(corners)):

@@ -20,6 +20,7 @@ from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.frames import times as frame_times
 from heliotrope.geometry import FloatArray, as_float, as_vectors, azimuth_elevation, normalize
 from heliotrope.optics.attenuation import air_loss
+from heliotrope.optics.canting import Canting, canted
 from heliotrope.optics.flux import FluxView
 from heliotrope.optics.rays import trace
 from heliotrope.optics.receiver_flux import Efficiencies, FieldFlux
@@ -59,7 +60,13 @@ class FieldOptics:
     reflectivity, clean
         Of the clean mirror, and the share that soiling leaves, 0 to 1, () or (N,).
     focus
-        "slant": each mirror is focused on its aim; "flat"; or the focal length, m.
+        "slant": each mirror is focused on its aim; "flat"; or the focal length, m. Of mirrors with
+        facets it is that of each facet.
+    facets
+        Columns and rows of equal facets; None: as the plant file has them.
+    canting
+        Of these facets: "slant", a focal length or the sun at which they are canted off axis; see
+        `heliotrope.optics.canting.canted`.
     cells
         Rows and columns of each receiver; None: as the engine chooses.
     towers
@@ -76,6 +83,8 @@ class FieldOptics:
     reflectivity: npt.ArrayLike = 0.9
     clean: npt.ArrayLike = 1.0
     focus: Literal["slant", "flat"] | float = "slant"
+    facets: tuple[int, int] | None = None
+    canting: Canting = "slant"
     cells: tuple[int, int] | None = None
     towers: tuple[Tower, ...] = ()
     gaussians: int = 3
@@ -103,7 +112,7 @@ class FieldOptics:
             raise InputError(f"flux: an error of {error.max():g} rad must be from 0 to 0.2 rad")
         # Two axes of the normal share its variance, and the beam turns by twice the angle.
         spread = np.broadcast_to(2.0 * error**2, (len(plant),))[:, None, None] * np.eye(2)
-        return scene_of(
+        scene = scene_of(
             plant,
             sun,
             aim,
@@ -117,6 +126,10 @@ class FieldOptics:
             clean=self.clean,
             pointing=spread,
         )
+        if self.facets is None:
+            return scene
+        mirrors = canted(scene.mirrors, self.facets, self.canting, plant=plant, aim=aim)
+        return replace(scene, mirrors=mirrors)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

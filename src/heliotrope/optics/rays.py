@@ -26,8 +26,9 @@ from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 _BATCH = 250_000
 #: Limits of the number of rays.
 RAYS = (1_000, 1_000_000_000)
-#: Rays begin this far in front of their mirror, m, so that they do not meet it.
-_OFF = 0.01
+#: Rays begin this share of the field's size in front of their mirror, so that they do not meet it:
+#: a few steps of single precision. A centimetre would lift them over 1 % of a small shadow.
+_OFF = 5e-7
 #: Sides of a tower.
 _SIDES = 96
 
@@ -128,6 +129,8 @@ class _Tracer:
             self.center, self.tilt = facets.center[row, column], facets.tilt[row, column]
             self.half, self.focal = facets.half[row, column], facets.focal[row, column]
         self.origin = mirrors.center.mean(axis=0)
+        size = np.linalg.norm(mirrors.center - self.origin, axis=-1).max(initial=0.0)
+        self.off = _OFF * max(100.0, float(size))
         self.solids = _embree([*self._panels(), *map(_sides, scene.towers)], self.origin)
         self.meshes = {id(m): _embree([m.corners], self.origin) for m in _meshes(scene.surfaces)}
         across, along = tangent_axes(scene.sun)
@@ -176,7 +179,7 @@ class _Tracer:
         ray = self._pointed(ray, k)
         weight = _dot(light, normal) / np.maximum(normal @ self.scene.sun, 1e-12)
         surface, cell, distance = self._met(point, ray)
-        start = point + _OFF * normal
+        start = point + self.off * normal
         shaded = self._stopped(start, light, np.full(count, 1e6))
         blocked = self._stopped(start, ray, np.where(surface >= 0, distance, m.slant[k]))
         return k, weight, shaded, blocked, surface, cell
@@ -193,7 +196,7 @@ class _Tracer:
 
     def _stopped(self, start: FloatArray, ray: FloatArray, length: FloatArray) -> np.ndarray:
         origin, way = _single(start - self.origin), _single(ray)
-        hit = self.solids.run(origin, way, dists=_single(length - 2.0 * _OFF), query="OCCLUDED")
+        hit = self.solids.run(origin, way, dists=_single(length - 2.0 * self.off), query="OCCLUDED")
         return np.asarray(hit >= 0)
 
     def _met(self, point: FloatArray, ray: FloatArray) -> tuple[Any, Any, FloatArray]:

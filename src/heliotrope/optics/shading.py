@@ -189,8 +189,8 @@ def parts_of(begin: IntArray, rows: IntArray) -> IntArray:
     """Return the rows of the parts of some mirrors; ``begin`` (H + 1,) as in `Lit`."""
     counts = begin[rows + 1] - begin[rows]
     ends = np.cumsum(counts)
-    starts: IntArray = np.repeat(begin[rows] - ends + counts, counts)
-    return starts + np.arange(len(starts))
+    first = np.repeat(begin[rows] - ends + counts, counts)
+    return np.asarray(first + np.arange(len(first)), dtype=np.int64)
 
 
 def _rows(

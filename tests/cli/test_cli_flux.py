@@ -1,0 +1,133 @@
+"""``heliotrope flux``: what it prints, what it writes, and what it refuses."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import heliotrope as ht
+from heliotrope.cli import main
+from heliotrope.optics.scene import Tower
+
+SUN = "--sun=0.1,0.6,0.8"
+
+
+def run(
+    arguments: tuple[str, ...], capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["heliotrope", "flux", *arguments])
+    with pytest.raises(SystemExit) as leaving:
+        main()
+    said = capsys.readouterr()
+    return int(leaving.value.code or 0), said.out, said.err
+
+
+@pytest.fixture
+def flux(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run the command on the example plant in its folder."""
+    monkeypatch.chdir(tmp_path)
+    ht.write_plant(ht.example_plant(), "plant.toml")
+    return lambda *words: run(("plant.toml", *words), capsys, monkeypatch)
+
+
+def test_json_is_what_the_library_computes(flux: Any) -> None:
+    code, out, err = flux(
+        SUN, "--json", "--dni=800", "--sun-shape=buie:0.1", "--air=20", "--slope-mrad=2",
+        "--error-mrad=3", "--reflectivity=0.8", "--clean=0.9", "--focus=flat", "--cells=10x12",
+        "--tower=0,-10,1,15",
+    )  # fmt: skip
+    assert code == 0, err
+    got = json.loads(out)
+    known = ht.flux(
+        ht.example_plant(), sun=[0.1, 0.6, 0.8], dni=800.0, shape="buie:0.1", air=20.0, slope=2e-3,
+        error=3e-3, reflectivity=0.8, clean=0.9, focus="flat", cells=(10, 12),
+        towers=(Tower(0.0, -10.0, 1.0, -1e4, 15.0),),
+    )  # fmt: skip
+    assert got["power_w"] == pytest.approx(known.power)
+    assert got["efficiencies"] == pytest.approx(known.summary)
+    assert np.shape(got["receivers"][0]["flux_w_m2"]) == (10, 12)
+    assert [one["name"] for one in got["heliostats"]] == list(known.names)
+    assert got["heliostats"][3]["lit"] == pytest.approx(known.efficiencies.lit[3])
+
+
+def test_facets_are_canted_at_a_time(flux: Any) -> None:
+    words = ("--facets=3x2", "--canting=2026-09-02T10:00Z", "--json")
+    code, out, err = flux("--time=2026-09-02T15:00Z", *words)
+    assert code == 0, err
+    plant = ht.example_plant()
+    noon = ht.sun.vector("2026-09-02T10:00Z", plant.site)
+    known = ht.flux(plant, "2026-09-02T15:00Z", facets=(3, 2), canting=noon)
+    assert json.loads(out)["peak_w_m2"] == pytest.approx(known.peak)
+
+
+def test_files_are_written_and_named(flux: Any, tmp_path: Path) -> None:
+    code, out, err = flux(
+        SUN, "--csv=h.csv", "--map=m.csv", "--netcdf=f.nc", "--picture=p.png", "--by=cosine"
+    )
+    assert code == 0, err
+    for name in ("h.csv", "m.csv", "f.nc", "p.png"):
+        assert (tmp_path / name).stat().st_size > 500
+        assert name in out
+    assert "neither shaded nor blocked" in out
+    assert "peak" in out
+
+
+def test_rays_stand_beside(flux: Any) -> None:
+    pytest.importorskip("embreex")
+    code, out, err = flux(SUN, "--rays=2e4", "--json")
+    assert code == 0, err
+    got = json.loads(out)
+    assert got["rays"]["count"] == 20_000
+    assert got["rays"]["power_w"] == pytest.approx(got["power_w"], rel=0.01)
+    assert "by 20,000 rays" in flux(SUN, "--rays=2e4")[1]
+
+
+def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
+    code, out, err = flux("--time=2026-09-02T10:00Z", "--every=4h", "--csv=d.csv")
+    assert code == 0, err
+    with (tmp_path / "d.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert rows[0]["time"].startswith("2026-09-02T")
+    assert "mean optical efficiency" in out
+    monkey = flux("--year", "--sam=s.csv", "--solartherm=s.motab", "--json")
+    assert monkey[0] == 0, monkey[2]
+    got = json.loads(monkey[1])
+    assert len(got["suns"]) == len((tmp_path / "s.csv").read_text().splitlines()) > 80
+    assert 0.6 < got["mean_efficiency"] < 0.9
+    assert (tmp_path / "s.motab").read_text().startswith("#1\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ((SUN, "--time=now"), "give --time or --sun, not both"),
+        (("--time=2026-09-02T22:00Z",), "above the horizon; choose a time by day"),
+        ((SUN, "--dni=-1"), "--dni"),
+        ((SUN, "--air=fog"), "air 'fog': known models"),
+        ((SUN, "--sun-shape=disk"), "sun shape 'disk'; known"),
+        ((SUN, "--focus=near"), "--focus 'near': give slant, flat, or a focal length"),
+        ((SUN, "--facets=5"), "--facets '5': give columns and rows such as 5x7"),
+        ((SUN, "--facets=5x7", "--canting=noon"), "time 'noon' is not ISO 8601"),
+        ((SUN, "--cells=0x4"), "--cells '0x4': give rows and columns such as 20x56"),
+        ((SUN, "--tower=1,2,3"), "--tower '1,2,3': give four numbers in m"),
+        ((SUN, "--tower=0,-24,30,9"), "stands inside a tower of radius 30.0 m; move it"),
+        ((SUN, "--receiver=none"), "receiver 'none'"),
+        ((SUN, "--rays=10"), "rays: 10 must be from 1,000 to 1,000,000,000"),
+        ((SUN, "--sam=s.csv"), "--sam: it is written of --year only"),
+        ((SUN, "--picture=p.gif"), "give one of"),
+        ((SUN, "--csv=none/h.csv"), "there is no folder none"),
+        ((SUN, "--csv=plant.toml"), "this file is an input"),
+        (("--year", "--time=now"), "--time: a year takes no --time"),
+        (("--year", "--rays=1e4"), "--rays: a year is not traced"),
+        (("--every=1h", "--netcdf=f.nc"), "--netcdf: it is written of one time only"),
+    ],
+)
+def test_bad_input_ends_in_one_line(flux: Any, words: tuple[str, ...], line: str) -> None:
+    code, out, err = flux(*words)
+    assert (code, out) == (2, "")
+    assert line in err
+    assert len(err.splitlines()) == 1
