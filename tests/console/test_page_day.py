@@ -1,5 +1,6 @@
 """What an operator does all day, in a browser: each task with its clicks and seconds."""
 
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -117,6 +118,19 @@ def test_calibrate_now_shows_its_progress_and_its_result(
     )
     assert f"{1e3 * last.after:.2f} mrad" in page.inner_text(".hx-result")
     assert last.text in page.inner_text(".hx-result")
+    # The plant of these tests keeps no photographs.
+    row = {"heliostat": name, "target": last.target, "used": True, "reading": [], "text": last.text}
+    row["outcome"] = "calibrated"
+    rows = [{**row, "identity": k, "at": last.at - 10.0 * k} for k in (1, 2, 3)]
+    page.route("**/api/v1/photographs?*", lambda route: route.fulfill(json=rows))
+    dot = "<svg xmlns='http://www.w3.org/2000/svg' width='4' height='3'/>"
+    page.route(
+        re.compile(r"/api/v1/photographs/\d"),
+        lambda route: route.fulfill(body=dot, content_type="image/svg+xml"),
+    )
+    page.wait_for_selector(".hx-two img")
+    shown = page.locator(".hx-two img").evaluate_all("all => all.map((one) => one.src.slice(-1))")
+    assert shown == ["3", "1"]
 
 
 def test_aim_a_group_at_a_point_of_the_flux_picture(
@@ -150,8 +164,8 @@ def test_aim_a_group_at_a_point_of_the_flux_picture(
     page.select_option("dialog [name=where]", receiver.name)
     page.fill("dialog [name=right]", "99")
     page.click("dialog button >> text='Aim'")
-    said(page, "a point 99 m right of its middle is not on it; give at most")
-    page.click(".hx-orders >> text=Aim…")
+    page.wait_for_selector("dialog [role=alert]:has-text('99 m right of its middle is not on it')")
+    assert page.input_value("dialog [name=right]") == "99"
     page.select_option("dialog [name=where]", "standby")
     page.click("dialog button >> text='Aim'")
     said(page, "IDLE")
@@ -207,3 +221,32 @@ def test_trends_are_zoomed_moved_and_saved(field: LiveConsole, enter: Callable[.
     page.click("[aria-label=Earlier]")
     page.click("[aria-label='Remove available']")
     page.wait_for_selector(".hx-trend h2:has-text('available')", state="detached")
+
+
+def test_local_time_stands_beside_utc(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    page = enter("viewer", timezone_id="Asia/Kolkata", viewport={"width": 1440, "height": 900})
+    until(page, "document.querySelector('.hx-head').textContent.includes('local')")
+    utc, here = re.findall(r"(\d\d:\d\d)(?::\d\d UTC| local)", page.inner_text(".hx-head"))
+    minutes = [int(text[:2]) * 60 + int(text[3:]) for text in (utc, here)]
+    assert (minutes[1] - minutes[0]) % 1440 == 330
+    page.click(".hx-tabs >> text=Logs")
+    page.wait_for_selector("td >> text=/[0-9:]{8} \\([0-9]{2}:[0-9]{2}\\)/")
+
+
+def test_a_command_to_many_is_one_line_that_unfolds(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page = enter("operator")
+    names = field.live.names
+    entry = {"at": 1.8e9, "kind": "command", "what": "DEFOCUS", "severity": "", "heliostats": names}
+    entry["text"] = "operator (operator): 12 heliostats: done"
+    page.route("**/api/v1/journal?*", lambda route: route.fulfill(json=[entry]))
+    page.click(".hx-tabs >> text=Logs")
+    page.click(".hx-logs button >> text=journal")
+    page.select_option("[aria-label=Kind]", "command")
+    page.click("text='Search'")
+    line = page.locator(".hx-logs tr:has-text('DEFOCUS')").first
+    assert "12 heliostats" in line.inner_text()
+    assert names[11] not in line.inner_text()
+    line.locator("summary").click()
+    line.locator(f"text={names[11]}").wait_for()

@@ -74,3 +74,14 @@ def test_all_kinds_stand_in_one_list_the_latest_first(filled: Keeper) -> None:
 )
 def test_each_condition_narrows_it(filled: Keeper, query: dict[str, object], count: int) -> None:
     assert len(texts(filled, **query)) == count, texts(filled, **query)
+
+
+def test_a_command_to_many_names_them_apart_from_its_line(keeper: Keeper) -> None:
+    names = tuple(f"H{i:03d}" for i in range(300))
+    for identity, whom in (("p-1", names), ("p-2", names[:5])):
+        entry = replace(ORDER, identity=identity, heliostats=whom, at="2026-06-21T00:00:00.000")
+        keeper.do(lambda c, entry=entry: audit.begin(c, entry))
+    few, many = keeper.journal(JournalQuery(kind="command"))
+    assert "300 heliostats (H000" in many.text
+    assert many.heliostats == names[:200]
+    assert few.heliostats == ()

@@ -8,6 +8,7 @@ from sqlalchemy import ColumnElement, Connection, String, cast, or_, select
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
 from heliotrope.store.records import (
+    JOURNAL_NAMES,
     NOTE,
     AlarmEntry,
     AuditEntry,
@@ -111,7 +112,13 @@ def _commands(connection: Connection, query: JournalQuery) -> list[JournalEntry]
         connection, AuditEntry, wanted.order_by(_AUDIT.number.desc()).limit(query.limit)
     )
     return [
-        JournalEntry(datetime.fromisoformat(one.at).timestamp(), "command", one.what, _said(one))
+        JournalEntry(
+            datetime.fromisoformat(one.at).timestamp(),
+            "command",
+            one.what,
+            _said(one),
+            heliostats=one.heliostats[:JOURNAL_NAMES] if len(one.heliostats) > _NAMED else (),
+        )
         for one in found
     ]
 

@@ -470,6 +470,8 @@ class JournalEntry:
         One line.
     severity
         "" for a command.
+    heliostats
+        Names of the first `JOURNAL_NAMES` heliostats of a command to more than five.
     """
 
     at: float
@@ -477,6 +479,11 @@ class JournalEntry:
     what: str
     text: str
     severity: str = ""
+    heliostats: tuple[str, ...] = ()
+
+
+#: Heliostats of a command that the journal names at most.
+JOURNAL_NAMES = 200
 
 
 #: Source of an event that is a person's note.

@@ -19,11 +19,16 @@ export const mrad = (value, digits = 2) => (known(value) ? (1e3 * value).toFixed
 export const degrees = (value, digits = 2) => (known(value) ? ((value * 180) / Math.PI).toFixed(digits) : "–");
 export const count = (value) => (known(value) ? value.toLocaleString("en") : "–");
 export const clock = (at) => (known(at) && at > 0 ? new Date(1e3 * at).toISOString().slice(11, 19) : "–");
-// With its day, unless that is the plant's present day.
+// The same in the browser's time zone, "" where that is UTC: always beside UTC, never instead of it.
+export function local(at) {
+  const date = new Date(1e3 * at), two = (value) => String(value).padStart(2, "0");
+  return known(at) && date.getTimezoneOffset() ? `${two(date.getHours())}:${two(date.getMinutes())}` : "";
+}
+// With its day, unless that is the plant's present day, and with the local time in brackets.
 export function moment(at) {
   if (!known(at) || at <= 0) return "–";
-  const text = new Date(1e3 * at).toISOString(), today = store.head?.at.slice(0, 10);
-  return text.slice(0, 10) === today ? text.slice(11, 19) : `${text.slice(0, 10)} ${text.slice(11, 19)}`;
+  const text = new Date(1e3 * at).toISOString(), today = store.head?.at.slice(0, 10), here = local(at);
+  return `${text.slice(0, 10) === today ? "" : `${text.slice(0, 10)} `}${text.slice(11, 19)}${here && ` (${here})`}`;
 }
 export function span(seconds) {
   if (!known(seconds)) return "never";
@@ -87,20 +92,28 @@ export function lay(dialog) {
   dialog.show();
 }
 
-export function ask(title, fields, confirm) {
+// Asks in a dialog; null: cancelled. With `go` the dialog stays after an error, with what was typed, until `go` has succeeded.
+export function ask(title, fields, confirm, go = async () => {}) {
   return new Promise((resolve) => {
+    const told = h("p", { className: "hx-told bad", role: "alert", hidden: true }), given = () => Object.fromEntries(fields.map((field, i) => [field.name, inputs[i].value]));
+    let busy = false;
+    const submit = async (event) => {
+      event.preventDefault();
+      if (busy) return;
+      busy = true;
+      try { await go(given()); dialog.close("yes"); } catch (error) { told.textContent = error.message; told.hidden = false; } finally { busy = false; }
+    };
     const inputs = fields.map((field) => {
       if (field.options) return h("select", { name: field.name }, field.options.map((o) => h("option", { value: o }, o)));
       return h("input", { name: field.name, type: field.type ?? "text", value: field.value ?? "", step: "any", required: field.required ?? true });
     });
-    const dialog = h("dialog", { className: "hx-dialog" }, h("form", { method: "dialog" },
-      h("h2", {}, title), fields.map((field, i) => h("label", {}, field.label, inputs[i])),
+    const dialog = h("dialog", { className: "hx-dialog" }, h("form", { onsubmit: submit },
+      h("h2", {}, title), fields.map((field, i) => h("label", {}, field.label, inputs[i])), told,
       h("div", { className: "hx-row" },
         h("button", { type: "button", className: "hx-button", onclick: () => dialog.close("") }, "Cancel"),
         h("button", { type: "submit", value: "yes", className: "hx-button main" }, confirm))));
     dialog.addEventListener("close", () => {
-      const values = Object.fromEntries(fields.map((field, i) => [field.name, inputs[i].value]));
-      resolve(dialog.returnValue === "yes" ? values : null);
+      resolve(dialog.returnValue === "yes" ? given() : null);
     });
     lay(dialog);
   });

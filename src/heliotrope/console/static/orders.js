@@ -14,6 +14,13 @@ export async function act(what, name, plain = true) {
   } catch (error) { say(`${name}: ${error.message}`, true); return null; }
 }
 
+// Asks, does it, and shows its result; after an error the form stays open with what was typed.
+export async function askAnd(question, fields, confirm, what, name) {
+  let done = null;
+  const given = await ask(question, fields, confirm, async (values) => { done = await what(values); });
+  if (given) await act(async () => done, name);
+}
+
 // Says how far a ticket is, to its end; a later one does not silence an earlier one's result.
 let latest = "";
 async function follow(ticket) {
@@ -51,13 +58,10 @@ function recipients() {
 async function order(name, title, make, fields, sure) {
   let to;
   try { to = recipients(); } catch (error) { say(`${title}: ${error.message}`, true); return; }
-  let values = {};
   const safe = name === "STOW" || name === "DEFOCUS";
   if (fields || (!safe && (scope === "field" || (sure && to.names.length !== 1)))) {
-    values = await ask(`${title}: ${to.text}`, fields ?? [], title);
-    if (!values) return;
-  }
-  await act(() => make(to.names, values), title);
+    await askAnd(`${title}: ${to.text}`, fields ?? [], title, (values) => make(to.names, values), title);
+  } else await act(() => make(to.names, {}), title);
 }
 
 // Declares the position of the axes: nothing moves, but every later motion depends on it.
@@ -65,10 +69,10 @@ async function zero() {
   const rows = [...store.selection];
   if (rows.length !== 1) { say("Zero: select exactly one heliostat; counts differ from one to the next", true); return; }
   const name = store.field.names[rows[0]];
-  const v = await ask(`Declare the position of ${name}? It must be locked; its controller stores the counts.`, [
+  await askAnd(`Declare the position of ${name}? It must be locked; its controller stores the counts.`, [
     { name: "primary", label: "Primary axis (steps)", type: "number", value: "0" },
-    { name: "secondary", label: "Secondary axis (steps)", type: "number", value: "0" }], "Declare and store");
-  if (v) await act(() => api("POST", "commands", { command: "ZERO", heliostats: [name], values: [Number(v.primary), Number(v.secondary)] }), `Zero ${name}`);
+    { name: "secondary", label: "Secondary axis (steps)", type: "number", value: "0" }], "Declare and store",
+  (v) => api("POST", "commands", { command: "ZERO", heliostats: [name], values: [Number(v.primary), Number(v.secondary)] }), `Zero ${name}`);
 }
 
 // Declares that the beam is at its aim now: the counts become those that belong there.

@@ -2,7 +2,7 @@
 import { api, me, store } from "./live.js";
 import { colourOf, dark } from "./palette.js";
 import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, span, table } from "./dom.js";
-import { act, aim } from "./orders.js";
+import { act, aim, askAnd } from "./orders.js";
 import { drawFlux, fluxPoint } from "./showing.js";
 import { markCorners } from "./marking.js";
 import { compareVersions } from "./versions.js";
@@ -398,12 +398,13 @@ function journal() {
   const all = h("input", { type: "checkbox" }), allLabel = h("label", { className: "hx-field" }, all, "commands of automatic control too");
   const found = h("div"), said = h("p", { className: "hx-hint" }, "Events, alarms and commands of all days, over restarts."), most = 1000;
   let rows = [];
+  const unfolded = new Set();
   const search = async () => {
     const seconds = (date, more) => (date ? { [more ? "until" : "since"]: Date.parse(`${date}T00:00:00Z`) / 1e3 + (more ? 86400 : 0) } : {});
     const query = new URLSearchParams({ ...seconds(from.value, false), ...seconds(to.value, true), kind: kind.value, person: who.value.trim(), heliostat: name.value.trim(), text: text.value.trim(), but: all.checked ? "" : "automatic control", limit: most });
     rows = await api("GET", `journal?${query}`);
     said.textContent = rows.length === most ? `The latest ${count(most)}; choose fewer days or a text.` : `${count(rows.length)} entries.`;
-    found.replaceChildren(table([["Time (UTC)", (r) => moment(r.at)], ["Kind", (r) => h("span", { className: severe[r.severity] ?? "" }, r.kind)], ["What", (r) => r.what], ["", (r) => r.text]], rows));
+    found.replaceChildren(table([["Time (UTC)", (r) => moment(r.at)], ["Kind", (r) => h("span", { className: severe[r.severity] ?? "" }, r.kind)], ["What", (r) => r.what], ["", (r) => (r.heliostats.length ? h("span", {}, several(r.heliostats, `${r.at}${r.what}`, unfolded), " ", r.text) : r.text)]], rows));
   };
   const form = h("form", { className: "hx-row hx-search", onsubmit: (event) => { event.preventDefault(); act(search, "journal", false); } },
     fromLabel, toLabel, kind, whoLabel, nameLabel, textLabel, allLabel, h("button", { className: "hx-button main" }, "Search"),
@@ -426,9 +427,9 @@ async function giveBack(one) {
 async function lockPlace() {
   const { targets, receivers } = store.field;
   const named = new Map([...targets.map((name) => [`target ${name}`, ["target", name]]), ...receivers.map((name) => [`receiver ${name}`, ["receiver", name]]), ["tower", ["tower", "tower"]]]);
-  const v = await ask("Lock a target, a receiver or the tower? Heliostats whose beams are aimed there stow, and none comes until everybody has returned their lock; under a locked tower all stow.", [
-    { name: "place", label: "Place", options: [...named.keys()] }, { name: "reason", label: "Reason" }, { name: "hours", label: "Expected back in (hours)", type: "number", value: "4", required: false }], "Lock");
-  if (v) await act(() => api("POST", "holds", { ...places(...named.get(v.place)), reason: v.reason, hours: Number(v.hours) || null }), `lock ${v.place}`);
+  await askAnd("Lock a target, a receiver or the tower? Heliostats whose beams are aimed there stow, and none comes until everybody has returned their lock; under a locked tower all stow.", [
+    { name: "place", label: "Place", options: [...named.keys()] }, { name: "reason", label: "Reason" }, { name: "hours", label: "Expected back in (hours)", type: "number", value: "4", required: false }], "Lock",
+  (v) => api("POST", "holds", { ...places(...named.get(v.place)), reason: v.reason, hours: Number(v.hours) || null }), "lock");
 }
 
 // The operator's own timetable: heliostats calibrated at times of day or at intervals.
@@ -436,14 +437,14 @@ const listed = (text) => text.split(",").map((one) => one.trim()).filter(Boolean
 async function putTimetable(entries, what) { await act(() => api("PUT", "timetable", { entries }), what); }
 const asGiven = ({ name, heliostats, target, at, every_s }) => ({ name, heliostats, target, at, every_s });
 async function addEntry(rows) {
-  const v = await ask("Calibrate heliostats at times of day, at an interval, or both? They come before all that automatic control would choose.", [
+  await askAnd("Calibrate heliostats at times of day, at an interval, or both? They come before all that automatic control would choose.", [
     { name: "name", label: "Name of the entry" }, { name: "heliostats", label: "Heliostats, separated by commas" },
     { name: "target", label: "Target", options: ["any", ...store.field.targets] },
     { name: "at", label: "Times of day with zone (08:30Z, 10:30+02:00)", required: false },
-    { name: "every", label: "Interval from midnight UTC (minutes)", type: "number", required: false }], "Put in force");
-  if (!v) return;
-  const entry = { name: v.name, heliostats: listed(v.heliostats), target: v.target === "any" ? "" : v.target, at: listed(v.at || ""), every_s: v.every ? 60 * Number(v.every) : null };
-  await putTimetable([...rows.filter((one) => one.name !== v.name).map(asGiven), entry], `put ${v.name} on the timetable`);
+    { name: "every", label: "Interval from midnight UTC (minutes)", type: "number", required: false }], "Put in force", (v) => {
+    const entry = { name: v.name, heliostats: listed(v.heliostats), target: v.target === "any" ? "" : v.target, at: listed(v.at || ""), every_s: v.every ? 60 * Number(v.every) : null };
+    return api("PUT", "timetable", { entries: [...rows.filter((one) => one.name !== v.name).map(asGiven), entry] });
+  }, "timetable");
 }
 async function removeEntry(rows, name) {
   if (await ask(`Remove ${name} from the timetable? What it has asked for goes on.`, [], "Remove")) await putTimetable(rows.filter((one) => one.name !== name).map(asGiven), `remove ${name} from the timetable`);

@@ -1,7 +1,8 @@
 // What the page and the wall screen both show: the head, what is open, and the flux on a receiver.
 import { store } from "./live.js";
 import { cividis, dark } from "./palette.js";
-import { count, degrees, h } from "./dom.js";
+import { count, degrees, h, local } from "./dom.js";
+import { t } from "./words.js";
 
 export function headOf(box) {
   const day = h("b", { className: "hx-day" }), time = h("b"), speed = h("span", { className: "hx-hint" }), sun = h("span", { className: "hx-sun" }), live = h("span", { className: "hx-live" });
@@ -10,7 +11,8 @@ export function headOf(box) {
     const now = store.head;
     if (!now) return;
     day.textContent = now.at.slice(0, 10);
-    time.textContent = `${now.at.slice(11, 19)} UTC`;
+    const here = local(now.utc);
+    time.textContent = `${now.at.slice(11, 19)} UTC${here && ` · ${here} ${t("local")}`}`;
     speed.textContent = Math.abs(now.pace - 1) > 0.05 ? `simulated at ${now.pace.toPrecision(2)} × real time` : "";
     sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
   };
