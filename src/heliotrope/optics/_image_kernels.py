@@ -272,42 +272,13 @@ def _columns(row, ray, axes, t, shape, columns, seen):
 
 
 @njit(**_FAST)
-def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
-    """Add one Gaussian to the visible cells; returns the first and the last row that it reaches."""
-    value, ratio, shrink, up, down, peak = room
-    box = step * step / 12.0
-    power /= 2.0 * math.pi
-    for k in range(count):
-        du, dv, wu, wv = seen[3, k], seen[4, k], seen[5, k], seen[6, k]
-        a = uu + box * du * du + wu * wu
-        b = uv + box * du * dv + wu * wv
-        c = vv + box * dv * dv + wv * wv
-        inverse = 1.0 / (a * c - b * b)
-        pu, pv = seen[1, k] - u, seen[2, k] - v
-        alpha = (du * du * c - 2.0 * du * dv * b + dv * dv * a) * inverse
-        beta = (du * pu * c - (du * pv + dv * pu) * b + dv * pv * a) * inverse
-        gamma = (pu * pu * c - 2.0 * pu * pv * b + pv * pv * a) * inverse
-        value[k], ratio[k], shrink[k] = gamma, beta, alpha
-        up[k] = power * seen[7, k] * math.sqrt(inverse)
-        peak[k] = -beta / alpha
-        down[k] = gamma + beta * peak[k]
-    flattest, first, last = 1e300, 1e300, -1e300
-    middle, nearest = 0.0, 2.0 * DEEP
-    for k in range(count):
-        if down[k] < 2.0 * DEEP:
-            first, last = min(first, peak[k]), max(last, peak[k])
-            flattest = min(flattest, shrink[k])
-            if down[k] < nearest:
-                nearest, middle = down[k], peak[k]
-    if last < first:
-        return rows, -1
-    reach = math.sqrt((2.0 * DEEP - nearest) / flattest)
-    begin = max(0, math.ceil((first - reach - low) / step))
-    end = min(rows - 1, math.floor((last + reach - low) / step))
-    if end < begin:
-        return rows, -1
-    start = min(end, max(begin, math.floor((middle - low) / step + 0.5)))
-    z, most = low + start * step, 0.0
+def _march(z, step, count, rows, local, room):
+    """Add the prepared Gaussians from a height z to both ends of the rows that they reach.
+
+    From row to row an exponential of a square needs two products, by its ratio and theirs.
+    """
+    value, ratio, shrink, up, down, _ = room
+    (begin, start, end), most = rows, 0.0
     for k in range(count):
         alpha, beta, gamma = shrink[k], ratio[k], value[k]
         at = -0.5 * (alpha * z * z + 2.0 * beta * z + gamma)
@@ -344,6 +315,45 @@ def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
             up[k] *= down[k]
             down[k] *= shrink[k]
             line[k] += up[k]
+
+
+@njit(**_FAST)
+def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
+    """Add one Gaussian to the visible cells; returns the first and the last row that it reaches."""
+    value, ratio, shrink, up, down, peak = room
+    box = step * step / 12.0
+    power /= 2.0 * math.pi
+    for k in range(count):
+        du, dv, wu, wv = seen[3, k], seen[4, k], seen[5, k], seen[6, k]
+        a = uu + box * du * du + wu * wu
+        b = uv + box * du * dv + wu * wv
+        c = vv + box * dv * dv + wv * wv
+        inverse = 1.0 / (a * c - b * b)
+        pu, pv = seen[1, k] - u, seen[2, k] - v
+        alpha = (du * du * c - 2.0 * du * dv * b + dv * dv * a) * inverse
+        beta = (du * pu * c - (du * pv + dv * pu) * b + dv * pv * a) * inverse
+        gamma = (pu * pu * c - 2.0 * pu * pv * b + pv * pv * a) * inverse
+        value[k], ratio[k], shrink[k] = gamma, beta, alpha
+        up[k] = power * seen[7, k] * math.sqrt(inverse)
+        peak[k] = -beta / alpha
+        down[k] = gamma + beta * peak[k]
+    flattest, first, last = 1e300, 1e300, -1e300
+    middle, nearest = 0.0, 2.0 * DEEP
+    for k in range(count):
+        if down[k] < 2.0 * DEEP:
+            first, last = min(first, peak[k]), max(last, peak[k])
+            flattest = min(flattest, shrink[k])
+            if down[k] < nearest:
+                nearest, middle = down[k], peak[k]
+    if last < first:
+        return rows, -1
+    reach = math.sqrt((2.0 * DEEP - nearest) / flattest)
+    begin = max(0, math.ceil((first - reach - low) / step))
+    end = min(rows - 1, math.floor((last + reach - low) / step))
+    if end < begin:
+        return rows, -1
+    start = min(end, max(begin, math.floor((middle - low) / step + 0.5)))
+    _march(low + start * step, step, count, (begin, start, end), local, room)
     return begin, end
 
 
@@ -448,11 +458,9 @@ def cast_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums, p
     weights, variances = sums
     ray, axes = np.empty(3), np.empty((2, 3))
     turn, work = np.empty((2, 2)), (np.empty((2, 2)), np.empty((2, 2)), np.empty(2))
-    most, total = 1, 0.0
+    most, total = 1, np.sum(weights * variances)
     for i in rows[first:last]:
         most = max(most, parts[3][i + 1] - parts[3][i])
-    for k in range(len(weights)):
-        total += weights[k] * variances[k]
     images = np.empty((most, IMAGE + 2))
     for i in rows[first:last]:
         out[i, 0] = out[i, 1] = 0.0
