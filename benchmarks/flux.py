@@ -209,7 +209,7 @@ def run(quick: bool) -> Result:
         for value, limit in (("cold_ms", "limit_ms"), ("moved_ms", "moved_limit_ms"))
     )
     headline = (
-        f"flux of {rows[0]['mirrors']:,} mirrors on {CELLS[0] * CELLS[1]:,} cells in {cold:.0f} ms, "
-        f"{rows[0]['moved_ms']:.1f} ms after one in a hundred moved"
+        f"flux of {rows[0]['mirrors']:,} mirrors on {CELLS[0] * CELLS[1]:,} cells in "
+        f"{cold:.0f} ms, {rows[0]['moved_ms']:.1f} ms after one in a hundred moved"
     )
     return Result(rows, headline, figures, within_budget=kept)
