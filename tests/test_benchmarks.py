@@ -99,6 +99,10 @@ COLUMNS = {
         "worst_mm", "in_68", "in_95", "wrong_accepts", "wrong_rejects", "faults", "faults_named",
     },
     "first_run": {"figure", "value", "limit", "kept"},
+    "flux": {
+        "field", "mirrors", "figure", "sun_deg", "cold_ms", "limit_ms", "moved_ms",
+        "moved_limit_ms", "cold_processor_ms", "grown_mb",
+    },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 #: A browser with fifty viewers, and plants, take their time.

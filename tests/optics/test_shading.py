@@ -160,3 +160,21 @@ def test_facets_share_what_is_left_of_the_mirror() -> None:
     areas = lit.moments[:, 0].reshape(-1, 4)
     assert areas.sum(axis=1) == pytest.approx(12.0 * whole.both)
     assert (areas.std(axis=1) > 0.1).any()
+
+
+def test_a_tower_below_the_receiver_does_not_block_its_own_beams() -> None:
+    """Also where an oblique mirror's nearer focus lies before the tower."""
+    place, sun = field(6, 80)
+    aim = np.tile([0.0, 5.0, 70.0], (len(place), 1))
+    place[:, 2] = 0.0
+    given = poses(place, sun, aim)
+    mirrors = Mirrors.of(place, given.normal, (1.0, 1.0), aim)
+    tower = Tower(0.0, 0.0, 4.5, 0.0, 60.0)
+    alone = Shading(Scene(sun, 1000.0, mirrors, ())).lit
+    lit = Shading(Scene(sun, 1000.0, mirrors, (), (tower,))).lit
+    assert np.array_equal(lit.blocking, alone.blocking)
+    # A target behind the tower is another matter.
+    behind = np.tile([0.0, -40.0, 30.0], (len(place), 1))
+    given = Mirrors.of(place, bisector(sun, normalize(behind - place)), (1.0, 1.0), behind)
+    lit = Shading(Scene(sun, 1000.0, given, (), (tower,))).lit
+    assert (lit.blocking < 0.01).any()

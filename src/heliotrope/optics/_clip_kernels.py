@@ -175,6 +175,12 @@ def _carry(i, mirrors, way, bend, reach, corners, m, spare, polygon):
         for k in range(m):
             for c in range(3):
                 corners[k, c] = spare[k, c]
+    if bend[0, 0] < 0.0 and m >= 3:
+        # Nothing is carried through the point where the rays meet.
+        m = _cut(corners, m, spare, 0.0, 0.0, 1.0, -0.999 * dz / bend[0, 0])
+        for k in range(m):
+            for c in range(3):
+                corners[k, c] = spare[k, c]
     if m < 3:
         return 0
     x0, x1, y0, y1, area = math.inf, -math.inf, math.inf, -math.inf, 0.0
@@ -289,12 +295,17 @@ def outlines(i, near, mirrors, towers, way, bend, reach, work):
         if m:
             sizes[count] = m
             count += 1
+    # A tower may stand close to the aim, beyond one of the two foci of an oblique mirror: there its
+    # rays are taken to meet in one point.
+    pencil = np.zeros((3, 2))
+    if bend[0, 0] != 0.0:
+        pencil[0, 0] = pencil[1, 1] = -2.0 * mirrors[i, 14]
     for k in range(len(towers)):
         if _beside_tower(i, towers[k], mirrors, way, reach):
             continue
         for part in range(2):
             m = _tower_corners(i, towers[k], mirrors, way, part, corners)
-            m = _carry(i, mirrors, way, bend, reach, corners, m, spare, polygons[count])
+            m = _carry(i, mirrors, way, pencil, reach, corners, m, spare, polygons[count])
             if m:
                 sizes[count] = m
                 count += 1

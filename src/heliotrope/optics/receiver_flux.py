@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, reflect
@@ -37,7 +38,7 @@ _MOST = 64
 #: Blocks of mirrors whose flux is summed apart, whatever the number of threads.
 _BLOCKS = 8
 #: Mirrors whose directions differ by less than this see the same cells of a mesh, rad.
-_ALIKE = np.radians(3.0)
+_ALIKE = np.radians(5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,17 +280,7 @@ class _Cells:
         own = np.einsum("cki,ckj->cij", from_middle, from_middle) / 12.0
         parts = (cells.center, cells.normal, cells.area, own.reshape(-1, 9))
         self._cells, self._middle = as_input(np.column_stack(parts)), as_input(surface.center)
-        mirrors = scene.mirrors
-        ways = reflect(np.broadcast_to(scene.sun, mirrors.normal.shape), mirrors.normal)
-        names, self._group = np.unique(np.round(ways / _ALIKE), axis=0, return_inverse=True)
-        hidden = np.zeros((len(names), len(corners)), dtype=np.bool_)
-        first = np.array([ways[self._group == k].mean(axis=0) for k in range(len(names))])
-        run_blocks(
-            lambda a, b: kernels.hide(a, b, first, self._cells, as_input(corners), hidden),
-            len(names),
-            2,
-        )
-        self._hidden = hidden
+        self._hidden, self._group = _hidden(scene, mesh, self._cells)
 
     def __call__(
         self, rows: IntArray, edges: list[int], field: Any, sign: float, flux: FloatArray,
@@ -309,6 +300,27 @@ class _Cells:
         if self._front is not None:
             # What enters the aperture, whatever the cells make of it.
             self._front(rows, edges, field, sign, self._seen, power)
+
+
+def _hidden(
+    scene: Scene, mesh: Mesh, cells: FloatArray
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
+    """Return which cells others hide from each of D directions, (D, C), and each mirror's, (H,)."""
+    count = len(scene.mirrors)
+    away = np.einsum("vk,ck->cv", mesh.vertices, mesh.cells.normal)
+    away -= np.sum(mesh.cells.center * mesh.cells.normal, axis=-1)[:, None]
+    room = 1e-6 * float(np.ptp(mesh.vertices, axis=0).max())
+    if (away < room).all() or (away > -room).all():
+        # Convex from outside, or from inside behind its aperture: only backs are dark.
+        return np.zeros((1, len(away)), dtype=np.bool_), np.zeros(count, dtype=np.intp)
+    normal = scene.mirrors.normal
+    ways = reflect(np.broadcast_to(scene.sun, normal.shape), normal)
+    names, group = np.unique(np.round(ways / _ALIKE), axis=0, return_inverse=True)
+    first = np.array([ways[group == k].mean(axis=0) for k in range(len(names))])
+    hidden = np.zeros((len(names), len(cells)), dtype=np.bool_)
+    corners = as_input(mesh.corners)
+    run_blocks(lambda a, b: kernels.hide(a, b, first, cells, corners, hidden), len(names), 2)
+    return hidden, group
 
 
 def _plan(surface: Surface, scene: Scene) -> _Grid | _Cells:
