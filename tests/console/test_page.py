@@ -440,7 +440,7 @@ def test_dark_and_light(enter: Callable[[str], Any]) -> None:
 def test_the_tabs_are_reached_by_keys(enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
     page.focus(".hx-tabs [aria-selected=true]")
-    for key, kind in (("ArrowRight", "heliostat"), ("ArrowLeft", "plant"), ("End", "schedule")):
+    for key, kind in (("ArrowRight", "heliostat"), ("ArrowLeft", "plant"), ("End", "shift")):
         page.keyboard.press(key)
         page.wait_for_selector(f".hx-tabs [data-tab={kind}][aria-selected=true]:focus")
         page.wait_for_selector(f".hx-panels > .hx-{kind}")

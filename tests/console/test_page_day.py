@@ -141,6 +141,8 @@ def test_aim_a_group_at_a_point_of_the_flux_picture(
     page = enter("operator")
     page.click(".hx-authority >> text=Take command")
     page.wait_for_selector(".hx-authority >> text=You have command")
+    # Visits under way go on to their ends.
+    field.until(lambda: not operations.automatic.view().running)
     page.fill(".hx-query", " ".join(names))
     page.keyboard.press("Enter")
     page.wait_for_selector("dt:has-text('Intercept')")

@@ -148,3 +148,45 @@ def test_only_people_who_may_command_change_it_and_only_to_what_can_be() -> None
             await plant.end()
 
     run_virtual(main, start=START)
+
+
+def test_some_come_first_and_some_never_unless_a_person_asks() -> None:
+    names = design().names
+
+    async def main(clock: VirtualClock) -> None:
+        first = TimetableEntry("first", (names[3],), rule="first")
+        never = TimetableEntry("never", (names[0],), rule="never")
+        plant = LivePlant(design(first, never), clock, LiveOptions(threads=0))
+        async with plant.running():
+            automatic = plant.operations.automatic
+
+            def visited() -> list[str]:
+                begun = [*automatic.view().results[::-1], *automatic.view().running]
+                return [one.heliostat for one in begun]
+
+            while not set(names[1:]) <= set(visited()):
+                await asyncio.sleep(2.0)
+            assert names[0] not in {visit.heliostat for visit in automatic.plan(4)}
+            assert names[3] in visited()[:2]
+            assert names[0] not in visited()
+            plant.operations.calibrate(OPERATOR, names[0])
+            while names[0] not in visited():
+                await asyncio.sleep(1.0)
+
+    run_virtual(main, start=START)
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"rule": "often"}, "rule 'often'; give first or never"),
+        ({"rule": "never", "at": ("12:00Z",)}, "leave times and target out"),
+        ({"rule": "first", "target": "left"}, "leave times and target out"),
+    ],
+)
+def test_a_rule_stands_alone(given: dict[str, object], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        TimetableEntry("a", ("A1",), **given)
+    made = TimetableEntry("a", ("A1",), rule="never")
+    assert TimetableEntry.of(made.document) == made
+    assert not made.due(0.0, 1e9)

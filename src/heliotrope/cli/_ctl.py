@@ -860,6 +860,13 @@ def timetable(
     every: Annotated[
         str, typer.Option(help="Interval from midnight UTC: 10min, 2h.", show_default=False)
     ] = "",
+    rule: Annotated[
+        str,
+        typer.Option(
+            help="Instead of times: first (before others) or never (only by persons).",
+            show_default=False,
+        ),
+    ] = "",
     remove: Annotated[bool, typer.Option("--remove", help="Remove the entry.")] = False,
     plant_file: Annotated[
         bool, typer.Option("--plant-file", help="Put the plant file's timetable in force again.")
@@ -867,12 +874,12 @@ def timetable(
     as_json: Json = False,
 ) -> None:
     """Show or change the calibrations at times of day and at intervals."""
-    gives = bool(heliostats or target or at or every)
+    gives = bool(heliostats or target or at or every or rule)
     if plant_file and (name or gives or remove):
         raise InputError("ctl timetable: --plant-file goes alone")
     if bool(name) != (gives or remove):
         raise InputError(
-            "ctl timetable: give NAME HELIOSTAT… with --at or --every, or NAME --remove"
+            "ctl timetable: give NAME HELIOSTAT… with --at, --every or --rule, or NAME --remove"
         )
     with _client(context) as client:
         answer = client.get("timetable")
@@ -881,7 +888,7 @@ def timetable(
             if entries is not None and gives:
                 seconds = parse_duration(every).total_seconds() if every else None
                 entry = {"name": name, "heliostats": heliostats or [], "target": target}
-                entries.append({**entry, "at": at or [], "every_s": seconds})
+                entries.append({**entry, "at": at or [], "every_s": seconds, "rule": rule})
             answer = client.ask("PUT", "timetable", {"entries": entries})
     if as_json:
         print_json(answer)
@@ -892,8 +899,8 @@ def timetable(
             ", ".join(row["heliostats"][:3]) + ("…" if len(row["heliostats"]) > 3 else ""),
             row["target"] or "any",
             ", ".join(row["at"]) + (f" every {row['every_s']:g} s" if row["every_s"] else ""),
-            _utc(row["next"]),
-            row["text"] or "not due yet",
+            row["rule"] or _utc(row["next"]),
+            row["text"] or ("" if row["rule"] else "not due yet"),
         )
         for row in answer
     ]
@@ -904,7 +911,7 @@ def _entries(in_force: list[dict[str, Any]], name: str, remove: bool) -> list[di
     """Return the entries in force but for one, as the API takes them."""
     if remove and name not in [entry["name"] for entry in in_force]:
         raise UnknownNameError("timetable entry", name, [entry["name"] for entry in in_force])
-    keys = ("name", "heliostats", "target", "at", "every_s")
+    keys = ("name", "heliostats", "target", "at", "every_s", "rule")
     return [{key: entry[key] for key in keys} for entry in in_force if entry["name"] != name]
 
 

@@ -17,7 +17,6 @@ SMALL = 1024
 _KINDS = {
     ".css": "text/css",
     ".js": "text/javascript",
-    ".json": "application/json",
     ".svg": "image/svg+xml",
 }
 #: Address and file of each page but the sign-in's.

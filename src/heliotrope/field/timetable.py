@@ -22,9 +22,13 @@ from heliotrope.geometry import FloatArray
 DAY, LEAST_INTERVAL, MOST, MOST_TIMES = 86_400.0, 60.0, 100, 96
 
 
+#: Rules for what automatic control chooses.
+RULES = ("first", "never")
+
+
 @dataclass(frozen=True)
 class TimetableEntry:
-    """Heliostats that are calibrated at times of day, at intervals, or both.
+    """Heliostats that are calibrated at times of day, at intervals, or both; or a rule for them.
 
     Attributes
     ----------
@@ -38,6 +42,9 @@ class TimetableEntry:
         Times of day with their zone, as "08:30Z" or "10:30+02:00".
     every
         Interval, s, counted from midnight UTC; None: only ``at``.
+    rule
+        "" for times; "first": automatic control takes them before others whenever a visit is worth
+        it; "never": it takes none of them, only persons do. A rule has neither times nor a target.
 
     Raises
     ------
@@ -50,6 +57,7 @@ class TimetableEntry:
     target: str = ""
     at: tuple[str, ...] = ()
     every: float | None = None
+    rule: str = ""
 
     def __post_init__(self) -> None:
         who = f"timetable entry {self.name!r}"
@@ -58,6 +66,12 @@ class TimetableEntry:
         if len(set(self.heliostats)) < len(self.heliostats):
             twice = next(n for n in self.heliostats if self.heliostats.count(n) > 1)
             raise InputError(f"{who}: heliostat {twice} stands in it twice; name it once")
+        if self.rule:
+            if self.rule not in RULES:
+                raise InputError(f"{who}: rule {self.rule!r}; give {' or '.join(RULES)}")
+            if self.at or self.every is not None or self.target:
+                raise InputError(f"{who}: {self.rule!r} is always so; leave times and target out")
+            return
         if not self.at and self.every is None:
             raise InputError(f"{who}: no time; give times of day (at) or an interval (every_s)")
         if len(self.at) > MOST_TIMES:
@@ -78,12 +92,14 @@ class TimetableEntry:
             document.get("target") or "",
             tuple(document.get("at") or ()),
             document.get("every_s"),
+            document.get("rule") or "",
         )
 
     @property
     def document(self) -> dict[str, Any]:
         """The entry with the keys of the plant file; what is not set is left out."""
-        rest = {"target": self.target, "at": list(self.at), "every_s": self.every}
+        rest: dict[str, Any] = {"target": self.target, "at": list(self.at), "every_s": self.every}
+        rest["rule"] = self.rule
         settings = {key: value for key, value in rest.items() if value}
         return {"name": self.name, "heliostats": list(self.heliostats), **settings}
 
@@ -96,10 +112,12 @@ class TimetableEntry:
 
     def due(self, since: float, until: float) -> bool:
         """Return whether it was due after ``since`` and up to ``until``, POSIX s."""
-        return self.next(since) <= until
+        return not self.rule and self.next(since) <= until
 
     def next(self, after: float) -> float:
-        """Return when it is due first after a time, POSIX s."""
+        """Return when it is due first after a time, POSIX s; NaN for a rule."""
+        if self.rule:
+            return math.nan
         day = math.floor(after / DAY) * DAY
         remaining = self.seconds[self.seconds > after - day]
         return day + (float(remaining[0]) if len(remaining) else DAY + float(self.seconds[0]))

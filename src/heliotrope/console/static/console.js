@@ -11,7 +11,7 @@ import { ask, count, h } from "./dom.js";
 import { alertText, headOf } from "./showing.js";
 
 function map(box) {
-  const view = h("select", { title: "Colour by (V)", onchange: () => store.emit("view", view.value) },
+  const view = h("select", { title: "Colour by (V)", ariaLabel: "Colour by", onchange: () => store.emit("view", view.value) },
     Object.entries(VIEWS).map(([name, { title }]) => h("option", { value: name }, title)));
   const title = (name) => name[0].toUpperCase() + name.slice(1);
   const mode = h("select", { title: "What a drag or a click on the map does; Shift and drag draws in every mode", ariaLabel: "Select by", onchange: () => store.emit("mode", mode.value) },

@@ -435,14 +435,16 @@ async function lockPlace() {
 // The operator's own timetable: heliostats calibrated at times of day or at intervals.
 const listed = (text) => text.split(",").map((one) => one.trim()).filter(Boolean);
 async function putTimetable(entries, what) { await act(() => api("PUT", "timetable", { entries }), what); }
-const asGiven = ({ name, heliostats, target, at, every_s }) => ({ name, heliostats, target, at, every_s });
+const asGiven = ({ name, heliostats, target, at, every_s, rule }) => ({ name, heliostats, target, at, every_s, rule });
+const RULES = { "at its times": "", "first: before others whenever a visit is worth it": "first", "never: only persons calibrate them": "never" };
 async function addEntry(rows) {
-  await askAnd("Calibrate heliostats at times of day, at an interval, or both? They come before all that automatic control would choose.", [
-    { name: "name", label: "Name of the entry" }, { name: "heliostats", label: "Heliostats, separated by commas" },
+  await askAnd("Calibrate heliostats at times of day, at an interval, or both; or have automatic control take them first, or never?", [
+    { name: "name", label: "Name of the entry" }, { name: "heliostats", label: "Heliostats, separated by commas", value: store.selected().slice(0, 200).join(", ") },
+    { name: "rule", label: "When", options: Object.keys(RULES) },
     { name: "target", label: "Target", options: ["any", ...store.field.targets] },
     { name: "at", label: "Times of day with zone (08:30Z, 10:30+02:00)", required: false },
     { name: "every", label: "Interval from midnight UTC (minutes)", type: "number", required: false }], "Put in force", (v) => {
-    const entry = { name: v.name, heliostats: listed(v.heliostats), target: v.target === "any" ? "" : v.target, at: listed(v.at || ""), every_s: v.every ? 60 * Number(v.every) : null };
+    const entry = { name: v.name, heliostats: listed(v.heliostats), target: v.target === "any" ? "" : v.target, at: listed(v.at || ""), every_s: v.every ? 60 * Number(v.every) : null, rule: RULES[v.rule] };
     return api("PUT", "timetable", { entries: [...rows.filter((one) => one.name !== v.name).map(asGiven), entry] });
   }, "timetable");
 }
@@ -460,9 +462,9 @@ export function schedule(box) {
       plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
         : h("p", { className: "hx-hint" }, "No measurement is planned."),
       h("h3", {}, "Timetable"),
-      canCommand() ? h("button", { className: "hx-button", onclick: () => addEntry(timed) }, "Calibrate at times of day or intervals…") : "",
+      canCommand() ? h("button", { className: "hx-button", onclick: () => addEntry(timed) }, "Calibrate at times, first or never…") : "",
       timed.length ? table([["Entry", (r) => r.name], ["Heliostats", (r) => r.heliostats.join(", ")], ["Target", (r) => r.target || "any"],
-        ["At", (r) => [...r.at, ...(r.every_s ? [`every ${span(r.every_s)}`] : [])].join(", ")], ["Next", (r) => minute(r.next)], ["Last", (r) => minute(r.last)], ["Result", (r) => r.text],
+        ["At", (r) => r.rule || [...r.at, ...(r.every_s ? [`every ${span(r.every_s)}`] : [])].join(", ")], ["Next", (r) => minute(r.next)], ["Last", (r) => minute(r.last)], ["Result", (r) => r.text],
         ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => removeEntry(timed, r.name) }, "Remove…") : "")]], timed)
         : h("p", { className: "hx-hint" }, "Empty."),
       h("h3", {}, `Tried again, or given up (${count(retries.length)})`),

@@ -1,7 +1,7 @@
 // The report of a shift, for the screen and for paper.
 import { api } from "./live.js";
 import { count, facts, h, moment, mrad, number, table } from "./dom.js";
-import { t, translate } from "./words.js";
+import { t } from "./words.js";
 
 const SVG = "http://www.w3.org/2000/svg", HOUR = 3600, DAY = 86400;
 const hours = (seconds) => `${number(seconds / HOUR, 1)} h`;
@@ -74,7 +74,6 @@ form.append(h("label", { className: "hx-field" }, t("From (UTC)"), since), h("la
   button(t("Last 8 hours"), () => show(0, 0)), button(t("Today"), () => show(midnight(), 0)), button(t("Yesterday"), () => show(midnight() - DAY, midnight())),
   button(t("Print"), () => print()), h("a", { href: "/" }, t("Back to the console")));
 form.onsubmit = (event) => { event.preventDefault(); show(read(since), read(until)); };
-translate(document.head);
 document.documentElement.classList.toggle("light", localStorage.getItem("heliotrope-theme") === "light");
 const asked = new URLSearchParams(location.search);
 await show(Number(asked.get("since")) || 0, Number(asked.get("until")) || 0);

@@ -1,14 +1,13 @@
 // Trends of any quantity over days beside their events: drag to zoom, wheel, buttons to move, export.
 import { api } from "./live.js";
 import { h, moment, saveCsv, table } from "./dom.js";
-import { t, translate } from "./words.js";
+import { t } from "./words.js";
 
 const { uPlot } = window, DAY = 86400, MOST = 6;
 // Units on the screen, by those of the API.
 const SCREEN = { W: ["MW", 1e-6], rad: ["mrad", 1e3] };
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 document.documentElement.classList.toggle("light", localStorage.getItem("heliotrope-theme") === "light");
-translate(document.body);
 
 const [form, tools] = [document.querySelector("form"), document.querySelector("form + div")], said = document.querySelector("[role=status]");
 const charts = document.querySelector("#charts"), events = document.querySelector("#events"), synced = uPlot.sync("trends");

@@ -4,7 +4,7 @@ import { FieldMap } from "./map.js";
 import { alertText, drawFlux, headOf } from "./showing.js";
 import { clock, count, h, number, refreshed } from "./dom.js";
 import { colourOf } from "./palette.js";
-import { t, translate } from "./words.js";
+import { t } from "./words.js";
 
 const part = (name) => document.querySelector(`.hx-${name}`), SEVERE = { emergency: "bad", alarm: "bad", fault: "bad", warning: "warn" };
 
@@ -34,6 +34,5 @@ function figures(box) {
 }
 
 document.documentElement.classList.toggle("light", localStorage.getItem("heliotrope-theme") === "light");
-translate(document.body);
 store.start().then(() => { new FieldMap(part("map-field")); headOf(part("head")); alertText(part("alert")); figures(part("side")); });
 window.heliotrope = { store }; // for tests

@@ -391,6 +391,9 @@ class TimetableTable(StrictTable):
         default_factory=list, description="Times of day with their zone: 08:30Z, 10:30+02:00."
     )
     every_s: Number | None = Field(None, description="Interval, from midnight UTC; 60 to 86400.")
+    rule: Literal["", "first", "never"] = Field(
+        "", description="Instead of times: taken before others, or only by persons."
+    )
 
 
 class PlantDocument(StrictTable):

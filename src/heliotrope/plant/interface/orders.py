@@ -176,6 +176,10 @@ class TimetableOrderEntry(Strict):
         Field(max_length=MOST_TIMES, description="Times of day with their zone, as 08:30Z."),
     ] = []
     every_s: Annotated[float, Field(ge=LEAST_INTERVAL, le=DAY)] | None = None
+    rule: Annotated[
+        Literal["", "first", "never"],
+        Field(description="Instead of times: automatic control takes them first, or never."),
+    ] = ""
 
 
 class TimetableOrder(Strict):

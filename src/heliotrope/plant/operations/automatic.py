@@ -227,7 +227,14 @@ class AutomaticControl:
         self._foresight: Foresight | None = None
         if visits is not None:
             self._calibrating = Calibrating(
-                plant, logbook, visits, self.book, self._keeping, self.truth, self.flights.first
+                plant,
+                logbook,
+                visits,
+                self.book,
+                self._keeping,
+                self.truth,
+                self.flights.first,
+                self.timetable.ruled,
             )
             if settings.foresee > 0.0:
                 self._foresight = Foresight(

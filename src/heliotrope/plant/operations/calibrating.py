@@ -166,6 +166,8 @@ class Calibrating:
         True errors, known to a twin only.
     first
         Returns the heliostats to be visited first, after those in doubt.
+    ruled
+        Returns a mask of the heliostats under a rule of the timetable, (N,); None: none is.
     """
 
     def __init__(
@@ -177,12 +179,14 @@ class Calibrating:
         keeping: Keeping,
         truth: TrueErrors,
         first: Callable[[], Collection[str]],
+        ruled: Callable[[str], npt.NDArray[np.bool_]] | None = None,
     ) -> None:
         self._plant, self._log, self._first = plant, log, first
         self._book, self._keeping, self._truth = book, keeping, truth
         self._cycle, self._scheduler = visits.cycle, visits.scheduler
         self._pictures, joint, receiver = visits.pictures, visits.joint, visits.receiver
         tell = log.take_alarm
+        self._ruled = ruled or (lambda _: np.zeros(len(plant.field.names), dtype=np.bool_))
         self._joint = None if joint is None else JointVisits(plant, book, joint, tell)
         self._receiver = None if receiver is None else ReceiverVisits(plant, book, receiver, tell)
         self._running: dict[str, Running] = {}
@@ -281,7 +285,11 @@ class Calibrating:
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> tuple[PlannedVisit, ...]:
         """Return the coming visits of the ready heliostats, (N,)."""
-        return tuple(self._scheduler.plan(ready, limit))
+        return tuple(self._scheduler.plan(self._chooses(ready), limit))
+
+    def _chooses(self, ready: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Return a mask of the ready heliostats that the schedule may choose itself, (N,)."""
+        return np.asarray(ready & ~self._ruled("never"))
 
     async def visit(
         self, target: str, ready: npt.NDArray[np.bool_], person: Person, token: int
@@ -295,7 +303,7 @@ class Calibrating:
         if not self.asked and not self._places.due(target, self._plant.now()):
             return ()
         if self._joint is not None:
-            if not self.asked and self._joint.awaited(target, ready):
+            if not self.asked and self._joint.awaited(target, self._chooses(ready)):
                 return ()
             if names := await self._for_joint_visit(self._joint, target, ready):
                 self._joint.begun(target)
@@ -342,6 +350,7 @@ class Calibrating:
             where in ("", target) and ready[self._plant.field.place(name)]
             for name, (where, _) in self._asked.items()
         )
+        ready = self._chooses(ready)
         if alone or (ready & self._pressing() & self._fresh()).any():
             return ()
         names = await joint.chosen(target, ready, self._scheduler.next)
@@ -455,10 +464,12 @@ class Calibrating:
                 del self._asked[name]
                 return name, search
         changed = np.isin(self._plant.field.names, list(self._first()))
+        ready = self._chooses(ready)
         fresh = ready & self._fresh()
+        before = fresh & self._ruled("first")
         alone = fresh if self._joint is None else self._joint.alone(fresh)
         doubted = fresh & self._plant.doubtful.standing
-        for rows in (doubted, fresh & changed, alone, fresh, ready):
+        for rows in (doubted, fresh & changed, before, alone, fresh, ready):
             chosen = self._scheduler.next(target, rows) if rows.any() else None
             if chosen is not None:
                 return chosen.heliostat, False

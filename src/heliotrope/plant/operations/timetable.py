@@ -9,6 +9,9 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.timetable import TimetableEntry, check_timetable
 from heliotrope.plant.controller import PlantController
@@ -92,6 +95,13 @@ class Timetable:
             if entry.due(since, self._looked):
                 self._ask(entry, ask)
 
+    def ruled(self, rule: str) -> npt.NDArray[np.bool_]:
+        """Return a mask of the heliostats under a rule of the entries in force, (N,)."""
+        named = [n for entry in self._entries if entry.rule == rule for n in entry.heliostats]
+        mask = np.zeros(len(self._plant.field.names), dtype=np.bool_)
+        mask[[self._plant.field.place(name) for name in named]] = True
+        return mask
+
     def rows(self) -> tuple[TimetableRow, ...]:
         """Return the entries in force, with their last and next times."""
         now, rows = self._now(), []
@@ -106,6 +116,7 @@ class Timetable:
                 entry.next(now),
                 turn.at,
                 turn.text,
+                entry.rule,
             )
             rows.append(row)
         return tuple(rows)

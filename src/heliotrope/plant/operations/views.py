@@ -607,6 +607,8 @@ class TimetableRow:
         When it is due, and when it was, POSIX s; NaN before the first time.
     text
         What came of the last time.
+    rule
+        "" for times; "first" or "never": what automatic control chooses of them.
     """
 
     name: str
@@ -617,6 +619,7 @@ class TimetableRow:
     next: float
     last: float
     text: str
+    rule: str = ""
 
 
 @dataclass(frozen=True)
