@@ -31,7 +31,7 @@ def main() -> None:
     with compiling():
         following()
         guarding()
-    for part in (searching, breaking, tracking, fitting):
+    for part in (searching, breaking, tracking, fitting, lighting):
         part()
 
 
@@ -135,6 +135,14 @@ def guarding() -> None:
         Box("far", (900.0, 0.0, 0.0), (1.0,) * 3),
     ]
     sweep(mechanism.armature, path, (0.0, -0.6, 0.8), MirrorOptics.of([2.0], [2.0]), volumes)
+
+
+def lighting() -> None:
+    """Cast the light of three mirrors on a receiver."""
+    from heliotrope.field.layouts import malan_plant
+    from heliotrope.optics.plant_flux import field_flux
+
+    field_flux(malan_plant(3), sun=(0.0, 0.6, 0.8))
 
 
 def _case() -> "tuple[Mechanism, Sightings]":
