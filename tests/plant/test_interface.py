@@ -580,7 +580,9 @@ def test_a_photograph_that_is_known_is_not_sent_again() -> None:
 def test_an_aim_is_a_place_or_points_and_never_both() -> None:
     aimed = list[Any]()
     here = {
-        "aim_at": lambda who, token, heliostats, where: aimed.append((token, heliostats, where)),
+        "aim_at": lambda who, token, heliostats, where, place: aimed.append(
+            (token, heliostats, where)
+        ),
         "aim": lambda who, token, points: aimed.append((token, points["A"].tolist())),
     }
     point = np.array([1.0, 2.0, 3.0])

@@ -310,6 +310,8 @@ def run(
     with contextlib.ExitStack() as stack:
         twin = None
         if clusters is None:
+            import sqlalchemy  # noqa: F401 - where it is absent, no field begins in vain
+
             if configure or check:
                 raise InputError("run: --configure and --check need a real plant; give --clusters")
             design = design_of(field, heliostats, prototype=prototype)
