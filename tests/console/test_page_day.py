@@ -81,6 +81,7 @@ def test_versions_side_by_side_and_one_brought_back(
         page.fill("dialog [name=reason]", "levelled")
         page.click("dialog >> text=Store new values")
         page.wait_for_selector("dialog .hx-told:not(.bad):has-text('done')")
+        until(page, "document.querySelector('dialog [name=reason]').value === ''")
     page.click("dialog >> text='Close'")
     last = field.call(lambda: field.live.plant.beliefs.record(name))
     assert last.parameters["tilt_east"] == pytest.approx(1.5e-3)

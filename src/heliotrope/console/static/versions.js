@@ -15,7 +15,7 @@ export async function compareVersions(name) {
   const body = h("div"), told = h("p", { className: "hx-told", role: "status" }), engineer = me.role === "engineer";
   const reason = h("input", { name: "reason", maxLength: 500, placeholder: t("Reason, kept with the version") });
   const tell = (text, bad) => { told.textContent = text; told.classList.toggle("bad", Boolean(bad)); };
-  let typed = new Map(); // what was typed, by parameter, stays while versions are chosen
+  const typed = new Map(); // what was typed, by parameter, stays while versions are chosen
 
   const load = async () => {
     try {
@@ -31,12 +31,13 @@ export async function compareVersions(name) {
   };
   // The order is followed here to its end; what was typed stays after a refusal.
   const give = async (order) => {
+    const sent = new Map(typed);
     try {
       if (!reason.value.trim()) throw new Error(t("give the reason: it is kept with the version and in the audit"));
       let ticket = await api("POST", "parameters", { heliostat: name, reason: reason.value, ...order });
       while (!ticket.finished && dialog.isConnected) { tell(ticket.text); await new Promise((wake) => setTimeout(wake, 700)); ticket = await api("GET", `commands/${encodeURIComponent(ticket.identity)}`); }
       tell(ticket.text, !ticket.good);
-      if (ticket.good) { typed = new Map(); reason.value = ""; await load(); }
+      if (ticket.good) { for (const [key, one] of sent) if (typed.get(key) === one) typed.delete(key); reason.value = ""; await load(); }
     } catch (error) { tell(error.message, true); }
   };
   const back = h("button", { type: "button", className: "hx-button", onclick: () => give({ version: Number(first.value) }) });
