@@ -319,8 +319,7 @@ def run(
             up = begin is not Begin.STOW and not prototype
             options = _options(field, heliostats, prototype=prototype)
             options += ["--speed", str(speed), "--start", begins.isoformat(), *["--up"] * up]
-            new = begin is Begin.NEW or prototype
-            measured = 0 if new else min(_MEASURED, len(design) * 3 // 20)
+            measured = 0 if begin is Begin.NEW or prototype else _measured(len(design))
             # It begins while the plant's program is loaded.
             twin = stack.enter_context(twin_process(options, seed, measured))
         from heliotrope.cli.run._evidence import Evidence
@@ -367,6 +366,11 @@ def run(
         folder = field if field.is_dir() else field.parent
         choice = PlantChoice(folder, clusters, idle is not False, configure, check)
         run_plant(open_plant(field), choice, shown)
+
+
+def _measured(heliostats: int) -> int:
+    """Return how many mirrors were measured yesterday."""
+    return min(_MEASURED, heliostats * 3 // 20)
 
 
 def _options(field: Path | None, heliostats: int | None, *, prototype: bool) -> list[str]:
