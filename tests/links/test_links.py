@@ -354,9 +354,12 @@ def test_a_partition_is_noticed_by_both_within_the_deadline_and_nothing_is_kept(
             begin = clock.monotonic()
             in_doubt = await plant.send(b"while cut", expires=begin + 1.0)
             assert in_doubt is SendOutcome.SENT  # nobody can know yet
+            ends = begin + cluster.lasts
             while plant.connected or cluster.connected:
                 await asyncio.sleep(0.01)
             assert 1.0 <= clock.monotonic() - begin <= 1.52
+            assert ends == pytest.approx(clock.monotonic(), abs=0.52)
+            assert plant.lasts == cluster.lasts == 0.0
             assert await plant.send(b"dropped", expires=begin + 60.0) is SendOutcome.DISCONNECTED
             assert plant.statistics.dropped == 1
             await asyncio.sleep(5.0)
@@ -608,6 +611,20 @@ def real(main: Callable[[], Awaitable[None]]) -> None:
 def server(keys: dict[str, bytes] | None = None, **options: object) -> TcpServer:
     keys = keys or {"north": KEY}
     return TcpServer("127.0.0.1", 0, keys, SystemClock(), QUICK, **options)  # type: ignore[arg-type]
+
+
+def test_all_clusters_of_a_field_may_call_in_the_same_instant() -> None:
+    async def main() -> None:
+        plant = server({f"C{i:03}": KEY for i in range(300)})
+        async with running(plant):
+            await plant.listening()
+            with contextlib.ExitStack() as stack:
+                # Its loop does not turn meanwhile; a call that the system drops waits for a second.
+                for _ in range(300):
+                    call = socket.create_connection(("127.0.0.1", plant.port), timeout=0.5)
+                    stack.enter_context(call)
+
+    asyncio.run(main())
 
 
 def client(port: int, name: str = "north", key: bytes = KEY, **options: object) -> Link:

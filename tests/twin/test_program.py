@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -32,6 +33,7 @@ from heliotrope.twin.live import PacedLoop, World, WorldOptions
 from heliotrope.twin.live.live import true_mechanisms
 from heliotrope.twin.program import read_folder, write_folder
 from heliotrope.twin.program.boards import read_boards, write_boards
+from heliotrope.twin.program.program import _ends
 from heliotrope.twin.program.server import TwinServer
 from heliotrope.twin.weather import WeatherStation
 from heliotrope.twin.yesterday import measure_yesterday, with_records
@@ -202,6 +204,24 @@ def test_a_field_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("heliotrope.plant.io.followed_clock._STARTING", 0.0)
     with pytest.raises(FetchError, match="simulated field: no answer"):
         ClockReader(f"http://127.0.0.1:{free_port()}/{SECRET}")
+
+
+@pytest.mark.parametrize(
+    ("connected", "lasts", "lease", "ends"),
+    [
+        (True, 1.4, 2.8, 1.0),  # the connection ends first
+        (True, 1.4, 1.5, 0.1),  # the lease does
+        (True, 1.4, -5.0, 1.0),  # no plant leads it yet
+        (True, 0.3, 2.8, -0.1),
+        (False, 0.0, 1.5, math.inf),  # nothing comes from a plant that has ended
+    ],
+)
+def test_a_field_waits_for_a_plant_that_is_late(
+    connected: bool, lasts: float, lease: float, ends: float
+) -> None:
+    link = SimpleNamespace(connected=connected, lasts=lasts)
+    found = _ends(SimpleNamespace(lease_left=lease), link)  # type: ignore[arg-type]
+    assert found == pytest.approx(ends)
 
 
 # -- the field -----------------------------------------------------------------------------

@@ -111,7 +111,14 @@ class CarriedLink:
     @property
     def connected(self) -> bool:
         """Whether the other end was alive, and heard this end, within the deadline."""
-        return self._open and self._until(-math.inf) > self._clock.monotonic()
+        return self.lasts > 0.0
+
+    @property
+    def lasts(self) -> float:
+        """Time until the connection ends unless something is heard, s; 0: not connected."""
+        if not self._open:
+            return 0.0
+        return max(0.0, self._until(-math.inf) - self._clock.monotonic())
 
     def _until(self, opened: float) -> float:
         """Return when the connection ends unless something is heard."""

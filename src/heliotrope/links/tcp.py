@@ -481,7 +481,11 @@ class TcpServer:
         """
         try:
             server = await asyncio.get_running_loop().create_server(
-                lambda: _Pipe(_GREETING, self._arrive), self._host, self._requested
+                lambda: _Pipe(_GREETING, self._arrive),
+                self._host,
+                self._requested,
+                # All clusters may call in the same instant, as after a restart.
+                backlog=len(self.links) + 2 * _NEWCOMERS,
             )
         except OSError as error:
             raise LinkError(

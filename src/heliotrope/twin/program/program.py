@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from heliotrope.cluster.controller import Cluster
 from heliotrope.errors import FetchError
 from heliotrope.field.plant import Plant
 from heliotrope.imaging.frame import Frame
@@ -29,8 +30,11 @@ _FIRST = 0.02
 #: A lease of the plant this long says that it leads the cluster, s.
 _LED = 1.5
 #: Time is held this long before the end of a lease, s: the plant, which renews it each second, then
-#: takes no status of a cluster for old. Wall time for which it is held for a plant that hangs, s.
-_HELD, _HANGS = 1.4, 10.0
+#: takes no status of a cluster for old; and this long before a connection counts as lost, s.
+_HELD, _HEARD = 1.4, 0.4
+#: Wall time for which it is held for a plant that hangs, s: ten times what a plant of 10,000
+#: computes at a stretch, for a machine that has other work.
+_HANGS = 60.0
 #: Time in which clusters have sent the orders with which they begin, and in which the plant has
 #: heard of a field that tracks, s.
 _BEGUN, _REPORTED = 0.5, 1.2
@@ -221,20 +225,27 @@ class TwinProgram:
 
 
 async def _hold(world: World, loop: PacedLoop) -> None:
-    """Hold the loop's time before a lease of the plant ends, without end.
+    """Hold the loop's time before a lease of the plant or a connection ends, without end.
 
     Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A plant
-    that leads no cluster any more has ended, and one that renews nothing for long hangs.
+    that is connected to no cluster has ended, and one that says nothing for long hangs.
     """
-    renewed = time.monotonic()
+    said = time.monotonic()
     while True:
-        led = [left for cluster in world.clusters if (left := cluster.lease_left) > 0.0]
-        least = min(led, default=math.inf)
-        if least > _HELD:
-            renewed = time.monotonic()
-        hangs = time.monotonic() - renewed > _HANGS
-        loop.until = math.inf if hangs else loop.time() + max(0.0, least - _HELD)
+        ends = min(map(_ends, world.clusters, world.far), default=math.inf)
+        if ends > 0.0:
+            said = time.monotonic()
+        hangs = time.monotonic() - said > _HANGS
+        loop.until = math.inf if hangs else loop.time() + max(0.0, ends)
         await _wall(_CHECKED)
+
+
+def _ends(cluster: Cluster, link: CarriedLink) -> float:
+    """Return how long time may go on before a cluster must have heard its plant, s."""
+    if not link.connected:
+        return math.inf
+    lease = cluster.lease_left
+    return min(link.lasts - _HEARD, lease - _HELD if lease > 0.0 else math.inf)
 
 
 class _Sensors:
