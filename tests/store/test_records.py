@@ -146,6 +146,21 @@ class TestParameters:
         assert math.isnan(second.after)
         assert keeper.calibration_history("nobody") == []
 
+    def test_many_at_once_are_those_one_by_one(self, keeper: Keeper, seen: Sightings) -> None:
+        """Of the second versions, some rest on sightings of the first, and some no longer do."""
+        numbers = keeper.record_sightings(NAMES, seen)
+        groups = [("A1", numbers[:3], 1), ("B", numbers[2:5], 1), ("A1", numbers[1:4], 2)]
+        one = [version(name, some, version=number) for name, some, number in groups]
+        keeper.record_calibration(*one[:2])
+        keeper.record_calibration(one[2], version("C", numbers[:1]))
+        with pytest.raises(InputError, match="calibration of B: two versions at once"):
+            keeper.record_calibration(*(version("B", numbers[:1], version=n) for n in (2, 3)))
+        confirm(keeper)
+        history = [*keeper.calibration_history("A1"), *keeper.calibration_history("B")]
+        for found, wanted in zip(history, (one[0], one[2], one[1]), strict=True):
+            np.testing.assert_array_equal(found.sightings, wanted.sightings)
+            np.testing.assert_array_equal(found.residual_after[-1], wanted.residual_after[-1])
+
     def test_the_latest_of_each(self, keeper: Keeper) -> None:
         none = np.zeros(0, np.int64)
         for seed, name in enumerate(("A", "B", "A", "A", "C")):

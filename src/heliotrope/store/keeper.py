@@ -187,31 +187,39 @@ class Keeper:
         self.writer.put(lambda c: rows.insert(c, tables.sighting, made))
         return numbers
 
-    def record_calibration(self, record: HeliostatCalibration) -> None:
-        """Record a calibration; its version must be above the recorded ones of the heliostat.
+    def record_calibration(self, *records: HeliostatCalibration) -> None:
+        """Record calibrations; each version must be above the recorded ones of its heliostat.
 
         Raises
         ------
         InputError
-            If its version is not above them.
+            If a version is not above them, or a heliostat comes twice; then none is recorded.
         StoreError
             If too many records wait already.
         """
         with self._mine:
-            last = self._versions.get(record.heliostat, 0)
-            if record.version <= last:
-                raise InputError(
-                    f"calibration of {record.heliostat}: version {record.version} is not above "
-                    f"{last}, the last one recorded; give it a higher version"
-                )
-            row = rows.row_of(tables.parameter_version, record)
+            versions = dict[str, int]()
+            for record in records:
+                if record.heliostat in versions:
+                    raise InputError(
+                        f"calibration of {record.heliostat}: two versions at once; record the "
+                        "second when the first is recorded"
+                    )
+                last = self._versions.get(record.heliostat, 0)
+                if record.version <= last:
+                    raise InputError(
+                        f"calibration of {record.heliostat}: version {record.version} is not above "
+                        f"{last}, the last one recorded; give it a higher version"
+                    )
+                versions[record.heliostat] = record.version
+            made = [rows.row_of(tables.parameter_version, record) for record in records]
 
             def work(connection: Connection) -> None:
-                rows.insert(connection, tables.parameter_version, [row])
-                _change_behind(connection, record)
+                rows.insert(connection, tables.parameter_version, made)
+                _change_behind(connection, records)
 
             self.writer.put(work)
-            self._versions[record.heliostat] = record.version
+            self._versions |= versions
 
     def sightings(
         self,
@@ -493,18 +501,31 @@ def calibration_history(connection: Connection, heliostat: str) -> list[Heliosta
     return [rows.calibration(row, behind) for row in connection.execute(query).mappings().all()]
 
 
-def _change_behind(connection: Connection, record: HeliostatCalibration) -> None:
-    """Record the sightings behind a version: those that the one before does not rest on alike."""
+def _change_behind(connection: Connection, records: Sequence[HeliostatCalibration]) -> None:
+    """Record the sightings behind versions: those that the ones before do not rest on alike."""
     used = tables.parameter_sighting.c
-    mine = and_(used.heliostat == record.heliostat, used.until.is_(None))
-    uses = connection.execute(select(used.sighting, used.used).where(mine))
-    made, dropped = rows.behind_rows(record, {number: bool(use) for number, use in uses})
-    for k in range(0, len(dropped), _MANY):
-        ended = and_(mine, used.sighting.in_(dropped[k : k + _MANY]))
-        connection.execute(
-            update(tables.parameter_sighting).where(ended).values(until=record.version)
-        )
-    rows.insert(connection, tables.parameter_sighting, made)
+    standing: dict[str, dict[int, bool]] = {record.heliostat: {} for record in records}
+    names = list(standing)
+    for k in range(0, len(names), _MANY):
+        mine = and_(used.heliostat.in_(names[k : k + _MANY]), used.until.is_(None))
+        for name, number, use in connection.execute(
+            select(used.heliostat, used.sighting, used.used).where(mine)
+        ):
+            standing[name][number] = bool(use)
+    rows_made: list[rows.Row] = []
+    for record in records:
+        made, dropped = rows.behind_rows(record, standing[record.heliostat])
+        for k in range(0, len(dropped), _MANY):
+            ended = and_(
+                used.heliostat == record.heliostat,
+                used.until.is_(None),
+                used.sighting.in_(dropped[k : k + _MANY]),
+            )
+            connection.execute(
+                update(tables.parameter_sighting).where(ended).values(until=record.version)
+            )
+        rows_made += made
+    rows.insert(connection, tables.parameter_sighting, rows_made)
 
 
 def _make_folder(folder: Path) -> None:

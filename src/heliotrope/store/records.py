@@ -536,8 +536,8 @@ class Records(Protocol):
         """Record sightings, whose rows point to ``names``; return their numbers, (M,)."""
         ...
 
-    def record_calibration(self, record: HeliostatCalibration) -> None:
-        """Record a calibration; its version must be above the recorded ones of the heliostat."""
+    def record_calibration(self, *records: HeliostatCalibration) -> None:
+        """Record calibrations; each version must be above the recorded ones of its heliostat."""
         ...
 
     def record(self, fact: Fact) -> None:

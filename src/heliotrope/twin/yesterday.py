@@ -93,8 +93,10 @@ class Yesterday:
             numbers[rows] = records.record_sightings(
                 self.names, some, target=target, campaign=CAMPAIGN
             )
-        for record in self.calibrations:
-            records.record_calibration(replace(record, sightings=numbers[record.sightings]))
+        kept = [replace(r, sightings=numbers[r.sightings]) for r in self.calibrations]
+        # Together, since one by one they take seconds; a later version changes what is behind.
+        for version in sorted({record.version for record in kept}):
+            records.record_calibration(*(r for r in kept if r.version == version))
         for visit in self.visits:
             records.record(visit)
         if self.visits:
