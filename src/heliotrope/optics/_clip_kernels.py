@@ -46,11 +46,11 @@ def gridded(mirrors, low, step, shape, heads, links, tops):
 
 
 @njit(**INNER)
-def _near(i, j, mirrors, way, reach, slack):
-    """Whether mirror j may touch the rays from mirror i along a way, up to a distance."""
+def _near(i, j, mirrors, ray, reach, slack):
+    """Whether mirror j may touch the rays from mirror i in a direction, up to a distance."""
     x, y = mirrors[j, 0] - mirrors[i, 0], mirrors[j, 1] - mirrors[i, 1]
     z = mirrors[j, 2] - mirrors[i, 2]
-    along = x * way[0] + y * way[1] + z * way[2]
+    along = x * ray[0] + y * ray[1] + z * ray[2]
     room = mirrors[i, 15] + mirrors[j, 15] + slack
     if along < -room or along > reach + room:
         return False
@@ -58,18 +58,18 @@ def _near(i, j, mirrors, way, reach, slack):
 
 
 @njit(**INNER)
-def _along(i, mirrors, way, reach, slack, grid, found, count):
-    """Append the mirrors near the rays from mirror i along a way; returns them and their number."""
+def _along(i, mirrors, ray, reach, slack, grid, near, count):
+    """Append the mirrors near the rays from mirror i in a direction; return all, and how many."""
     low, step, shape, heads, links, tops, top = grid
     x0, y0, z0 = mirrors[i, 0] - low[0], mirrors[i, 1] - low[1], mirrors[i, 2] - mirrors[i, 15]
     wide = mirrors[i, 15] + 0.5 * step + slack
     length = reach
-    if way[2] > 0.0:
-        length = min(reach, max(0.0, (top - z0) / way[2]))
+    if ray[2] > 0.0:
+        length = min(reach, max(0.0, (top - z0) / ray[2]))
     # Columns are taken along the axis in which the ray goes faster.
-    major = 0 if abs(way[0]) >= abs(way[1]) else 1
+    major = 0 if abs(ray[0]) >= abs(ray[1]) else 1
     a0, b0 = (x0, y0) if major == 0 else (y0, x0)
-    da, db = way[major], way[1 - major]
+    da, db = ray[major], ray[1 - major]
     na, nb = shape[1 - major], shape[major]
     ends = (a0, a0 + length * da)
     first = max(0, math.floor((min(ends) - wide) / step))
@@ -79,51 +79,51 @@ def _along(i, mirrors, way, reach, slack, grid, found, count):
     for a in range(first, last + 1):
         left = min(max(a * step - a0, min(0.0, length * da)), max(0.0, length * da))
         right = min(max((a + 1) * step - a0, min(0.0, length * da)), max(0.0, length * da))
-        one, other = b0 + slope * left, b0 + slope * right
-        start = max(0, math.floor((min(one, other) - thick) / step))
-        stop = min(nb - 1, math.floor((max(one, other) + thick) / step))
+        enter, leave = b0 + slope * left, b0 + slope * right
+        start = max(0, math.floor((min(enter, leave) - thick) / step))
+        stop = min(nb - 1, math.floor((max(enter, leave) + thick) / step))
         lowest = z0
         if abs(da) > 1e-12:
-            lowest = min(z0 + way[2] * (left - wide) / da, z0 + way[2] * (right + wide) / da)
-            lowest = min(lowest, z0 + way[2] * (left + wide) / da)
-            lowest = min(lowest, z0 + way[2] * (right - wide) / da)
+            lowest = min(z0 + ray[2] * (left - wide) / da, z0 + ray[2] * (right + wide) / da)
+            lowest = min(lowest, z0 + ray[2] * (left + wide) / da)
+            lowest = min(lowest, z0 + ray[2] * (right - wide) / da)
         for b in range(start, stop + 1):
             k = b * shape[1] + a if major == 0 else a * shape[1] + b
             if tops[k] < lowest:
                 continue
             j = heads[k]
             while j >= 0:
-                if j != i and _near(i, j, mirrors, way, reach, slack):
-                    if count == len(found):
+                if j != i and _near(i, j, mirrors, ray, reach, slack):
+                    if count == len(near):
                         grown = np.empty(2 * count, dtype=np.int64)
                         for m in range(count):
-                            grown[m] = found[m]
-                        found = grown
-                    found[count] = j
+                            grown[m] = near[m]
+                        near = grown
+                    near[count] = j
                     count += 1
                 j = links[j]
-    return found, count
+    return near, count
 
 
 @njit(**OPTIONS)
-def candidates(rows, mirrors, sun, ways, reaches, slack, grid, spans):
+def candidates(rows, mirrors, sun, rays, reaches, slack, grid, spans):
     """Mirrors that may shade and block each of ``rows``: one list, and where each part begins.
 
     ``spans`` (R + 1, 2) gets the begin of the shading and of the blocking ones; the last row, the
     end.
     """
-    found, count = np.empty(8 * len(rows) + 64, dtype=np.int64), 0
+    near, count = np.empty(8 * len(rows) + 64, dtype=np.int64), 0
     # Shadows are no longer than the field.
     far = 1.5 * grid[1] * (grid[2][0] + grid[2][1])
     for r in range(len(rows)):
         i = rows[r]
         spans[r, 0] = count
-        found, count = _along(i, mirrors, sun, far, slack, grid, found, count)
+        near, count = _along(i, mirrors, sun, far, slack, grid, near, count)
         spans[r, 1] = count
-        found, count = _along(i, mirrors, ways[i], reaches[i], slack, grid, found, count)
+        near, count = _along(i, mirrors, rays[i], reaches[i], slack, grid, near, count)
     spans[len(rows), 0] = count
     spans[len(rows), 1] = count
-    return found[:count]
+    return near[:count]
 
 
 @njit(**INLINED)
@@ -132,16 +132,16 @@ def _cut(corners, m, into, axis_x, axis_y, axis_z, offset):
     count = 0
     for k in range(m):
         k2 = k + 1 if k + 1 < m else 0
-        here = (corners[k, 0] * axis_x + corners[k, 1] * axis_y + corners[k, 2] * axis_z) - offset
-        there = (
+        before = (corners[k, 0] * axis_x + corners[k, 1] * axis_y + corners[k, 2] * axis_z) - offset
+        after = (
             corners[k2, 0] * axis_x + corners[k2, 1] * axis_y + corners[k2, 2] * axis_z
         ) - offset
-        if here <= 0.0:
+        if before <= 0.0:
             for c in range(3):
                 into[count, c] = corners[k, c]
             count += 1
-        if (here < 0.0 < there) or (there < 0.0 < here):
-            t = here / (here - there)
+        if (before < 0.0 < after) or (after < 0.0 < before):
+            t = before / (before - after)
             for c in range(3):
                 into[count, c] = corners[k, c] + t * (corners[k2, c] - corners[k, c])
             count += 1
@@ -149,7 +149,7 @@ def _cut(corners, m, into, axis_x, axis_y, axis_z, offset):
 
 
 @njit(**INNER)
-def _carry(i, mirrors, way, bend, reach, corners, m, spare, polygon):
+def _carry(i, mirrors, ray, bend, reach, corners, m, spare, polygon):
     """Carry a polygon, relative to mirror i in ENU, into its plane; 0 corners if it hides nothing.
 
     ``bend`` is D in the mirror's axes, (3, 2).
@@ -160,9 +160,9 @@ def _carry(i, mirrors, way, bend, reach, corners, m, spare, polygon):
         corners[k, 0] = x * row[3] + y * row[4] + z * row[5]
         corners[k, 1] = x * row[6] + y * row[7] + z * row[8]
         corners[k, 2] = x * row[9] + y * row[10] + z * row[11]
-    dx = way[0] * row[3] + way[1] * row[4] + way[2] * row[5]
-    dy = way[0] * row[6] + way[1] * row[7] + way[2] * row[8]
-    dz = way[0] * row[9] + way[1] * row[10] + way[2] * row[11]
+    dx = ray[0] * row[3] + ray[1] * row[4] + ray[2] * row[5]
+    dy = ray[0] * row[6] + ray[1] * row[7] + ray[2] * row[8]
+    dz = ray[0] * row[9] + ray[1] * row[10] + ray[2] * row[11]
     if dz <= 1e-9:
         return 0
     # Only what is in front of the mirror and before the aim hides anything.
@@ -226,8 +226,8 @@ def _mirror_corners(i, j, mirrors, corners):
 
 
 @njit(**INNER)
-def _tower_corners(i, tower, mirrors, way, part, corners):
-    """Corners of a tower's outline across the way (part 0) or of its top (part 1)."""
+def _tower_corners(i, tower, mirrors, ray, part, corners):
+    """Corners of a tower's outline across the ray (part 0) or of its top (part 1)."""
     x, y = tower[0] - mirrors[i, 0], tower[1] - mirrors[i, 1]
     bottom, top = tower[3] - mirrors[i, 2], tower[4] - mirrors[i, 2]
     if part == 1:
@@ -239,10 +239,10 @@ def _tower_corners(i, tower, mirrors, way, part, corners):
             corners[k, 1] = y + radius * math.sin(k * turn)
             corners[k, 2] = top
         return ROUND
-    flat = math.sqrt(way[0] ** 2 + way[1] ** 2)
+    flat = math.sqrt(ray[0] ** 2 + ray[1] ** 2)
     if flat < 1e-9:
         return 0
-    ax, ay = -way[1] / flat * tower[2], way[0] / flat * tower[2]
+    ax, ay = -ray[1] / flat * tower[2], ray[0] / flat * tower[2]
     for k in range(4):
         s = 1.0 if k in (1, 2) else -1.0
         corners[k, 0], corners[k, 1] = x + s * ax, y + s * ay
@@ -251,18 +251,18 @@ def _tower_corners(i, tower, mirrors, way, part, corners):
 
 
 @njit(**INLINED)
-def _beside_tower(i, tower, mirrors, way, reach):
+def _beside_tower(i, tower, mirrors, ray, reach):
     """Whether a tower is away from the rays of mirror i."""
     x, y = tower[0] - mirrors[i, 0], tower[1] - mirrors[i, 1]
-    flat = math.sqrt(way[0] ** 2 + way[1] ** 2)
+    flat = math.sqrt(ray[0] ** 2 + ray[1] ** 2)
     room = mirrors[i, 15] + tower[2]
     if flat < 1e-9:
         return x * x + y * y > room * room
-    along = (x * way[0] + y * way[1]) / flat
+    along = (x * ray[0] + y * ray[1]) / flat
     return (
         along < -room
-        or abs(x * way[1] - y * way[0]) / flat > room
-        or mirrors[i, 2] + (along - room) / flat * way[2] - mirrors[i, 15] > tower[4]
+        or abs(x * ray[1] - y * ray[0]) / flat > room
+        or mirrors[i, 2] + (along - room) / flat * ray[2] - mirrors[i, 15] > tower[4]
         or along - room > reach * flat
     )
 
@@ -280,8 +280,8 @@ def bend_of(row, sun, bend):
 
 
 @njit(**INNER)
-def outlines(i, near, mirrors, towers, way, bend, reach, work):
-    """Polygons that hide a part of mirror i along a way; returns them, their corners and number.
+def outlines(i, near, mirrors, towers, ray, bend, reach, work):
+    """Polygons that hide a part of mirror i; returns them, their corners and number.
 
     ``near`` lists the mirrors. ``work`` holds two lists of corners.
     """
@@ -291,7 +291,7 @@ def outlines(i, near, mirrors, towers, way, bend, reach, work):
     count = 0
     for j in near:
         m = _mirror_corners(i, j, mirrors, corners)
-        m = _carry(i, mirrors, way, bend, reach, corners, m, spare, polygons[count])
+        m = _carry(i, mirrors, ray, bend, reach, corners, m, spare, polygons[count])
         if m:
             sizes[count] = m
             count += 1
@@ -301,11 +301,11 @@ def outlines(i, near, mirrors, towers, way, bend, reach, work):
     if bend[0, 0] != 0.0:
         pencil[0, 0] = pencil[1, 1] = -2.0 * mirrors[i, 14]
     for k in range(len(towers)):
-        if _beside_tower(i, towers[k], mirrors, way, reach):
+        if _beside_tower(i, towers[k], mirrors, ray, reach):
             continue
         for part in range(2):
-            m = _tower_corners(i, towers[k], mirrors, way, part, corners)
-            m = _carry(i, mirrors, way, pencil, reach, corners, m, spare, polygons[count])
+            m = _tower_corners(i, towers[k], mirrors, ray, part, corners)
+            m = _carry(i, mirrors, ray, pencil, reach, corners, m, spare, polygons[count])
             if m:
                 sizes[count] = m
                 count += 1
@@ -317,25 +317,25 @@ def _split(points, m, ax, ay, bx, by, inside, outside):
     """Cut a convex polygon along the line from a to b; the left of it is inside."""
     nx, ny = ay - by, bx - ax
     p = q = 0
-    here = (points[0, 0] - ax) * nx + (points[0, 1] - ay) * ny
+    before = (points[0, 0] - ax) * nx + (points[0, 1] - ay) * ny
     for k in range(m):
         k2 = k + 1 if k + 1 < m else 0
-        there = (points[k2, 0] - ax) * nx + (points[k2, 1] - ay) * ny
+        after = (points[k2, 0] - ax) * nx + (points[k2, 1] - ay) * ny
         x, y = points[k, 0], points[k, 1]
-        if here >= 0.0:
+        if before >= 0.0:
             inside[p, 0], inside[p, 1] = x, y
             p += 1
-        if here <= 0.0:
+        if before <= 0.0:
             outside[q, 0], outside[q, 1] = x, y
             q += 1
-        if here * there < 0.0:
-            t = here / (here - there)
+        if before * after < 0.0:
+            t = before / (before - after)
             x, y = x + t * (points[k2, 0] - x), y + t * (points[k2, 1] - y)
             inside[p, 0], inside[p, 1] = x, y
             outside[q, 0], outside[q, 1] = x, y
             p += 1
             q += 1
-        here = there
+        before = after
     return p, q
 
 
@@ -488,7 +488,7 @@ def part_of(i, f, table, kind, split, row):
 
 
 @njit(**OPTIONS)
-def clip(first, last, rows, mirrors, towers, sun, ways, reaches, near, spans, parts, out):
+def clip(first, last, rows, mirrors, towers, sun, rays, reaches, near, spans, parts, out):
     """Clip mirrors ``rows[first:last]``; see `Lit` for what is written.
 
     ``spans`` (H, 3): where the list ``near`` of mirrors that may shade it begins, that of those
@@ -509,7 +509,7 @@ def clip(first, last, rows, mirrors, towers, sun, ways, reaches, near, spans, pa
             i, near[spans[i, 0] : spans[i, 1]], mirrors, towers, sun, straight, np.inf, work
         )
         blocks, lengths, m = outlines(
-            i, near[spans[i, 1] : spans[i, 2]], mirrors, towers, ways[i], bend,
+            i, near[spans[i, 1] : spans[i, 2]], mirrors, towers, rays[i], bend,
             reaches[i], work,
         )  # fmt: skip
         both, corners = np.empty((n + m, CORNERS, 2)), np.empty(n + m, dtype=np.int64)
@@ -549,7 +549,7 @@ def clip(first, last, rows, mirrors, towers, sun, ways, reaches, near, spans, pa
 
 
 @njit(**OPTIONS)
-def pieces_of(i, mirrors, towers, sun, ways, reaches, near, spans):
+def pieces_of(i, mirrors, towers, sun, rays, reaches, near, spans):
     """Convex pieces of the lit part of one mirror: corners and where each begins."""
     work, straight, bend = (
         (np.empty((CORNERS, 3)), np.empty((CORNERS, 3))), np.zeros((3, 2)), np.zeros((3, 2)),
@@ -560,7 +560,7 @@ def pieces_of(i, mirrors, towers, sun, ways, reaches, near, spans):
         i, near[spans[i, 0] : spans[i, 1]], mirrors, towers, sun, straight, np.inf, work
     )
     blocks, lengths, m = outlines(
-        i, near[spans[i, 1] : spans[i, 2]], mirrors, towers, ways[i], bend, reaches[i], work
+        i, near[spans[i, 1] : spans[i, 2]], mirrors, towers, rays[i], bend, reaches[i], work
     )
     both, corners = np.empty((n + m, CORNERS, 2)), np.empty(n + m, dtype=np.int64)
     for k in range(n + m):
