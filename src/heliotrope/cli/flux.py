@@ -277,52 +277,52 @@ def _moment(
     if time is not None and sun is not None:
         raise InputError("give --time or --sun, not both")
     when = None if sun is not None else _noon(plant) if time is None else parse_time(time)
-    given = {**order.options, "sun": None if sun is None else parse_point(sun, "sun")}
+    options = {**order.options, "sun": None if sun is None else parse_point(sun, "sun")}
     with progress("casting beams", order.as_json) as step:
         step(0, 1)
-        found = field_flux(plant, when, **given)
+        result = field_flux(plant, when, **options)
     second = None
     if rays[0]:
         with progress("tracing rays", order.as_json) as step:
-            second = field_flux(plant, when, rays=rays[0], seed=rays[1], progress=step, **given)
+            second = field_flux(plant, when, rays=rays[0], seed=rays[1], progress=step, **options)
     if "csv" in order.files:
-        flux_files.write_heliostats(order.files["csv"], found)
+        flux_files.write_heliostats(order.files["csv"], result)
     if "map" in order.files:
-        flux_files.write_map(order.files["map"], found)
+        flux_files.write_map(order.files["map"], result)
     if "netcdf" in order.files:
-        flux_files.write_netcdf(order.files["netcdf"], found)
+        flux_files.write_netcdf(order.files["netcdf"], result)
     if "picture" in order.files:
         from heliotrope.calibration.plan.report import write_picture
 
-        write_picture(order.files["picture"], flux_figure(found, by))
+        write_picture(order.files["picture"], flux_figure(result, by))
     if order.as_json:
         print_json(
-            _document(found, when) | ({} if second is None else {"rays": _second(found, second)})
+            _document(result, when) | ({} if second is None else {"rays": _second(result, second)})
         )
         return
-    _print_moment(found, second)
+    _print_moment(result, second)
     order.print_files()
 
 
-def _document(found: "PlantFlux", when: Any) -> dict[str, Any]:
+def _document(result: "PlantFlux", when: Any) -> dict[str, Any]:
     import numpy as np
 
     from heliotrope.geometry import azimuth_elevation
     from heliotrope.optics import EFFICIENCIES
 
-    azimuth, elevation = np.degrees(azimuth_elevation(found.sun))
-    shares = {name: getattr(found.efficiencies, name) for name in EFFICIENCIES}
-    power = found.heliostat_power
+    azimuth, elevation = np.degrees(azimuth_elevation(result.sun))
+    shares = {name: getattr(result.efficiencies, name) for name in EFFICIENCIES}
+    power = result.heliostat_power
     return {
-        "plant": found.plant,
+        "plant": result.plant,
         "time": when,
         "sun_azimuth_deg": float(azimuth),
         "sun_elevation_deg": float(elevation),
-        "dni_w_m2": found.dni,
-        "mirror_area_m2": float(found.area.sum()),
-        "power_w": found.power,
-        "peak_w_m2": found.peak,
-        "efficiencies": found.summary,
+        "dni_w_m2": result.dni,
+        "mirror_area_m2": float(result.area.sum()),
+        "power_w": result.power,
+        "peak_w_m2": result.peak,
+        "efficiencies": result.summary,
         "receivers": [
             {
                 "name": view.receiver,
@@ -331,22 +331,22 @@ def _document(found: "PlantFlux", when: Any) -> dict[str, Any]:
                 "peak_w_m2": float(view.flux.max()),
                 "flux_w_m2": view.flux,
             }
-            for view in found.maps
+            for view in result.maps
         ],
         "heliostats": [
             {"name": name, "power_w": power[i]} | {key: shares[key][i] for key in EFFICIENCIES}
-            for i, name in enumerate(found.names)
+            for i, name in enumerate(result.names)
         ],
     }
 
 
-def _second(found: "PlantFlux", second: "PlantFlux") -> dict[str, Any]:
+def _second(result: "PlantFlux", second: "PlantFlux") -> dict[str, Any]:
     """Return what rays say, beside the engine's result."""
     import numpy as np
 
-    apart = [a.flux - b.flux for a, b in zip(found.maps, second.maps, strict=True)]
-    squares = np.concatenate([each.ravel() ** 2 for each in apart])
-    noise = np.concatenate([each.ravel() ** 2 for each in second.errors])
+    apart = [a.flux - b.flux for a, b in zip(result.maps, second.maps, strict=True)]
+    squares = np.concatenate([flux.ravel() ** 2 for flux in apart])
+    noise = np.concatenate([error.ravel() ** 2 for error in second.errors])
     peak = max(second.peak, 1e-300)
     return {
         "count": second.rays,
@@ -359,37 +359,37 @@ def _second(found: "PlantFlux", second: "PlantFlux") -> dict[str, Any]:
     }
 
 
-def _print_moment(found: "PlantFlux", second: "PlantFlux | None") -> None:
+def _print_moment(result: "PlantFlux", second: "PlantFlux | None") -> None:
     import numpy as np
 
     from heliotrope.geometry import azimuth_elevation
 
-    azimuth, elevation = np.degrees(azimuth_elevation(found.sun))
-    shares = np.stack([getattr(found.efficiencies, name) for name in _WORDS])
+    azimuth, elevation = np.degrees(azimuth_elevation(result.sun))
+    shares = np.stack([getattr(result.efficiencies, name) for name in _WORDS])
     header = ["efficiency", "field", "lowest heliostat", "highest"]
     rows = []
-    for (name, words), each in zip(_WORDS.items(), shares, strict=True):
-        known = each[np.isfinite(each)]
+    for (name, words), share in zip(_WORDS.items(), shares, strict=True):
+        known = share[np.isfinite(share)]
         ends = (f"{100 * x:.2f} %" for x in ((known.min(), known.max()) if known.size else ()))
-        row = [words, f"{100 * found.summary[name]:.2f} %", *ends]
+        row = [words, f"{100 * result.summary[name]:.2f} %", *ends]
         rows.append(row + [""] * (4 - len(row)))
         if second is not None:
             rows[-1].append(f"{100 * second.summary[name]:.2f} %")
     if second is not None:
         header.append("by rays")
-    title = f"{found.plant}: sun {azimuth:.2f}° from north, {elevation:.2f}° high, "
-    title += f"{found.dni:g} W/m² on {found.area.sum():,.0f} m²"
+    title = f"{result.plant}: sun {azimuth:.2f}° from north, {elevation:.2f}° high, "
+    title += f"{result.dni:g} W/m² on {result.area.sum():,.0f} m²"
     print_table(header, rows, title=title)
-    for view in found.maps:
+    for view in result.maps:
         print(
             f"{view.receiver}: {1e-6 * view.power:.5g} MW, peak {1e-3 * view.flux.max():.5g} kW/m²,"
             f" {100 * view.intercept:.2f} % of the light"
         )
-    dark = int(np.isnan(found.efficiencies.total).sum())
+    dark = int(np.isnan(result.efficiencies.total).sum())
     if dark:
-        print(f"{dark} of {len(found.names)} heliostats cannot reach their aim")
+        print(f"{dark} of {len(result.names)} heliostats cannot reach their aim")
     if second is not None:
-        said = _second(found, second)
+        said = _second(result, second)
         print(
             f"by {second.rays:,} rays: {1e-6 * said['power_w']:.5g} ± "
             f"{1e-6 * said['power_error_w']:.2g} MW, peak {1e-3 * second.peak:.5g} kW/m²; cells "
@@ -472,13 +472,13 @@ def _print_table(table: "FluxTable", order: _Order) -> None:
     heads += ["elevation, °", "cosine", "lit", "intercept", "total", "MW", "peak, kW/m²"]
     rows = [
         [
-            *(str(one[name]) for name in first),
-            f"{one['elevation_deg']:.1f}",
-            *(f"{100 * one[name]:.2f} %" for name in ("cosine", "lit", "intercept", "total")),
-            f"{1e-6 * one['power_w']:.4g}",
-            f"{1e-3 * one['peak_w_m2']:.4g}",
+            *(str(record[name]) for name in first),
+            f"{record['elevation_deg']:.1f}",
+            *(f"{100 * record[name]:.2f} %" for name in ("cosine", "lit", "intercept", "total")),
+            f"{1e-6 * record['power_w']:.4g}",
+            f"{1e-3 * record['peak_w_m2']:.4g}",
         ]
-        for one in records[:SHOWN]
+        for record in records[:SHOWN]
     ]
     print_table(
         heads, rows, title=f"{table.plant}: mean optical efficiency {100 * table.mean:.2f} %"

@@ -248,20 +248,20 @@ class PlantFlux(Value, Framed):
         return field_efficiencies(self.efficiencies, self.area)
 
 
-def field_efficiencies(one: Efficiencies, area: FloatArray) -> dict[str, float]:
+def field_efficiencies(shares: Efficiencies, area: FloatArray) -> dict[str, float]:
     """Return the efficiencies of a field, each as a share of what the one before left.
 
     Parameters
     ----------
-    one
+    shares
         Of the mirrors, (N,); a mirror with NaN counts as dark, and its area counts.
     area
         m², (N,).
     """
-    light = [area, np.nan_to_num(area * one.cosine)]
+    light = [area, np.nan_to_num(area * shares.cosine)]
     for stage in ("lit", "mirror", "air"):
-        light.append(light[-1] * np.nan_to_num(getattr(one, stage)))
-    light.append(np.nan_to_num(area * one.total))
+        light.append(light[-1] * np.nan_to_num(getattr(shares, stage)))
+    light.append(np.nan_to_num(area * shares.total))
     sums = [float(each.sum()) for each in light]
 
     def share(part: float, whole: float) -> float:
@@ -269,7 +269,7 @@ def field_efficiencies(one: Efficiencies, area: FloatArray) -> dict[str, float]:
 
     cosine = sums[1]
     alone = {
-        name: share(float(light[1] @ np.nan_to_num(getattr(one, name))), cosine)
+        name: share(float(light[1] @ np.nan_to_num(getattr(shares, name))), cosine)
         for name in ("shading", "blocking")
     }
     steps = [share(b, a) for a, b in pairwise(sums)]
@@ -326,14 +326,14 @@ def field_flux(
     UnknownNameError
         If there is no receiver or option of that name.
     """
-    given = (light or FieldOptics()).changed(changes)
+    optics = (light or FieldOptics()).changed(changes)
     direction = _one_sun(plant, time, sun)
-    scene = given.scene(plant, direction, aim, _names(receiver))
+    scene = optics.scene(plant, direction, aim, _names(receiver))
     if scene.dark is not None and scene.dark.all():
         raise InputError(f"flux: none of the {len(plant)} heliostats can reach its aim at this sun")
     if rays:
-        return _traced(plant, scene, given, rays, seed, progress)
-    engine = FieldFlux(scene, sun=given.shape, air=given.air, gaussians=given.gaussians)
+        return _traced(plant, scene, optics, rays, seed, progress)
+    engine = FieldFlux(scene, sun=optics.shape, air=optics.air, gaussians=optics.gaussians)
     intercepts = [power / max(float(engine.leaving.sum()), 1e-300) for power in engine.powers]
     lit = int((engine.leaving > 0.0).sum())
     maps = [
@@ -529,7 +529,7 @@ def flux_day(
     InputError
         As `field_flux`, or if the sun is up at none of the times.
     """
-    given = (light or FieldOptics()).changed(changes)
+    optics = (light or FieldOptics()).changed(changes)
     suns = np.atleast_2d(vector(times, plant.site))
     up = suns[:, 2] > np.sin(LOWEST)
     if not up.any():
@@ -537,9 +537,9 @@ def flux_day(
     seconds = np.atleast_1d(unix_seconds(times))[up]
     unknown = np.full(len(seconds), np.nan)
     weight = np.full(len(seconds), 1.0 / len(seconds))
-    dni = np.full(len(seconds), given.dni)
+    dni = np.full(len(seconds), optics.dni)
     return _table(
-        plant, suns[up], (seconds, unknown, unknown, weight, dni), _names(receiver), aim, given,
+        plant, suns[up], (seconds, unknown, unknown, weight, dni), _names(receiver), aim, optics,
         progress,
     )  # fmt: skip
 
@@ -584,7 +584,7 @@ def flux_year(
             f"flux: {declinations} declinations and steps of {hours} h; give 2 to 100, and 0.1 to "
             "4 h"
         )
-    given = (light or FieldOptics()).changed(changes)
+    optics = (light or FieldOptics()).changed(changes)
     longitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, declinations)
     steps = int(12.0 / hours)
     grid = np.meshgrid(
@@ -597,11 +597,11 @@ def flux_year(
     declination, hour, weight = (each.ravel() for each in (*grid, weight))
     suns = sun_at(declination, hour, np.radians(plant.site.latitude_deg))
     up = suns[:, 2] > np.sin(LOWEST)
-    clear = given.dni * 0.7 ** (1.0 / suns[up, 2]) ** 0.678
+    clear = optics.dni * 0.7 ** (1.0 / suns[up, 2]) ** 0.678
     share = weight[up] / weight[up].sum()
     unknown = np.full(int(up.sum()), np.nan)
     columns = (unknown, declination[up], hour[up], share, clear)
-    return _table(plant, suns[up], columns, _names(receiver), aim, given, progress)
+    return _table(plant, suns[up], columns, _names(receiver), aim, optics, progress)
 
 
 def sun_at(declination: npt.ArrayLike, hour: npt.ArrayLike, latitude: float) -> FloatArray:
@@ -629,11 +629,11 @@ def _table(
     for k, sun in enumerate(suns):
         scene = replace(light, dni=float(dni[k])).scene(plant, sun, aim, receivers)
         engine = FieldFlux(scene, sun=light.shape, air=light.air, gaussians=light.gaussians)
-        one = engine.efficiencies
-        rows.append(field_efficiencies(one, scene.mirrors.area))
+        efficiencies = engine.efficiencies
+        rows.append(field_efficiencies(efficiencies, scene.mirrors.area))
         power[k] = sum(engine.powers)
         peak[k] = max(float(flux.max()) for flux in engine.maps)
-        heliostat += weight[k] * dni[k] * np.nan_to_num(one.total)
+        heliostat += weight[k] * dni[k] * np.nan_to_num(efficiencies.total)
         if progress is not None:
             progress(k + 1, len(suns))
     shares = {name: np.array([row[name] for row in rows]) for name in EFFICIENCIES}
