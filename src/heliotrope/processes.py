@@ -2,24 +2,26 @@
 
 import contextlib
 import os
+import signal
 import threading
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 
 
-def pool(processes: int, begin: Callable[[], None] | None = None) -> ProcessPoolExecutor:
-    """Return a pool of processes, each of which calls ``begin`` first.
+def pool(processes: int, niceness: int | None = None) -> ProcessPoolExecutor:
+    """Return a pool of processes that begin anew and end with this one.
 
-    They begin anew: a forked child would inherit the locks of this process's threads. When this
-    process is killed, they end; else they would wait for work for ever.
+    A forked child would inherit the locks of this process's threads. When this process is killed,
+    they end; else they would wait for work for ever. With a ``niceness`` they compute beside a
+    plant: they leave it the machine from their first import on, have one thread each, and Ctrl-C in
+    its terminal is not theirs.
     """
     return ProcessPoolExecutor(
         processes,
         mp_context=get_context("spawn"),
-        initializer=_end_with_parent,
-        initargs=(begin,),
+        initializer=_begin,
+        initargs=(niceness,),
     )
 
 
@@ -39,8 +41,12 @@ def end(pool: ProcessPoolExecutor) -> None:
         process.kill()
 
 
-def _end_with_parent(begin: Callable[[], None] | None) -> None:
-    """Arrange for this process to end when its parent ends."""
+def _begin(niceness: int | None) -> None:
+    """Prepare a process; it has loaded nothing yet."""
+    if niceness is not None:
+        give_way(niceness)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        os.environ["HELIOTROPE_THREADS"] = "1"
     parent = parent_process()
     assert parent is not None
 
@@ -49,5 +55,3 @@ def _end_with_parent(begin: Callable[[], None] | None) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, name="end with parent", daemon=True).start()
-    if begin is not None:
-        begin()

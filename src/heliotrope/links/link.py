@@ -396,6 +396,19 @@ async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]
             task.cancel()
 
 
+async def first_of(*parts: Coroutine[Any, Any, object]) -> None:
+    """Run parts side by side until one is done, then cancel the others; raise what it raises."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    for task in done:
+        task.result()
+
+
 class Runnable(Protocol):
     """Something that is run and closed: a `Link`, a `Bus`, a server."""
 

@@ -9,9 +9,10 @@ import asyncio
 import contextlib
 import math
 from collections import Counter
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,7 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
-from heliotrope.links.link import running
+from heliotrope.links.link import first_of, running
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.controller import PlantController, Stores
 from heliotrope.plant.emergency import at_stow
@@ -93,6 +94,28 @@ class AssemblySettings:
     plant: PlantSettings = field(default_factory=PlantSettings)
     cycle: CycleSettings = CYCLE
     machines: MachineTables = MachineTables.UNKNOWN
+
+
+class _Begun:
+    """Operations that begin once the field is ready; until then the plant already leads it."""
+
+    def __init__(
+        self, operations: Operations, ready: Callable[[], Coroutine[Any, Any, None]] | None
+    ) -> None:
+        self._operations, self._ready = operations, ready
+        self._closing = asyncio.Event()
+
+    async def run(self) -> None:
+        """Wait until the field is ready, and work until closed."""
+        if self._ready is not None:
+            await first_of(self._ready(), self._closing.wait())
+        if not self._closing.is_set():
+            await self._operations.run()
+
+    async def close(self) -> None:
+        """End them."""
+        self._closing.set()
+        await self._operations.close()
 
 
 class PlantAssembly:
@@ -253,9 +276,7 @@ class PlantAssembly:
                 # The safety table waits for readings from the start.
                 if sensors is not None:
                     tasks.append(group.create_task(self._sense(sensors)))
-                if self.ports.ready is not None:
-                    await self.ports.ready()
-                await later.enter_async_context(running(self.operations))
+                await later.enter_async_context(running(_Begun(self.operations, self.ports.ready)))
                 if cameras is not None:
                     tasks.append(group.create_task(self._look(cameras)))
                 if self.ports.witnesses:
@@ -295,6 +316,7 @@ class PlantAssembly:
 
     async def _look(self, cameras: Cameras) -> None:
         """Photograph each target once, so that a camera that fails is known before a beam comes."""
+        await self.operations.begun.wait()
         for target in self.design.targets:
             if not cameras.sees(target.name):
                 self.logbook.event("calibration", target.name, "no camera looks at it")

@@ -5,7 +5,7 @@ only in the `Ports` that are passed in: links to clusters, cameras, sensors, a c
 records.
 """
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -165,7 +165,7 @@ class Ports:
     beside: Callable[[], AbstractAsyncContextManager[object]] = field(
         default=nullcontext, kw_only=True
     )
-    ready: Callable[[], Awaitable[None]] | None = field(default=None, kw_only=True)
+    ready: Callable[[], Coroutine[Any, Any, None]] | None = field(default=None, kw_only=True)
     truth: Callable[[], FloatArray] | None = field(default=None, kw_only=True)
     learner: Learner | None = field(default=None, kw_only=True)
     worker: Worker = field(default=at_once, kw_only=True)

@@ -6,16 +6,14 @@ plant compute; in virtual time, and where a computation is as short as a message
 """
 
 import asyncio
-import os
 import pickle
-import signal
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from functools import partial
 from typing import Protocol, TypeVar, TypeVarTuple
 
 from heliotrope.errors import HeliotropeError, InputError
-from heliotrope.processes import end, give_way, pool
+from heliotrope.processes import end, pool
 
 T = TypeVar("T")
 Given = TypeVarTuple("Given")
@@ -61,7 +59,7 @@ class WorkerProcesses:
 
     def __init__(self, count: int = PROCESSES) -> None:
         self._count = count
-        self._pool = pool(count, _begin)
+        self._pool = pool(count, _NICE)
 
     def start(self, load: Callable[[], None]) -> None:
         """Begin the processes, each of which loads what computations need."""
@@ -78,7 +76,7 @@ class WorkerProcesses:
         except BrokenExecutor:
             if self._pool is used:
                 end(used)
-                self._pool = pool(self._count, _begin)
+                self._pool = pool(self._count, _NICE)
             raise InputError(
                 "the process that computes beside the plant has ended; the next computation begins "
                 "another; if it ends again, see whether the machine runs out of memory"
@@ -87,14 +85,6 @@ class WorkerProcesses:
     def close(self) -> None:
         """End the processes at once; their results are lost."""
         end(self._pool)
-
-
-def _begin() -> None:
-    """Prepare a process."""
-    # Ctrl-C in the plant's terminal is the plant's.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    give_way(_NICE)
-    os.environ["HELIOTROPE_THREADS"] = "1"
 
 
 def _computed(work: Callable[[*Given], T], *given: *Given) -> T:

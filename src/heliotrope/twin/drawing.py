@@ -22,6 +22,7 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.optics import Beam, reflected_beam
+from heliotrope.twin import warm
 from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
 
 #: Least share of a mirror that is left by its neighbours for a beam to be drawn, and the elements
@@ -165,6 +166,7 @@ def _drawing(line: Connection) -> None:
     """Draw what comes over a line until it is closed."""
     # Ctrl-C in the plant's terminal is the plant's.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    warm.drawing()  # while the field begins: what it loads takes seconds
     while True:
         try:
             exposure: Exposure = line.recv()

@@ -30,6 +30,7 @@ from heliotrope.files.disk import DiskBusyError, DiskThread
 from heliotrope.files.text import read_text
 from heliotrope.geometry import as_float
 from heliotrope.lcu import states
+from heliotrope.links.link import first_of
 from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.operations.pictures import Pictures, PictureSettings
@@ -418,6 +419,7 @@ async def watch(
     """Print a line at intervals until the end."""
     loop = asyncio.get_running_loop()
     pause = speed * shown.every * (_SELDOM if shown.console and shown.every == EVERY else 1.0)
+    await first_of(live.operations.begun.wait(), asked.wait())
     until = None if shown.minutes is None else loop.time() + 60.0 * shown.minutes
     while not asked.is_set() and (until is None or loop.time() < until):
         wait = pause if until is None else min(pause, until - loop.time())

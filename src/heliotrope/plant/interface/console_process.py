@@ -89,7 +89,8 @@ class ConsoleProcess:
     on_alarm
         Takes the alarm in the plant's loop.
     on_address
-        Called once, in the interface's thread, with the address at which it listens.
+        Called once, in the interface's thread, with the address at which it listens, when the plant
+        works.
     patience
         See `Patience`.
 
@@ -183,7 +184,7 @@ class ConsoleProcess:
 
     def _well(self) -> None:
         """Note a sign of life."""
-        if not self._told:
+        if not self._told and self._interface.begun:
             self._told = True
             self._on_address(self._interface.addresses[self._part.name])
         if self._alarmed:

@@ -138,6 +138,11 @@ class PlantInterface:
                 await asyncio.to_thread(thread.close)
             self._threads.shutdown(wait=False, cancel_futures=True)
 
+    @property
+    def begun(self) -> bool:
+        """Whether the plant works: it leads a field that is ready."""
+        return self._desk.operations.begun.is_set()
+
     def one_time_link(self, name: str, address: str) -> str:
         """Return a link that signs an account in, once and soon, without its password.
 

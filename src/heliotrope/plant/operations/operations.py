@@ -121,6 +121,8 @@ class Operations:
         See their classes: whoever reads the plant asks them.
     telemetry
         Folder of the telemetry; None: none is archived.
+    begun
+        Set once it works.
     """
 
     def __init__(
@@ -145,13 +147,14 @@ class Operations:
         self._history = History(plant, records, self._figures)
         self._records = records
         self._flux: dict[str, _Cached] = {}
-        self._closing = asyncio.Event()
+        self._closing, self.begun = asyncio.Event(), asyncio.Event()
 
     # -- running ---------------------------------------------------------------------------
 
     async def run(self) -> None:
         """Work until closed; the plant itself is run by the owner."""
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
+        self.begun.set()
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
             parts = (self._look(), self._follow(), self._history.run())

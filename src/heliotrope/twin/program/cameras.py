@@ -26,6 +26,8 @@ class TwinCameras:
         Its event loop.
     seed
         Of the sensors' noise.
+    drawer
+        The process that draws, which takes some seconds to begin.
 
     Raises
     ------
@@ -33,10 +35,12 @@ class TwinCameras:
         A camera without a position.
     """
 
-    def __init__(self, world: World, loop: asyncio.AbstractEventLoop, seed: int) -> None:
+    def __init__(
+        self, world: World, loop: asyncio.AbstractEventLoop, seed: int, drawer: Drawer
+    ) -> None:
         self._world, self._loop = world, loop
         self._chance, self._numbers = np.random.default_rng(seed), itertools.count(1)
-        self._drawer, self._scenes = Drawer(), dict[str, Scene]()
+        self._drawer, self._scenes = drawer, dict[str, Scene]()
         surfaces = {target.name: target for target in (*world.design.targets, *world.faces)}
         visits = world.design.receiver_visits
         for camera in world.design.cameras:
@@ -49,19 +53,10 @@ class TwinCameras:
             if seen:
                 self._scenes[camera.name] = Scene(camera, seen)
 
-    def start(self) -> None:
-        """Begin the process that draws."""
-        if self._scenes:
-            self._drawer.start()
-
     def wait(self) -> None:
         """Wait until it draws, which takes some seconds at first; to be called in a thread."""
         for name in list(self._scenes)[:1]:
             self.photograph(name)
-
-    def close(self) -> None:
-        """End it."""
-        self._drawer.close()
 
     def photograph(self, name: str) -> Frame:
         """Return a photograph by a camera, exposed now; to be called in a thread.

@@ -15,9 +15,10 @@ from heliotrope.field.plant import Plant
 from heliotrope.imaging.frame import Frame
 from heliotrope.links.clock import Clock, SystemClock, VirtualClock
 from heliotrope.links.connection import CarriedLink
-from heliotrope.links.link import LinkSettings, running
+from heliotrope.links.link import LinkSettings, first_of, running
 from heliotrope.links.tcp import tcp_link
 from heliotrope.safety import FLUX_READING
+from heliotrope.twin.drawing import Drawer
 from heliotrope.twin.live import PacedLoop, World, WorldOptions
 from heliotrope.twin.program.boards import BOARDS, read_boards
 from heliotrope.twin.program.cameras import TwinCameras
@@ -124,7 +125,7 @@ class TwinProgram:
         def link(name: str) -> CarriedLink:
             return tcp_link(*self._files.plant, name, self._files.keys[name], clock, _LINK)
 
-        files, go = self._files, _Go()
+        files, go, drawer = self._files, _Go(), Drawer()
         server = TwinServer(
             files.serves,
             files.secret,
@@ -135,6 +136,8 @@ class TwinProgram:
             go.begin,
         )
         server.start()
+        if self._design.cameras:
+            drawer.start()
         try:
             design = await self._stored(ending)
             if ending.is_set():
@@ -143,15 +146,14 @@ class TwinProgram:
                 self._options.seed, boards=self._options.boards, pty=self._options.pty, link=link
             )
             world = World(design, clock, options)
-            cameras = TwinCameras(world, loop, self._options.seed)
+            cameras = TwinCameras(world, loop, self._options.seed, drawer)
             self._parts = _Parts(world, cameras)
-            cameras.start()
             sensors = _Sensors(world, self._options.seed)
             # The plant reads them as soon as it begins.
             _write(self._files.folder, sensors.readings())
             self._waits = True
             if paced is not None:
-                await _first(go.event, ending)
+                await first_of(go.event.wait(), ending.wait())
                 paced.speed = _FIRST * self._options.speed
             async with (
                 world.running(),
@@ -169,8 +171,7 @@ class TwinProgram:
                     task.cancel()
         finally:
             server.close()
-            if self._parts is not None:
-                self._parts.cameras.close()
+            drawer.close()
 
     async def _stored(self, ending: asyncio.Event) -> Plant:
         """Return the plant with what its local controllers store."""
@@ -270,14 +271,6 @@ class _Go:
     def begin(self) -> bytes:
         self.event.set()
         return b""
-
-
-async def _first(*events: asyncio.Event) -> None:
-    """Wait until one of some events is set."""
-    waits = [asyncio.ensure_future(event.wait()) for event in events]
-    await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-    for wait in waits:
-        wait.cancel()
 
 
 async def _wall(seconds: float) -> None:
