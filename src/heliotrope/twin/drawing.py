@@ -7,7 +7,7 @@ its field it would wait for their event loop, and they for it.
 import multiprocessing
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from multiprocessing.connection import Connection
@@ -22,7 +22,6 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.optics import Beam, reflected_beam
-from heliotrope.twin import warm
 from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
 
 #: Least share of a mirror that is left by its neighbours for a beam to be drawn, and the elements
@@ -97,9 +96,15 @@ class Drawer:
     """A process that draws photographs; it may be asked by several threads.
 
     It begins with the first photograph, or by `start`, and anew after one in which it died.
+
+    Parameters
+    ----------
+    load
+        Called in it first, such as `twin.warm.drawing`; None: the first photograph takes longer.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, load: Callable[[], None] | None = None) -> None:
+        self._load = load
         self._mine = threading.Lock()
         self._process: SpawnProcess | None = None
         self._line: Connection | None = None
@@ -146,7 +151,7 @@ class Drawer:
         if self._line is None:
             context = multiprocessing.get_context("spawn")
             self._line, far = context.Pipe()
-            self._process = context.Process(target=_drawing, args=(far,), daemon=True)
+            self._process = context.Process(target=_drawing, args=(far, self._load), daemon=True)
             self._process.start()
             # The process alone holds its end now, so that its death is seen, and ours by it.
             far.close()
@@ -162,11 +167,12 @@ class Drawer:
         process.join()
 
 
-def _drawing(line: Connection) -> None:
+def _drawing(line: Connection, load: Callable[[], None] | None) -> None:
     """Draw what comes over a line until it is closed."""
     # Ctrl-C in the plant's terminal is the plant's.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    warm.drawing()  # while the field begins: what it loads takes seconds
+    if load is not None:
+        load()
     while True:
         try:
             exposure: Exposure = line.recv()

@@ -18,6 +18,7 @@ from heliotrope.links.connection import CarriedLink
 from heliotrope.links.link import LinkSettings, first_of, running
 from heliotrope.links.tcp import tcp_link
 from heliotrope.safety import FLUX_READING
+from heliotrope.twin import warm
 from heliotrope.twin.drawing import Drawer
 from heliotrope.twin.live import PacedLoop, World, WorldOptions
 from heliotrope.twin.program.boards import BOARDS, read_boards
@@ -125,7 +126,7 @@ class TwinProgram:
         def link(name: str) -> CarriedLink:
             return tcp_link(*self._files.plant, name, self._files.keys[name], clock, _LINK)
 
-        files, go, drawer = self._files, _Go(), Drawer()
+        files, go, drawer = self._files, _Go(), Drawer(warm.drawing)
         server = TwinServer(
             files.serves,
             files.secret,
