@@ -326,6 +326,8 @@ async def _run(
     design: Plant, choice: PlantChoice, shown: Shown, outside: _Outside, prepare: Prepare | None
 ) -> None:
     ending = begin(design, shown)
+    if outside.reader is not None:
+        print("the simulated field begins; the first start compiles, and takes longer", flush=True)
     with computing() as worker, store(shown) as (keeper, folder):
         if prepare is not None:
             await prepare(keeper, design, outside.clock.utc())
