@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -238,9 +237,13 @@ class LiveConsole:
             self._why = here.plant.sentinel.refusal(here.plant.field.clusters)
             return not self._why
 
-        for call in self.call(lambda: here.plant.sentinel.calls):
-            # As its own: an order that others withdraw again and again makes its person pause.
-            self.call(partial(here.withdraw, Person(call.who, Role.ENGINEER)))
+        def withdraw() -> None:
+            for call in here.plant.sentinel.calls:
+                # As its own: an order that others withdraw again and again makes its person pause.
+                here.withdraw(Person(call.who, Role.ENGINEER))
+
+        # In one turn of the loop: a page may be withdrawing too.
+        self.call(withdraw)
         try:
             self.until(quiet)
         except AssertionError:
