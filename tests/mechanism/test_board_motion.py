@@ -117,7 +117,7 @@ def test_safe_paths_and_the_ends_of_defocus_are_those_of_the_boards(seed: int) -
     stops = np.sort([books.drives(rows).angles(ends[..., k]) for k in (0, 1)], axis=0)
     tracks = kind == TRACK
     other = np.where(tracks[:, None], books.standby, aims)
-    offset = offsets(pose, other, begin, angle, tracks)
+    offset = offsets(pose, other, begin, angle)
     end = turned(begin, offset, *stops)
     _, lower = end_down_the_path(pose, path, np.where(elsewhere | tracks, 0, place), begin, angle)
     down = np.isfinite(lower[:, 0])

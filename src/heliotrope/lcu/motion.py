@@ -287,10 +287,9 @@ class Motion:
 
         From standby, held there too, it goes down the safe way, and on the way up back as it has
         come, until an axis has turned by its angle or the ground is reached. No other place is
-        known to be off the receiver: the aim may be on a target. From an aim, an axis that the
-        usual sense would bring nearer to standby, which is beside the receiver, turns the other
-        way. A mirror that is held elsewhere, where a person has left it, turns off the aim. Without
-        a recent sun, by the angles.
+        known to be off the receiver: the aim may be on a target. From an aim, the axes turn away
+        from standby, which is beside the receiver. A mirror that is held elsewhere, where a person
+        has left it, turns off the aim. Without a recent sun, by the angles.
         """
         primary, secondary = self._offset = self.config.defocus
         if not self.known or self.sun.since_ms > RECENT_MS:
@@ -311,20 +310,12 @@ class Motion:
             chosen, self._target, self._offset = list(pose.angles), point, (0.0, 0.0)
             if first >= primary or second >= secondary or point[2] <= points[0][2]:
                 break
-        tracks = kind in (TRACK, SEARCH)
-        other = self.config.standby if tracks else self.aim
+        other = self.config.standby if kind in (TRACK, SEARCH) else self.aim
         pose = None if other is None or chosen is not None else self.pose(other, 0)
         self.unreachable = unreachable
         if pose is not None:
             first, second = near[0] - pose.angles[0], near[1] - pose.angles[1]
-            if not tracks:
-                primary, secondary = math.copysign(primary, first), math.copysign(secondary, second)
-            else:
-                if abs(first + primary) < abs(first):
-                    primary = -primary
-                if abs(second + secondary) < abs(second):
-                    secondary = -secondary
-            self._offset = primary, secondary
+            self._offset = math.copysign(primary, first), math.copysign(secondary, second)
         return chosen
 
     # Actions of the state table.

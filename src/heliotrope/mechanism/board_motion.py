@@ -127,30 +127,24 @@ def end_down_the_path(
     return points, angles
 
 
-def offsets(
-    pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArray, tracks: Mask
-) -> FloatArray:
+def offsets(pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArray) -> FloatArray:
     """Return by how much the axes turn where DEFOCUS does not go down the path: `Motion._turn`.
 
-    From an aim, an axis that would come nearer to standby turns the other way. A mirror that is
-    held turns off its aim.
+    From an aim, the axes turn away from standby. A mirror that is held turns off its aim.
 
     Parameters
     ----------
     pose, begin, defocus
         As for `end_down_the_path`.
     points
-        Standby point of a mirror that tracks, of every other its aim, m, (K, 3); NaN: none.
-    tracks
-        Whether each mirror tracks or searches, (K,).
+        Standby point of a mirror that tracks or searches, of every other its aim, m, (K, 3);
+        NaN: none.
     """
     off, known = np.full_like(begin, np.nan), np.flatnonzero(np.isfinite(points).all(axis=-1))
     if known.size:
         angles, good = pose(known, points[known])
         off[known[good]] = (begin[known] - angles)[good]
-    back = np.where(np.abs(off + defocus) < np.abs(off), -defocus, defocus)
-    chosen = np.where(tracks[:, None], back, np.copysign(defocus, off))
-    return as_float(np.where(np.isnan(off), defocus, chosen))
+    return as_float(np.where(np.isnan(off), defocus, np.copysign(defocus, off)))
 
 
 def turned(begin: FloatArray, offset: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

@@ -102,7 +102,7 @@ def defocused(
 
     tracks = np.isin(state, states.ON_AIM)
     other = np.where(tracks[:, None], standbys, aims)
-    end = turned(begin, offsets(pose, other, begin, turn, tracks), *paths.stops(rows))
+    end = turned(begin, offsets(pose, other, begin, turn), *paths.stops(rows))
 
     # Down the safe path from standby and from an approach, as far as the path is known.
     goes = np.isin(state, (states.IDLE, states.LOCKED, states.APPROACHING))

@@ -289,6 +289,7 @@ class CodedCycle(ABC):
         with _Taken.of(layout) as taken:
             async with self._stay(visit, layout, light, tell) as move:
                 await self._photograph(visit, layout, light, taken, move, tell)
+            self._check(visit)
             lost = {name: refused(visit.mandate, name, text) for name, text in visit.lost.items()}
             if len(taken.pictures) < taken.needed:
                 cloud = Verdict.CLOUD
@@ -348,7 +349,6 @@ class CodedCycle(ABC):
             taken.pictures.append((number, picture))
             if visit.astray:
                 taken.forget()
-        self._check(visit)
 
     def _check(self, visit: CodedVisit) -> None:
         """Refuse to go on without a heliostat."""

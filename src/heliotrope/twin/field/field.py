@@ -315,7 +315,6 @@ class Field:
             points,
             self._angles_at(self.axes["count"][rows], rows),
             self._defocus[rows],
-            tracks,
         )
 
     def _recent(self, rows: Rows) -> Bools:
