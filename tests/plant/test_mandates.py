@@ -287,6 +287,24 @@ def test_automatic_control_goes_on_after_a_person_and_its_visits_are_no_losses(w
     played(scene)
 
 
+def test_who_was_taken_out_of_a_joint_visit_is_shown_in_it_no_longer() -> None:
+    """Simulated day 51064: it was shown in the visit while a person commanded it."""
+
+    async def scene(here: Scene) -> None:
+        plant, view = here.live.plant, here.live.operations.automatic.view
+        left_to_work(here)
+        await until(here, lambda: any(_stages(here, "photograph 2 ")))
+        (before,) = view().running
+        gone, token = before.heliostats[0], commanded(here, VERA)
+        plant.command(VERA, token, "STOW", (gone,))
+        (after,) = view().running
+        assert after.since == before.since
+        assert after.heliostats == before.heliostats[1:]
+        here.live.operations.automatic.switch(on=False)
+
+    played(scene)
+
+
 def _stages(here: Scene, word: str) -> list[str]:
     running = here.live.operations.automatic.view().running
     return [one.stage for one in running if word in one.stage]

@@ -21,7 +21,7 @@ from heliotrope.plant.operations import Logbook, calibrating
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import FRESH, PLACES, Calibrating
 from heliotrope.plant.operations.raising import RAISING
-from heliotrope.plant.operations.views import CalibrationEntry
+from heliotrope.plant.operations.views import CalibrationEntry, Running
 from heliotrope.plant.orders.authority import RefusedError, TakenOutError
 from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.visits import CycleResult
@@ -128,6 +128,25 @@ def test_a_heliostat_that_stays_first_leaves_the_target_to_all_others(tmp_path: 
         here.ready[3] = True
         await here.visit()
         assert here.visits.names == [names[3]] * 2, "a target is not idle for it"
+
+    play(tmp_path, scene)
+
+
+def test_a_choice_leaves_out_whom_another_visit_has_taken_meanwhile(tmp_path: Path) -> None:
+    """Simulated day 51133: a receiver visit began while a target chose, with the same mirror."""
+
+    async def scene(here: Scene) -> None:
+        names, now = here.plant.field.names, 0.0
+
+        async def chosen(*_: object) -> tuple[str, ...]:
+            here.calibrating._running["receiver"] = Running(names[0], "receiver", "", now)
+            return names[:1]
+
+        made: dict[str, Any] = {"chosen": chosen, "awaited": lambda *_: False}
+        made |= {"alone": np.zeros_like, "concluded": lambda _: None, "again": lambda _: False}
+        requests = SimpleNamespace(next=lambda *_: (), asked=())
+        here.calibrating._joint = SimpleNamespace(requests=requests, **made)  # type: ignore[assignment]
+        assert await here.visit() == names[1:2]
 
     play(tmp_path, scene)
 

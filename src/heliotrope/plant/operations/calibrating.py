@@ -309,6 +309,7 @@ class Calibrating:
                 self._joint.begun(target)
                 await self._coded_visit(self._joint.cycle, names, target, person, token)
                 return names
+            ready = ready & ~self._away()
         name, search = self._chosen(target, ready)
         if not name:
             return ()
@@ -354,10 +355,17 @@ class Calibrating:
         if alone or (ready & self._pressing() & self._fresh()).any():
             return ()
         names = await joint.chosen(target, ready, self._scheduler.next)
-        # Another target's visit may have begun meanwhile.
-        away = {name for run in self._running.values() for name in run.heliostats}
-        free = tuple(name for name in names if name not in away)
+        away = self._away()
+        free = tuple(name for name in names if not away[self._plant.field.place(name)])
         return free if len(free) > 1 else ()
+
+    def _away(self) -> npt.NDArray[np.bool_]:
+        """Return a mask of the heliostats in visits, (N,), which may have begun during a choice."""
+        found = np.zeros(len(self._plant.field), dtype=bool)
+        found[
+            [self._plant.field.place(n) for r in self._running.values() for n in r.heliostats]
+        ] = True
+        return found
 
     async def receiver_visit(
         self, ready: npt.NDArray[np.bool_], person: Person, token: int

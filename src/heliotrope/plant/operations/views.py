@@ -1,7 +1,7 @@
 """The views that `Operations` gives of a plant at work: plain values that never change."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
@@ -377,6 +377,11 @@ class Running:
     def heliostats(self) -> tuple[str, ...]:
         """All heliostats of the visit."""
         return (self.heliostat, *self.others)
+
+    def without(self, heliostats: Collection[str]) -> "Running | None":
+        """Return the visit without some heliostats, None if it has no others."""
+        left = tuple(name for name in self.heliostats if name not in heliostats)
+        return replace(self, heliostat=left[0], others=left[1:]) if left else None
 
 
 @dataclass(frozen=True)

@@ -381,6 +381,11 @@ class Authority:
         """Return the open mandate of each heliostat that is in a visit, by name."""
         return {name: each for each in self._mandates.values() for name in each.heliostats}
 
+    def taken_out(self, where: str) -> frozenset[str]:
+        """Return the heliostats that orders have taken out of the visit to a surface."""
+        here = (each.taken for each in self._mandates.values() if each.where == where)
+        return frozenset(name for taken in here for name in taken)
+
     def prevail(self, heliostats: Sequence[str], why: str, *, fault: bool = False) -> None:
         """Take heliostats out of the visits that they are in; see `Mandate.take_out`."""
         for each in self._mandates.values():

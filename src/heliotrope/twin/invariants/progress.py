@@ -99,7 +99,7 @@ class ProgressObserver(Judge):
         self._up: bool | None = None
         self._locked: set[str] = set()
         self._calibrates, self._measured = True, 0.0
-        self._took_at, self._begun = -inf, dict[str, tuple[str, ...]]()
+        self._took_at, self._begun = -inf, dict[str, set[str]]()
         self._emergency = self._called = self._ended = False
 
     # -- persons -----------------------------------------------------------------------------
@@ -123,7 +123,8 @@ class ProgressObserver(Judge):
         """Note that a person has taken the command authority."""
         running = operations.automatic.view().running
         self._took_at = now
-        self._begun = {run.target: run.heliostats for run in running if run.target in self._targets}
+        here = (run for run in running if run.target in self._targets)
+        self._begun = {run.target: set(run.heliostats) for run in here}
 
     def switched(self, *, on: bool) -> None:
         """Note that a person has switched calibration on or off."""
@@ -272,7 +273,7 @@ class ProgressObserver(Judge):
         if now - self._took_at > GOES_ON:
             self._begun.clear()
         for place, names in list(self._begun.items()):
-            if any(run.heliostats == names for run in view.running):
+            if any(run.target == place and names >= set(run.heliostats) for run in view.running):
                 continue
             del self._begun[place]
             ends = {entry.heliostat: entry.outcome for entry in reversed(view.results)}
@@ -338,11 +339,11 @@ class ProgressObserver(Judge):
         counted = Counter(name for run in running for name in run.heliostats)
         for name, count in counted.items():
             self.check(16, count == 1, now, name, f"it is shown in {count} visits at once")
-        kept = {("visit", run.target, *run.heliostats) for run in running}
+        kept = {("visit", run.target, f"{run.since}") for run in running}
         for key in [key for key in self._since if key[0] == "visit" and key not in kept]:
             del self._since[key]
         for run in running:
-            key = ("visit", run.target, *run.heliostats)
+            key = ("visit", run.target, f"{run.since}")
             fresh = key not in self._since
             saw = f"its visit to {run.target} has been under way"
             self._within(key, True, now, VISIT_WITHIN, run.heliostat, saw)
