@@ -510,15 +510,13 @@ class AutomaticControl:
         """Return the progress of calibration."""
         reason = self._why_not()
         running = {} if self._calibrating is None else self._calibrating.running
-        left = self._plant.authority.taken_out
-        present = (run.without(left(run.target)) for run in running.values())
         return CalibrationView(
             not reason,
             reason or "",
             self.book.calibrated,
             len(self._plant.field) - self.book.calibrated,
             self.book.failed,
-            tuple(run for run in present if run is not None),
+            tuple(running.values()),
             tuple(list(self.book.results)[:-51:-1]),
             tuple(self.book.quality),
             () if self._calibrating is None else self._calibrating.asked,

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -258,8 +257,10 @@ class Calibrating:
 
     @property
     def running(self) -> Mapping[str, Running]:
-        """Visits under way, by target."""
-        return MappingProxyType(self._running)
+        """Visits under way, by target, with the heliostats that no order has taken out."""
+        left = self._plant.authority.taken_out
+        present = ((place, run.without(left(place))) for place, run in self._running.items())
+        return {place: run for place, run in present if run is not None}
 
     def result(self, heliostat: str, since: float) -> CalibrationEntry | str:
         """Return the result of a visit that ended since a time, POSIX s; without one, why not."""
@@ -361,11 +362,8 @@ class Calibrating:
 
     def _away(self) -> npt.NDArray[np.bool_]:
         """Return a mask of the heliostats in visits, (N,), which may have begun during a choice."""
-        found = np.zeros(len(self._plant.field), dtype=bool)
-        found[
-            [self._plant.field.place(n) for r in self._running.values() for n in r.heliostats]
-        ] = True
-        return found
+        names = [name for run in self.running.values() for name in run.heliostats]
+        return np.isin(self._plant.field.names, names)
 
     async def receiver_visit(
         self, ready: npt.NDArray[np.bool_], person: Person, token: int

@@ -415,7 +415,9 @@ class BeamObserver(Judge):
             self._loss(on, now)
         if plant is not None:
             beliefs = plant.beliefs
-            self._unsurveyed = {n for n in self._unsurveyed if beliefs.record(n) is None}
+            # Parameters that a person has set say nothing about the others.
+            records = {name: beliefs.record(name) for name in self._unsurveyed}
+            self._unsurveyed = {n for n, r in records.items() if r is None or not len(r.sightings)}
             if plant.sentinel.on:  # automatic control has given up the field
                 self.taken(self._mirrors)
             self._proofs(plant, sun, now)

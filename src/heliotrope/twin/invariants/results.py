@@ -75,7 +75,7 @@ class _Account:
     before: Mechanism | None = None
     vain: int = 0  # visits in a row that brought nothing
     searched: int = 0  # visits in a row in which no beam was found by a search
-    typed: bool = False  # a person has set parameters, which the plant will believe
+    typed: int = 0  # times that a person has set parameters, which the plant will believe
 
 
 class ResultObserver(Judge):
@@ -136,7 +136,7 @@ class ResultObserver(Judge):
     def typed(self, heliostats: Sequence[str]) -> None:
         """Note that a person has set parameters: the next version may be theirs, no visit's."""
         for name in heliostats:
-            self._accounts[name].typed = True
+            self._accounts[name].typed += 1
 
     def look(self, operations: Operations | None, now: float) -> None:
         """Judge the results since the last check; None: the plant's program does not run."""
@@ -165,10 +165,11 @@ class ResultObserver(Judge):
         record, stored = beliefs.record(name), beliefs.known(name)
         count = 0 if stored is None else len(stored)
         version = 0 if record is None else record.version
-        if account.typed and version != account.version and record is not None and not count:
-            account.typed, account.kept = False, 0
+        if account.typed and version > account.version and count <= account.kept:
+            account.typed = max(0, account.typed - version + account.version)
+            account.kept, account.last = count, min(account.last, count)
             account.version, account.before = version, beliefs.present(name)
-            account.last, account.result_version = 0, version
+            account.result_version = version
         if begins:
             # Sightings come back with the calibration that they led to.
             saw = f"a new program knows calibration {version}, that before it {account.version}"
