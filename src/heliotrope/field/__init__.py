@@ -5,6 +5,9 @@
 ones; `example_plant` has 18 heliostats, `prototype` is Malan's.
 """
 
+from heliotrope.field.approval import (
+    ApprovalSettings,
+)
 from heliotrope.field.camera import (
     Camera,
 )
@@ -53,6 +56,7 @@ from heliotrope.field.volumes import (
 )
 
 __all__ = [
+    "ApprovalSettings",
     "Box",
     "Camera",
     "Cylinder",

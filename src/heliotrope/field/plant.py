@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.approval import ApprovalSettings
 from heliotrope.field.camera import Camera, check_unfolded
 from heliotrope.field.coded_visits import JointSettings, ReceiverSettings
 from heliotrope.field.heliostat import Heliostat
@@ -63,6 +64,8 @@ class Plant(Value, Framed):
         Calibrations at times of day and at intervals, as people want them.
     safety
         Numbers of the safety table that this plant sets; see `safety.limits`.
+    approval
+        Which changes by a person need a second one.
     """
 
     name: str
@@ -78,6 +81,7 @@ class Plant(Value, Framed):
     receiver_visits: ReceiverSettings | None = None
     timetable: tuple[TimetableEntry, ...] = ()
     safety: Limits = field(default_factory=dict)
+    approval: ApprovalSettings = field(default_factory=ApprovalSettings)
 
     def __post_init__(self) -> None:
         check_site(self.site)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import HeliotropeError
+from heliotrope.field.approval import ApprovalSettings
 from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
@@ -195,15 +196,16 @@ class PlantAssembly:
         return self.plant.field.names
 
     def _record_limits(self) -> None:
-        """Record which numbers of the safety table differ from those of the run before.
+        """Record which numbers of safety table and approvals differ from those of the run before.
 
         At the first run they are compared with the defaults.
         """
         if self.ports.records is None:
             return
-        now = numbers(limited(CONDITIONS, self.design.safety))
+        now = numbers(limited(CONDITIONS, self.design.safety)) | self.design.approval.numbers
         try:
             before = self.ports.records.exchange_limits(now) or numbers(CONDITIONS)
+            before = ApprovalSettings().numbers | before
         except StoreError as error:
             self.logbook.take_alarm(alarms.RECORDS.raised(problem=error))
             return

@@ -118,6 +118,30 @@ REASON_MISSING = Refusal(
     "{what}: a reason is needed; give one",
     "Give a reason.",
 )
+SECOND_PERSON = Refusal(
+    "second person needed",
+    "The author of a change approves or refuses it.",
+    "change {number} of {heliostat}: {person} asked for it, so another engineer must decide",
+    "Ask another engineer with an account of their own, or withdraw the change.",
+)
+NOT_AUTHOR = Refusal(
+    "not the author",
+    "A person withdraws a change that another has asked for.",
+    "change {number} of {heliostat}: {author} asked for it; {person} can refuse it",
+    "Refuse it with a reason, or ask its author.",
+)
+CHANGE_WAITS = Refusal(
+    "change waits",
+    "Another change of the same heliostat's parameters waits for its approval.",
+    "parameters {heliostat}: change {number} of {author} waits for approval; nothing was asked for",
+    "Have it approved or refused first, or let its author withdraw it.",
+)
+CHANGE_OVERTAKEN = Refusal(
+    "change overtaken",
+    "The heliostat has had new parameters since the change was asked for.",
+    "change {number} of {heliostat}: {reason}; it has ended",
+    "Compare the versions, and ask for the change again if it is still right.",
+)
 NOT_NOW = Refusal(
     "not accepted now",
     "An emergency holds, a row of the safety table refuses new motions, or a second plant runs.",

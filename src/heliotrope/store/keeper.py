@@ -61,6 +61,8 @@ _MANY = 500
 _LIMITS = "safety limits"
 #: Name of the document about the emergency that stands.
 _EMERGENCY = "emergency"
+#: Name of the document about changes that wait for an approval.
+_CHANGES = "waiting changes"
 
 
 class Keeper:
@@ -478,13 +480,27 @@ class Keeper:
 
     def emergency(self) -> str:
         """Return the document about the emergency in force; empty without one."""
-        about = tables.about
-        query = select(about.c.value).where(about.c.name == _EMERGENCY)
-        return str(self.do(lambda connection: connection.scalar(query)) or "")
+        return self._document(_EMERGENCY)
 
     def keep_emergency(self, document: str) -> None:
         """Replace the document about the emergency in force; empty: it has ended."""
-        row = {"name": _EMERGENCY, "value": document}
+        self._keep_document(_EMERGENCY, document)
+
+    def waiting_changes(self) -> str:
+        """Return the document about changes that wait for an approval; empty without one."""
+        return self._document(_CHANGES)
+
+    def keep_waiting_changes(self, document: str) -> None:
+        """Replace the document about changes that wait for an approval; empty: none waits."""
+        self._keep_document(_CHANGES, document)
+
+    def _document(self, name: str) -> str:
+        about = tables.about
+        query = select(about.c.value).where(about.c.name == name)
+        return str(self.do(lambda connection: connection.scalar(query)) or "")
+
+    def _keep_document(self, name: str, document: str) -> None:
+        row = {"name": name, "value": document}
         self.writer.put(lambda connection: rows.replace(connection, tables.about, [row]))
 
     def do(self, work: Work[Any], timeout: float = 5.0) -> Any:

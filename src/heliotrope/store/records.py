@@ -583,6 +583,14 @@ class Records(Protocol):
         """Replace the document about the emergency in force; empty: it has ended."""
         ...
 
+    def waiting_changes(self) -> str:
+        """Return the document about changes that wait for an approval; empty without one."""
+        ...
+
+    def keep_waiting_changes(self, document: str) -> None:
+        """Replace the document about changes that wait for an approval; empty: none waits."""
+        ...
+
     async def confirm(self) -> None:
         """Wait until all earlier records are safe.
 

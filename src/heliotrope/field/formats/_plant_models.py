@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema, create_model
 
+from heliotrope.field.approval import ApprovalSettings
 from heliotrope.field.coded_visits import CodedSettings, JointSettings, ReceiverSettings
 from heliotrope.safety import CONDITIONS
 from heliotrope.safety.limits import schema
@@ -396,6 +397,20 @@ class TimetableTable(StrictTable):
     )
 
 
+class ApprovalTable(StrictTable):
+    """``[approval]``: changes by a person that need a second one."""
+
+    parameters: bool = Field(
+        False,
+        description="True: a person's change of a heliostat's parameters, or their roll-back, "
+        "waits until another engineer approves it.",
+    )
+    within_s: Number = Field(
+        ApprovalSettings.within,
+        description="Time after which a change that nobody has approved ends; 60 to 604800.",
+    )
+
+
 class PlantDocument(StrictTable):
     """The whole file."""
 
@@ -432,3 +447,6 @@ class PlantDocument(StrictTable):
             }
         ),
     ] = Field(default_factory=dict)
+    approval: ApprovalTable | None = Field(
+        None, description="Without: no change needs a second person."
+    )

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.approval import ApprovalSettings
 from heliotrope.field.formats._plant_cameras import (
     build_camera,
     build_mark,
@@ -23,6 +24,7 @@ from heliotrope.field.formats._plant_cameras import (
 from heliotrope.field.formats._plant_coded import build_joint, build_receiver, coded_document
 from heliotrope.field.formats._plant_groups import build_group, group_document
 from heliotrope.field.formats._plant_models import (
+    ApprovalTable,
     PlantDocument,
     ReceiverTable,
     TargetTable,
@@ -30,6 +32,7 @@ from heliotrope.field.formats._plant_models import (
 )
 from heliotrope.field.formats._plant_table import HeliostatColumns, read_table, write_table
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
+from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.timetable import TimetableEntry
@@ -97,6 +100,7 @@ def _models() -> list[Any]:
         models.PrismTable,
         models.JointVisitsTable,
         models.TimetableTable,
+        models.ApprovalTable,
     ]
 
 
@@ -116,21 +120,7 @@ def _assemble(
         name=document.site.name,
         delta_t=document.site.delta_t_s,
     )
-    groups = {}
-    for group in sorted(set(table.group) - set(document.groups)):
-        known = ", ".join(document.groups)
-        problems.append(
-            FormatError(table.path, f"group {group!r} is not in {path.name}; known: {known}")
-        )
-    for name, group_table in document.groups.items():
-        try:
-            rows = np.flatnonzero(np.array(table.group) == name)
-            if len(rows):
-                groups[name] = build_group(path, name, group_table, table, rows, site)
-        except FormatError as error:
-            problems.append(error)
-        except InputError as error:
-            problems.append(FormatError(path, str(error), f"groups.{name}"))
+    groups = _groups(path, document, table, site, problems)
     targets = _all_built(path, "targets", document.targets, _target, problems)
     receivers = _all_built(path, "receivers", document.receivers, _receiver, problems)
     cameras = _all_built(path, "cameras", document.cameras, build_camera, problems)
@@ -140,6 +130,7 @@ def _assemble(
     settings = document.receiver_visits
     receiver = _built(path, "receiver_visits", settings, build_receiver, problems)
     timetable = _all_built(path, "timetable", document.timetable, _timetable_entry, problems)
+    approval = _built(path, "approval", document.approval, _approval, problems)
     _built(
         path,
         "safety",
@@ -147,7 +138,7 @@ def _assemble(
         lambda settings: limited(CONDITIONS, settings or {}),
         problems,
     )
-    if problems:
+    if problems or approval is None:
         return None
     try:
         return Plant(
@@ -163,10 +154,37 @@ def _assemble(
             receiver_visits=receiver,
             timetable=timetable,
             safety=document.safety,
+            approval=approval,
         )
     except InputError as error:
         problems.append(FormatError(path, str(error)))
         return None
+
+
+def _groups(
+    path: Path,
+    document: PlantDocument,
+    table: HeliostatColumns,
+    site: Site,
+    problems: list[FormatError],
+) -> dict[str, Heliostats]:
+    """Build the groups of heliostats; errors are added to ``problems``."""
+    groups = {}
+    for group in sorted(set(table.group) - set(document.groups)):
+        known = ", ".join(document.groups)
+        problems.append(
+            FormatError(table.path, f"group {group!r} is not in {path.name}; known: {known}")
+        )
+    for name, group_table in document.groups.items():
+        try:
+            rows = np.flatnonzero(np.array(table.group) == name)
+            if len(rows):
+                groups[name] = build_group(path, name, group_table, table, rows, site)
+        except FormatError as error:
+            problems.append(error)
+        except InputError as error:
+            problems.append(FormatError(path, str(error), f"groups.{name}"))
+    return groups
 
 
 def _built(
@@ -203,6 +221,10 @@ def _all_built(
 
 def _timetable_entry(table: TimetableTable) -> TimetableEntry:
     return TimetableEntry.of(table.model_dump())
+
+
+def _approval(table: ApprovalTable | None) -> ApprovalSettings:
+    return ApprovalSettings() if table is None else ApprovalSettings(table.parameters, table.within_s)
 
 
 def _receiver(table: ReceiverTable) -> Receiver:
@@ -309,6 +331,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
         **coded_document(plant.joint_visits, plant.receiver_visits),
         **({"timetable": [e.document for e in plant.timetable]} if plant.timetable else {}),
+        **({"approval": approval} if (approval := plant.approval.document) else {}),
         **({"safety": {k: dict(v) for k, v in plant.safety.items()}} if plant.safety else {}),
         "groups": groups,
     }

@@ -29,6 +29,7 @@ from heliotrope.plant.interface.overview import overview
 from heliotrope.plant.interface.tickets import TicketState
 from heliotrope.plant.operations import bus_frames as bus
 from heliotrope.plant.operations import views
+from heliotrope.plant.operations.approvals import WaitingChange
 from heliotrope.plant.operations.marking import MarksView, PictureToMark
 from heliotrope.plant.operations.report import ShiftReport
 from heliotrope.plant.operations.security import SecurityEvent
@@ -609,16 +610,48 @@ async def versions(desk: Desk, order: orders.TwoVersions) -> ParameterComparison
 async def set_parameters(desk: Desk, who: Person, order: orders.ParameterOrder) -> TicketState:
     """Set error parameters of a heliostat at rest by `values`, or bring back an earlier `version`.
 
-    The `reason` is kept.
+    The `reason` is kept. Where the plant file asks for a
+    [second approval](plant-format.md#second-approval), nothing is written and no command authority
+    is needed: the change waits, and the ticket ends with what becomes of it.
     """
-    typed, token = desk.operations.parameters, desk.token_of(who)
+    typed, approvals = desk.operations.parameters, desk.operations.approvals
     if bool(order.values) == bool(order.version):
         raise InputError("parameters: give either values or a version")
+    if approvals.needed:
+        return desk.tickets.put(await approvals.ask(who, **order.model_dump()))
+    token = desk.token_of(who)
     if order.version:
         ticket = await typed.restore(who, token, order.heliostat, order.version, order.reason)
     else:
         ticket = typed.change(who, token, order.heliostat, order.values, order.reason)
     return await desk.recorded(ticket)
+
+
+@_call("GET parameters/waiting", "calibration")
+def waiting_changes(desk: Desk) -> tuple[WaitingChange, ...]:
+    """Return the changes of parameters that wait for the approval of a second engineer."""
+    return desk.operations.approvals.waiting
+
+
+@_call("POST parameters/waiting/{number}/approve", "calibration", ENGINEER)
+async def approve_change(desk: Desk, who: Person, order: orders.OneChange) -> TicketState:
+    """Approve another engineer's change: it is written now.
+
+    You or its author must have the command authority. What cannot be written now waits on.
+    """
+    return await desk.recorded(await desk.operations.approvals.approve(who, order.number))
+
+
+@_call("POST parameters/waiting/{number}/refuse", "calibration", ENGINEER, body=orders.ReasonGiven)
+def refuse_change(desk: Desk, who: Person, order: orders.RefusedChange) -> None:
+    """Refuse another engineer's change, with a `reason`."""
+    desk.operations.approvals.refuse(who, order.number, order.reason)
+
+
+@_call("DELETE parameters/waiting/{number}", "calibration", ENGINEER)
+def withdraw_change(desk: Desk, who: Person, order: orders.OneChange) -> None:
+    """Withdraw your own change."""
+    desk.operations.approvals.withdraw(who, order.number)
 
 
 # -- photographs ---------------------------------------------------------------------------------

@@ -210,6 +210,22 @@ class ParameterOrder(Strict):
     reason: Annotated[Words, Field(min_length=1)]
 
 
+class OneChange(Strict):
+    """The number of a change that waits for an approval."""
+
+    number: Annotated[int, Field(ge=1, le=2**53)]
+
+
+class ReasonGiven(Strict):
+    """Why."""
+
+    reason: Annotated[Words, Field(min_length=1)]
+
+
+class RefusedChange(OneChange, ReasonGiven):
+    """The number of a change, and why it is refused."""
+
+
 class TwoVersions(Strict):
     """A heliostat and two versions of its parameters; 0: those of the plant file."""
 

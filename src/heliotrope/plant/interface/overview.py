@@ -37,6 +37,7 @@ def overview(operations: Operations) -> dict[str, Any]:
             "quality": calibration.quality[-1] if calibration.quality else None,
         },
         "cameras": cameras,
+        "changes": len(operations.approvals.waiting),
         "order": operations.viewer.emergency(),
         "events": _newest(operations),
     }

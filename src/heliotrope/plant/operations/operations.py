@@ -31,6 +31,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import ORDERED, EmergencyOrder
 from heliotrope.plant.field.lockouts import TOWER
+from heliotrope.plant.operations.approvals import Approvals
 from heliotrope.plant.operations.automatic import AUTOMATIC, AutomaticControl
 from heliotrope.plant.operations.errands import Errands
 from heliotrope.plant.operations.explaining import explain
@@ -117,7 +118,7 @@ class Operations:
 
     Attributes
     ----------
-    plant, logbook, automatic, viewer, security, pictures, parameters, marking
+    plant, logbook, automatic, viewer, security, pictures, parameters, approvals, marking
         See their classes: whoever reads the plant asks them.
     telemetry
         Folder of the telemetry; None: none is archived.
@@ -143,6 +144,7 @@ class Operations:
         self.security = SecurityLog(logbook, plant.clock)
         self.viewer = Viewer(plant, self.automatic)
         self.parameters = TypedParameters(plant, logbook, records)
+        self.approvals = Approvals(plant, logbook, self.parameters, self.errands, records)
         self.telemetry: Path | None = None
         self._history = History(plant, records, self._figures)
         self._records = records
@@ -154,6 +156,7 @@ class Operations:
     async def run(self) -> None:
         """Work until closed; the plant itself is run by the owner."""
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
+        self.approvals.recall()
         self.begun.set()
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
@@ -178,6 +181,7 @@ class Operations:
     async def _follow(self) -> None:
         """Follow operations of persons to their ends."""
         while True:
+            self.approvals.step()
             self.errands.look()
             await sleep_until(self.plant.clock, self.plant.now() + _FOLLOWED)
 

@@ -75,6 +75,8 @@ class ParametersView:
         Each one.
     earlier
         Versions before the one in use, newest first.
+    approval
+        Whether a change waits until another engineer approves it; see `approvals`.
     """
 
     heliostat: str
@@ -82,6 +84,40 @@ class ParametersView:
     stored: str
     parameters: tuple[ParameterState, ...]
     earlier: tuple[EarlierParameters, ...]
+    approval: bool = False
+
+
+@dataclass(frozen=True)
+class PreparedChange:
+    """Credible other parameters of a heliostat, ready to be written.
+
+    Attributes
+    ----------
+    record
+        The calibration with them; time, person and version are those of the writing.
+    items
+        What changes on the board, bytes by item.
+    shown, reason
+        The change in words, and the author's reason.
+    """
+
+    record: HeliostatCalibration
+    items: Mapping[str, bytes]
+    shown: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class SecondPerson:
+    """The author of a change, and who approved it."""
+
+    author: str
+    approver: str
+
+    @property
+    def text(self) -> str:
+        """Both, for audit and event."""
+        return f"asked for by {self.author}, approved by {self.approver}"
 
 
 class TypedParameters:
@@ -117,7 +153,7 @@ class TypedParameters:
         """
         record, group = self._plant.beliefs.record(heliostat), self._plant.design.find(heliostat)[0]
         stored = await self._stored(heliostat, who)
-        now = self._now(heliostat)
+        now = self.in_use(heliostat)
         in_file = self._file(heliostat)
         states = []
         for name in group.mechanism.parameters:
@@ -134,7 +170,10 @@ class TypedParameters:
             for one in await self._history(heliostat)
             if one.version != version
         ]
-        return ParametersView(heliostat, version, stored, tuple(states), tuple(earlier[::-1]))
+        approval = self._plant.design.approval.parameters
+        return ParametersView(
+            heliostat, version, stored, tuple(states), tuple(earlier[::-1]), approval
+        )
 
     async def compare(self, heliostat: str, first: int, second: int) -> ParameterComparison:
         """Compare two versions of a heliostat's parameters; 0: those of the plant file.
@@ -144,10 +183,7 @@ class TypedParameters:
         UnknownNameError
             If there is no such heliostat or version.
         """
-        group, nominal = (
-            self._plant.design.find(heliostat)[0],
-            self._plant.beliefs.nominal(heliostat),
-        )
+        group = self._plant.design.find(heliostat)[0]
         kept = {one.version: one for one in await self._history(heliostat)}
         last = self._plant.beliefs.record(heliostat)
         if last is not None:
@@ -170,22 +206,34 @@ class TypedParameters:
             )
             for name in group.mechanism.parameters
         ]
-        machines = [nominal.with_parameters(each) for each in values]
-        row = self._plant.field.place(heliostat)
-        aim = self._plant.aims[row]
-        aim = aim if np.isfinite(aim).all() else self._plant.default_aims((heliostat,))[heliostat]
-        suns = suns_of_day(self._utc(), self._plant.design.site)
-        change = beam_change(machines[0], machines[1], suns, aim)
-        change = change[np.isfinite(change)]
+        rms, most = self.beam_change(heliostat, *values)
         return ParameterComparison(
             heliostat,
             0 if last is None else last.version,
             _version(first, known[0]),
             _version(second, known[1]),
             tuple(rows),
-            float(np.sqrt(np.mean(change**2))) if len(change) else np.nan,
-            float(change.max()) if len(change) else np.nan,
+            rms,
+            most,
         )
+
+    def beam_change(
+        self, heliostat: str, first: Mapping[str, float], second: Mapping[str, float]
+    ) -> tuple[float, float]:
+        """Return by how far a beam moves at its aim from one set of parameters to another, m.
+
+        RMS and largest over the suns of this day; NaN where it tracks none. See `beam_change`.
+        """
+        nominal = self._plant.beliefs.nominal(heliostat)
+        machines = [nominal.with_parameters(each) for each in (first, second)]
+        aim = self._plant.aims[self._plant.field.place(heliostat)]
+        aim = aim if np.isfinite(aim).all() else self._plant.default_aims((heliostat,))[heliostat]
+        suns = suns_of_day(self._utc(), self._plant.design.site)
+        change = beam_change(machines[0], machines[1], suns, aim)
+        change = change[np.isfinite(change)]
+        if not len(change):
+            return np.nan, np.nan
+        return float(np.sqrt(np.mean(change**2))), float(change.max())
 
     async def _stored(self, heliostat: str, who: Person) -> str:
         if who.role < Role.OPERATOR:
@@ -212,7 +260,8 @@ class TypedParameters:
     def _utc(self) -> float:
         return self._plant.clock.utc().timestamp()
 
-    def _now(self, heliostat: str) -> dict[str, float]:
+    def in_use(self, heliostat: str) -> dict[str, float]:
+        """Return the parameters in use of a heliostat, by name."""
         record = self._plant.beliefs.record(heliostat)
         return self._file(heliostat) if record is None else record.parameters
 
@@ -232,6 +281,31 @@ class TypedParameters:
         ----------
         person, token
             An engineer, with the token of the command authority.
+        heliostat, values, reason
+            See `prepare`.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted.
+        InputError, UnknownNameError
+            See `prepare`.
+        """
+        return self.write(person, token, self.prepare(heliostat, values, reason))
+
+    async def restore(
+        self, person: Person, token: int, heliostat: str, version: int, reason: str
+    ) -> Ticket:
+        """Bring back an earlier version of a heliostat's parameters; see `change`."""
+        return self.write(person, token, await self.prepare_version(heliostat, version, reason))
+
+    def prepare(
+        self, heliostat: str, values: Mapping[str, float], reason: str
+    ) -> PreparedChange:
+        """Check new values of a heliostat's parameters; nothing is written.
+
+        Parameters
+        ----------
         heliostat, values
             Name, and the new values by parameter, rad, m or 1; the others stay.
         reason
@@ -239,8 +313,6 @@ class TypedParameters:
 
         Raises
         ------
-        RefusedError
-            If it is not accepted.
         InputError
             Values that are not credible, no reason, or nothing that changes.
         UnknownNameError
@@ -258,16 +330,14 @@ class TypedParameters:
                     "unit and the installation"
                 )
         last = self._plant.beliefs.record(heliostat)
-        record = self._typed(heliostat, mechanism, {**self._now(heliostat), **values}, values)
+        record = self._typed(heliostat, mechanism, {**self.in_use(heliostat), **values}, values)
         shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
         model = "" if last is None else last.model
         record = replace(record, model=model, note=reason.strip())
-        return self._write(person, token, record, reason, shown)
+        return self._prepared(record, shown, reason)
 
-    async def restore(
-        self, person: Person, token: int, heliostat: str, version: int, reason: str
-    ) -> Ticket:
-        """Bring back an earlier version of a heliostat's parameters; see `change`."""
+    async def prepare_version(self, heliostat: str, version: int, reason: str) -> PreparedChange:
+        """Check an earlier version of a heliostat's parameters; see `prepare`."""
         self._plant.field.place(heliostat)
         known = {one.version: one for one in await self._history(heliostat)}
         if version not in known:
@@ -275,7 +345,7 @@ class TypedParameters:
         note = f"version {version} again: {reason.strip()}"
         old = replace(known[version], growth=self._plant.beliefs.growth(heliostat))
         record = replace(old, covariance=old.covariance_at(self._utc()), note=note, pushed=())
-        return self._write(person, token, record, reason, f"version {version} again")
+        return self._prepared(record, f"version {version} again", reason)
 
     def _typed(
         self,
@@ -298,30 +368,43 @@ class TypedParameters:
             heliostat, 0.0, names, numbers, covariance, prior, provenance=Provenance.PERSON
         )
 
-    def _write(
-        self, person: Person, token: int, given: HeliostatCalibration, reason: str, shown: str
-    ) -> Ticket:
-        plant, name = self._plant, given.heliostat
+    def _prepared(self, record: HeliostatCalibration, shown: str, reason: str) -> PreparedChange:
+        name, beliefs = record.heliostat, self._plant.beliefs
         if not reason.strip():
             raise InputError(f"{name}: give the reason for other parameters; the audit keeps it")
-        last = plant.beliefs.record(name)
-        new = given.mechanism(plant.beliefs.nominal(name))[0]
-        before, items = items_of(plant.beliefs.present(name)[0]), items_of(new)
-        changed = tuple(item for item, data in items.items() if before[item] != data)
-        if not changed:
+        before = items_of(beliefs.present(name)[0])
+        after = items_of(record.mechanism(beliefs.nominal(name))[0])
+        items = {item: data for item, data in after.items() if before[item] != data}
+        if not items:
             raise InputError(f"{name}: it has these parameters already; nothing was changed")
+        return PreparedChange(record, items, shown, reason.strip())
+
+    def write(
+        self,
+        person: Person,
+        token: int,
+        change: PreparedChange,
+        second: SecondPerson | None = None,
+    ) -> Ticket:
+        """Write a change to the heliostat's board; see `change`.
+
+        With ``second``, version, audit and event name its author and who approved it.
+        """
+        name, approved = change.record.heliostat, "" if second is None else f"; {second.text}"
+        last = self._plant.beliefs.record(name)
         record = replace(
-            given,
+            change.record,
             at=self._utc(),
-            person=person.name,
-            pushed=changed,
+            person=person.name if second is None else second.author,
+            note=change.record.note + approved,
+            pushed=tuple(change.items),
             version=1 if last is None else last.version + 1,
         )
-        chosen = {item: items[item] for item in changed}
-        ticket = plant.parameters(
-            person, token, name, chosen, confirmed=reason.strip(), record=record
+        reason = change.reason + approved
+        ticket = self._plant.parameters(
+            person, token, name, change.items, confirmed=reason, record=record
         )
-        self._log.event("command", person.name, f"PARAMETERS {name}: {shown} ({reason.strip()})")
+        self._log.event("command", person.name, f"PARAMETERS {name}: {change.shown} ({reason})")
         return ticket
 
 
