@@ -66,9 +66,7 @@ class Desk:
     def again(self) -> None:
         self.errands = Errands(self.bench.plant.clock)
         self.typed = TypedParameters(self.bench.plant, self.kept, self.kept)
-        self.approvals = Approvals(
-            self.bench.plant, self.kept, self.typed, self.errands, self.kept
-        )
+        self.approvals = Approvals(self.bench.plant, self.kept, self.typed, self.errands, self.kept)
         self.approvals.recall()
 
     async def ask(self, **given: object) -> tuple[int, Ticket]:
@@ -158,9 +156,11 @@ def test_two_engineers_change_a_parameter(tmp_path: Path, holder: Person) -> Non
     bench, kept = play(tmp_path, scene, holder=holder)
     assert kept.document == ""
     asked, written, approved = kept.told
-    assert asked[0] == ENGINEER.name and asked[1].endswith(f"tilt_east 0.004 ({WHY})")
+    assert asked[0] == ENGINEER.name
+    assert asked[1].endswith(f"tilt_east 0.004 ({WHY})")
     assert written[0] == holder.name
-    assert approved[0] == SECOND.name and f"of {ENGINEER.name} approved" in approved[1]
+    assert approved[0] == SECOND.name
+    assert f"of {ENGINEER.name} approved" in approved[1]
     notes = [(one.who, one.what, one.note) for one in read(bench.audit.path)[0]]
     assert [(who, what) for who, what, _ in notes if what in ("APPROVAL", "PARAMETERS")] == [
         (ENGINEER.name, "APPROVAL"),
@@ -183,7 +183,8 @@ def test_a_roll_back_waits_too(tmp_path: Path) -> None:
         assert (change.version, change.based_on) == (1, 2)
         assert [(one.now, one.asked) for one in change.parameters] == [(0.001, 0.004)]
         record = desk.bench.plant.beliefs.record(NAME)
-        assert record is not None and record.version == 2
+        assert record is not None
+        assert record.version == 2
         assert await (await desk.approvals.approve(SECOND, number)).end(20.0)
         record = desk.bench.plant.beliefs.record(NAME)
         assert record is not None
@@ -249,8 +250,8 @@ def test_its_author_withdraws_and_another_refuses(tmp_path: Path) -> None:
         desk.look()
         assert "withdrawn by Egon" in withdrawn.text
         assert "refused by Edda: the level was off" in refused.text
-        assert withdrawn.finished and refused.finished
-        assert not (withdrawn.good or refused.good)
+        assert [t.finished for t in (withdrawn, refused)] == [True, True]
+        assert [t.good for t in (withdrawn, refused)] == [False, False]
         with pytest.raises(UnknownNameError):
             await desk.approvals.approve(SECOND, second)
         assert desk.writes == 0
@@ -269,10 +270,10 @@ def test_the_wait_ends_by_itself(tmp_path: Path) -> None:
         desk.look()
         assert not ticket.finished
         await desk.bench.wait(10.0)
-        with pytest.raises(RefusedError, match="nobody approved it until .* UTC; it has ended"):
+        with pytest.raises(RefusedError, match=r"nobody approved it until .* UTC; it has ended"):
             await desk.approvals.approve(SECOND, number)
         desk.look()
-        assert ticket.finished and not ticket.good
+        assert (ticket.finished, ticket.good) == (True, False)
         assert (desk.approvals.waiting, desk.writes) == ((), 0)
         await desk.ask()
         await desk.bench.wait(ON.within + 5.0)
@@ -292,7 +293,7 @@ def test_new_parameters_overtake_it(tmp_path: Path) -> None:
             NAME, 1.0, ("tilt_north",), np.array([1e-3]), np.eye(1) * 1e-8, np.ones(1), version=7
         )
         desk.bench.plant.beliefs.take(record)
-        with pytest.raises(RefusedError, match="has had version 7 since .*; it has ended"):
+        with pytest.raises(RefusedError, match=r"has had version 7 since .*; it has ended"):
             await desk.approvals.approve(SECOND, number)
         assert (desk.approvals.waiting, desk.writes) == ((), 0)
 

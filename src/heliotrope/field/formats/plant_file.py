@@ -224,7 +224,9 @@ def _timetable_entry(table: TimetableTable) -> TimetableEntry:
 
 
 def _approval(table: ApprovalTable | None) -> ApprovalSettings:
-    return ApprovalSettings() if table is None else ApprovalSettings(table.parameters, table.within_s)
+    if table is None:
+        return ApprovalSettings()
+    return ApprovalSettings(table.parameters, table.within_s)
 
 
 def _receiver(table: ReceiverTable) -> Receiver:

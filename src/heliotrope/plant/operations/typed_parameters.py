@@ -299,9 +299,7 @@ class TypedParameters:
         """Bring back an earlier version of a heliostat's parameters; see `change`."""
         return self.write(person, token, await self.prepare_version(heliostat, version, reason))
 
-    def prepare(
-        self, heliostat: str, values: Mapping[str, float], reason: str
-    ) -> PreparedChange:
+    def prepare(self, heliostat: str, values: Mapping[str, float], reason: str) -> PreparedChange:
         """Check new values of a heliostat's parameters; nothing is written.
 
         Parameters
