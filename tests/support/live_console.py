@@ -21,6 +21,7 @@ from heliotrope.console.remote import RemotePlant
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.urgent_process import server_of, way_of
+from heliotrope.field.approval import ApprovalSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.volumes import Box
 from heliotrope.links.clock import VirtualClock
@@ -96,8 +97,10 @@ class LiveConsole:
         work: AutomaticSettings | None = None,
         given: frozenset[str] = frozenset(),
         together: bool = False,
+        approval: ApprovalSettings | None = None,
     ) -> None:
         self.folder, self.address = folder, ""
+        self._approval = approval or ApprovalSettings()
         self._made, self._child = (heliostats, speed), child
         self._settings = settings or ConsoleSettings(port=0)
         self._marks = marks
@@ -133,7 +136,9 @@ class LiveConsole:
         now = time.time()
         for role in ROLES:
             self.keeper.people.add(role, _secrets.hash_password(PASSWORD), role, now)
-        design = replace(malan_plant(heliostats), keep_outs=(GATE,))
+        design = replace(
+            malan_plant(heliostats), keep_outs=(GATE,), approval=self._approval
+        )
         self.live = LivePlant(
             design,
             clock,

@@ -634,7 +634,7 @@ def error_parameters(
 ) -> None:
     """Show or set the error parameters of a heliostat at stow, locked or at rest.
 
-    Angles are in mrad and lengths in mm; NAME_deg=VALUE is in degrees.
+    Where the plant file asks for a second approval, they wait for it; see `ctl approvals`. Angles are in mrad and lengths in mm; NAME_deg=VALUE is in degrees.
     """
     from urllib.parse import quote
 
@@ -643,15 +643,87 @@ def error_parameters(
         if not values and not version:
             answer = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
             _show_parameters(answer, as_json)
+            if answer["approval"] and not as_json:
+                mine = (w for w in client.get("parameters/waiting") if w["heliostat"] == heliostat)
+                _show_waiting(list(mine))
             return
         if not reason.strip():
             raise InputError("ctl: give the reason for other parameters with --reason")
-        units = {}
-        if values:
-            answer = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
-            units = {parameter["name"]: parameter["unit"] for parameter in answer["parameters"]}
+        answer = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
+        units = {parameter["name"]: parameter["unit"] for parameter in answer["parameters"]}
         order["values"] = dict(_parameter(text, units) for text in values or ())
-        _follow_with_authority(client, "parameters", order, wait)
+        if answer["approval"]:
+            print(client.ask("POST", "parameters", order)["text"])
+        else:
+            _follow_with_authority(client, "parameters", order, wait)
+
+
+@app.command()
+def approvals(
+    context: typer.Context,
+    number: Annotated[
+        int,
+        typer.Argument(min=0, max=2**53, help="Of the change; none: list all.", show_default=False),
+    ] = 0,
+    approve: Annotated[bool, typer.Option("--approve", help="Approve it: it is written.")] = False,
+    refuse: Annotated[bool, typer.Option("--refuse", help="Refuse it; needs --reason.")] = False,
+    withdraw: Annotated[bool, typer.Option("--withdraw", help="Withdraw your own.")] = False,
+    reason: Annotated[str, typer.Option(help="Why it is refused.")] = "",
+    wait: Wait = 60.0,
+    as_json: Json = False,
+) -> None:
+    """List changes of parameters that wait for a second engineer; approve, refuse or withdraw one.
+
+    The author or whoever approves must have the command authority; else it is taken for the moment.
+    """
+    if (approve + refuse + withdraw > 1) or bool(number) != (approve or refuse or withdraw):
+        raise InputError("ctl approvals: give NUMBER with --approve, --refuse or --withdraw")
+    if refuse and not reason.strip():
+        raise InputError("ctl approvals: give the reason for the refusal with --reason")
+    path = f"parameters/waiting/{number}"
+    with _client(context) as client:
+        waiting = client.get("parameters/waiting")
+        if not number:
+            _show_waiting(waiting, as_json)
+        elif withdraw:
+            client.ask("DELETE", path)
+            print(f"change {number} withdrawn")
+        elif refuse:
+            client.ask("POST", f"{path}/refuse", {"reason": reason})
+            print(f"change {number} refused")
+        elif client.get("authority")["holder"] in [
+            one["author"] for one in waiting if one["number"] == number
+        ]:
+            _follow(client, client.ask("POST", f"{path}/approve"), wait, keeping=False)
+        else:
+            _follow_with_authority(client, f"{path}/approve", None, wait)
+
+
+def _show_waiting(waiting: list[dict[str, Any]], as_json: bool = False) -> None:
+    """Print the changes that wait for a second engineer."""
+    if as_json:
+        print_json(waiting)
+        return
+    for one in waiting:
+        print(
+            f"change {one['number']} of {one['heliostat']}, asked for by {one['author']} at "
+            f"{_utc(one['at'])}: {one['reason']}; it ends at {_utc(one['until'])}"
+        )
+        if one["version"]:
+            print(f"version {one['version']} again")
+        rows = []
+        for parameter in one["parameters"]:
+            unit, size = _SHOWN[parameter["unit"]]
+            shown = (f"{parameter[key] / size:.3f}" for key in ("now", "asked"))
+            rows.append((parameter["name"], *shown, unit))
+        print_table(("parameter", "in use", "asked for", "unit"), rows)
+        if one["beam_rms"] is not None:
+            print(
+                f"the beam moves by {1e3 * one['beam_rms']:.1f} mm RMS at its aim, at most "
+                f"{1e3 * one['beam_most']:.1f} mm"
+            )
+    if not waiting:
+        print("no change waits for approval")
 
 
 #: Units on the screen: name, and its size in the unit of the API.
@@ -1022,7 +1094,7 @@ def _give(
 
 
 def _follow_with_authority(
-    client: "Client | AtPlant", path: str, order: dict[str, Any], wait: float
+    client: "Client | AtPlant", path: str, order: dict[str, Any] | None, wait: float
 ) -> None:
     """Give an order that needs the command authority, and follow it to its end."""
     client.ask("POST", "authority")
@@ -1054,13 +1126,19 @@ def _follow_all(client: "Client | AtPlant", tickets: list[dict[str, Any]], wait:
         raise typer.Exit(1)
 
 
-def _follow(client: "Client | AtPlant", ticket: dict[str, Any], wait: float) -> None:
-    """Wait for the end of a command and print it; exit code 1 if it failed."""
+def _follow(
+    client: "Client | AtPlant", ticket: dict[str, Any], wait: float, keeping: bool = True
+) -> None:
+    """Wait for the end of a command and print it; exit code 1 if it failed.
+
+    With ``keeping`` it keeps the command authority until then, if the command needs it.
+    """
     until = time.monotonic() + wait
     while not ticket["finished"] and time.monotonic() < until:
         time.sleep(0.5)
         ticket = client.get(f"commands/{ticket['identity']}")
-        if not ticket["finished"] and ticket["command"] not in ("STOW", "DEFOCUS"):
+        needed = keeping and ticket["command"] not in ("STOW", "DEFOCUS")
+        if needed and not ticket["finished"]:
             client.ask("PUT", "authority")
     print(ticket["text"])
     if wait > 0.0 and not ticket["good"]:

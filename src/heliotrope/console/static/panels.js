@@ -5,7 +5,7 @@ import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refr
 import { act, aim, askAnd } from "./orders.js";
 import { drawFlux, fluxPoint } from "./showing.js";
 import { markCorners } from "./marking.js";
-import { compareVersions } from "./versions.js";
+import { compareVersions, waitingChanges, waitingView } from "./versions.js";
 import { t } from "./words.js";
 
 const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
@@ -79,9 +79,9 @@ export function heliostat(box) {
       return;
     }
     const name = encodeURIComponent(store.field.names[store.focus]);
-    const [one, why, kept] = await Promise.all([api("GET", `heliostats/${name}`), api("GET", `heliostats/${name}/why`), api("GET", `photographs?heliostat=${name}&limit=40`)]);
+    const [one, why, kept, waiting] = await Promise.all([api("GET", `heliostats/${name}`), api("GET", `heliostats/${name}/why`), api("GET", `photographs?heliostat=${name}&limit=40`), waitingChanges(store.field.names[store.focus])]);
     const ticket = await askedFor(one.name);
-    body.replaceChildren(...heliostatView(one, why, calibrationView(one, kept, ticket)), ...keptView(kept, one.history));
+    body.replaceChildren(...heliostatView(one, [whyView(why), ...waiting.map((each) => waitingView(each))], calibrationView(one, kept, ticket)), ...keptView(kept, one.history));
     const canvas = body.querySelector("canvas");
     if (canvas && one.history.length) chart(canvas, [
       { points: one.history.map((s) => [s.at, 1e3 * s.error]), colour: colourOf("APPROACHING"), dots: true },
@@ -143,7 +143,7 @@ function heliostatView(one, why, calibration) {
   const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none" : p.map((v) => number(v, 1)).join(", "));
   return [
     h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
-    whyView(why),
+    ...why,
     canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: "Automatic control calibrates it as soon as a target is free",
       onclick: () => act(() => calibrate(one.name, false), `calibrate ${one.name}`) }, "Calibrate now"),
     h("button", { className: "hx-button", title: "Automatic control searches its beam on a target until the camera sees it move with its aim; nothing is changed",
@@ -286,7 +286,7 @@ export function calibration(box) {
   const body = h("div"), lines = h("canvas", { className: "hx-chart" }), ahead = h("canvas", { className: "hx-chart" }), air = h("div"), nights = h("div");
   box.append(body, air, nights);
   const shown = new Set();
-  let view = null;
+  let view = null, waiting = [];
   const draw = () => {
     if (!view) return;
     const quality = recent(view.quality), truth = quality.some((p) => p.truth_median !== null);
@@ -297,6 +297,7 @@ export function calibration(box) {
         canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("PUT", "calibration", { on: !view.on }), "calibration") }, view.on ? "Switch off" : "Switch on") : ""),
       facts([["Calibrated", count(view.done)], ["Waiting", count(view.waiting)], ["Failed", count(view.failed)]]),
       h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement in progress"), view.asked.length ? h("li", {}, "asked for next: ", several(view.asked, "", shown)) : ""),
+      ...waiting.map((one) => waitingView(one)),
       h("h3", {}, "Error of the calibrated heliostats (mrad)"), lines,
       h("p", { className: "hx-keys" }, key("predicted, median", colourOf("APPROACHING")), key("90th percentile", colourOf("APPROACHING"), true),
         truth ? [key("true (twin), median", colourOf("SEARCHING")), key("90th percentile", colourOf("SEARCHING"), true)] : ""),
@@ -310,8 +311,8 @@ export function calibration(box) {
       .map(([field, colour, dash]) => ({ points: quality.filter((p) => p[field] !== null).map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
     if (view.outlooks.length) chart(ahead, outlookLines(view), dark());
   };
-  const end = refreshed(async () => { view = await api("GET", "calibration"); draw(); },
-    { key: () => JSON.stringify([store.head?.calibration, store.head?.measuring]) });
+  const end = refreshed(async () => { [view, waiting] = await Promise.all([api("GET", "calibration"), waitingChanges()]); draw(); },
+    { key: () => JSON.stringify([store.head?.calibration, store.head?.measuring, store.head?.changes]) });
   const off = store.on("theme", draw), landed = flights(air), learnt = learning(nights);
   return () => { end(); off(); landed(); learnt(); };
 }
