@@ -12,11 +12,13 @@ from typer.testing import CliRunner
 from heliotrope.cli import app
 from heliotrope.console import _secrets
 from heliotrope.field.approval import ApprovalSettings
+from heliotrope.plant.orders.authority import Person, Role
 from support.live_console import PASSWORD, LiveConsole
 from support.pages import NEEDS_BROWSER, said
 
 Ask = Callable[..., httpx.Response]
 Ctl = Callable[..., str]
+OPERATOR = Person("operator", Role.OPERATOR)
 SECOND, VALUES = "edda", {"tilt_east": 0.0005}
 
 
@@ -48,7 +50,7 @@ def tokens(console: LiveConsole) -> dict[str, str]:
 
 @pytest.fixture
 def ctl(console: LiveConsole, tokens: dict[str, str], tmp_path: Path) -> Ctl:
-    """Run `heliotrope ctl` as somebody; the last word may be the exit code that is expected."""
+    """Run `heliotrope ctl` as somebody; ``code`` is the exit code that is expected."""
 
     def run(who: str, *words: str, code: int = 0, data: bool = False) -> str:
         secret = tmp_path / who
@@ -63,7 +65,7 @@ def ctl(console: LiveConsole, tokens: dict[str, str], tmp_path: Path) -> Ctl:
 
 def stowed(console: LiveConsole, name: str) -> None:
     operations = console.live.operations
-    console.call(lambda: operations.plant.stow("test", (name,)))
+    console.call(lambda: operations.stow(OPERATOR, (name,)))
     console.until(lambda: operations.viewer.heliostat(name).state == "STOWED")
 
 
@@ -86,7 +88,7 @@ def test_two_engineers_by_the_api(console: LiveConsole, ask: Ask) -> None:
     assert (own.status_code, "another engineer must decide" in own.json()["detail"]) == (409, True)
     assert ask(SECOND, "DELETE", path).status_code == 409
     early = ask(SECOND, "POST", f"{path}/approve")
-    assert (early.status_code, "must take command" in early.json()["detail"]) == (409, True)
+    assert (early.status_code, "take command first" in early.json()["detail"]) == (409, True)
     assert ask(SECOND, "POST", "parameters/waiting/7/approve").status_code == 404
     assert console.call(lambda: beliefs.record(name)) is None
     assert ask(SECOND, "POST", "authority").is_success
@@ -97,7 +99,7 @@ def test_two_engineers_by_the_api(console: LiveConsole, ask: Ask) -> None:
     record = console.call(lambda: beliefs.record(name))
     assert record.person == "engineer"
     assert record.note == f"levelled; asked for by engineer, approved by {SECOND}"
-    console.until(lambda: console.live.operations.errands.look() or True)
+    console.call(console.live.operations.errands.look)
     ended = ask("engineer", "GET", f"commands/{ticket['identity']}").json()
     assert f"approved by {SECOND}" in ended["text"]
     texts = [(row["who"], row["text"]) for row in ask("viewer", "GET", "events").json()]
@@ -167,11 +169,8 @@ def test_on_the_page_one_asks_and_another_approves(
     second.wait_for_selector(".hx-waiting", state="detached")
     first.wait_for_selector(".hx-waiting", state="detached")
 
-    order = {"heliostat": name, "values": VALUES, "version": 0, "reason": "levelled twice"}
-    author = console.live.operations.approvals
-    from heliotrope.plant.orders.authority import Person, Role
-
-    console.wait(author.ask(Person("engineer", Role.ENGINEER), **order))
+    approvals = console.live.operations.approvals
+    console.wait(approvals.ask(Person("engineer", Role.ENGINEER), name, VALUES, 0, "levelled"))
     second.click(".hx-waiting >> text=Approve")
     console.until(lambda: console.live.plant.beliefs.record(name) is not None)
     said(second, "PARAMETERS: 1 done")

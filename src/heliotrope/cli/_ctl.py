@@ -634,7 +634,8 @@ def error_parameters(
 ) -> None:
     """Show or set the error parameters of a heliostat at stow, locked or at rest.
 
-    Where the plant file asks for a second approval, they wait for it; see `ctl approvals`. Angles are in mrad and lengths in mm; NAME_deg=VALUE is in degrees.
+    Where the plant file asks for a second approval, they wait for it; see `ctl approvals`.
+    Angles are in mrad and lengths in mm; NAME_deg=VALUE is in degrees.
     """
     from urllib.parse import quote
 
