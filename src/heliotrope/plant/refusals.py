@@ -138,7 +138,7 @@ CHANGE_WAITS = Refusal(
 )
 CHANGE_OVERTAKEN = Refusal(
     "change overtaken",
-    "The heliostat has had new parameters since the change was asked for.",
+    "The time of the change was over, or the heliostat has had new parameters since.",
     "change {number} of {heliostat}: {reason}; it has ended",
     "Compare the versions, and ask for the change again if it is still right.",
 )

@@ -1,13 +1,14 @@
 """Alarms, events and packets of a plant at work, for people."""
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
 
-from heliotrope.errors import HeliotropeError
+from heliotrope.errors import HeliotropeError, UnknownNameError
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.links.messages import ClusterStatus, ProtocolError, decode
@@ -21,6 +22,8 @@ from heliotrope.store.records import Event, Records, StoreError
 _STEADY = ("lease", "status")
 #: Longest text of a packet, letters.
 _LONGEST = 240
+#: Heliostats that the text of an event names at most; others are counted.
+MOST_NAMED = 3
 #: Alarms that the evaluation of the table raises and ends itself: nothing to acknowledge.
 _UNACKNOWLEDGED = (alarms.TIME_WENT_BACK.name, alarms.UNKNOWN_READING.name)
 #: Alarms whose acknowledgement the plant takes, beside the rows of the table.
@@ -60,6 +63,9 @@ class Logbook:
         self._clock, self._records = clock, records
         self._alarms: dict[tuple[str, str], AlarmRow] = {}
         self._events: deque[EventRow] = deque(maxlen=events)
+        #: The heliostats of those events that do not name them all, by number.
+        self._named: dict[int, tuple[str, ...]] = {}
+        self._numbers = count(1)
         self._packets: deque[tuple[float, str, str, bytes]] = deque(maxlen=packets)
         self._steady: dict[tuple[str, str, str], tuple[float, bytes]] = {}
         self._links: dict[str, Link] = {}
@@ -110,9 +116,22 @@ class Logbook:
             if self._records is not None:
                 self._keep(self._records.record_alarm, alarm, self._now())
 
-    def event(self, kind: str, who: str, text: str, severity: Severity = Severity.INFO) -> None:
-        """Take an event; see `EventRow`."""
-        self._events.append(EventRow(self._now(), kind, who, text))
+    def event(
+        self,
+        kind: str,
+        who: str,
+        text: str,
+        severity: Severity = Severity.INFO,
+        heliostats: Sequence[str] = (),
+    ) -> None:
+        """Take an event; see `EventRow`. ``heliostats``: all those that it is about."""
+        number, names = next(self._numbers), tuple(heliostats)
+        if names and not all(name in text for name in names[: MOST_NAMED + 1]):
+            self._named[number] = names
+        row = EventRow(self._now(), kind, who, text, number, len(self._named.get(number, ())))
+        if len(self._events) == self._events.maxlen:
+            self._named.pop(self._events[0].number, None)
+        self._events.append(row)
         if self._records is not None and kind != "alarm":
             line = f"{who}: {text}" if who else text
             self._keep(self._records.record_event, Event(self._now(), kind, line, severity))
@@ -181,6 +200,18 @@ class Logbook:
     def events(self, limit: int = 200) -> tuple[EventRow, ...]:
         """Return the last events, newest first."""
         return tuple(list(self._events)[: -limit - 1 : -1])
+
+    def named(self, number: int) -> tuple[str, ...]:
+        """Return the heliostats of an event whose text does not name them all.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such event, or its text names all.
+        """
+        if number not in self._named:
+            raise UnknownNameError("event of many heliostats", str(number), ())
+        return self._named[number]
 
     def packets(self, limit: int, cluster: str = "") -> tuple[PacketRow, ...]:
         """Return the last messages, newest first."""

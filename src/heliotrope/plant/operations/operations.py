@@ -36,7 +36,7 @@ from heliotrope.plant.operations.automatic import AUTOMATIC, AutomaticControl
 from heliotrope.plant.operations.errands import Errands
 from heliotrope.plant.operations.explaining import explain
 from heliotrope.plant.operations.history import History, figures
-from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.logbook import MOST_NAMED, Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.operations.report import ShiftReport, period, report
@@ -742,7 +742,7 @@ class Operations:
         _operator(person, "give back")
         names = tuple(dict.fromkeys(heliostats)) or self.names
         self.automatic.want(names, wanted=True)
-        self._tell(person, f"{len(names)} heliostats given to automatic control", "command")
+        self._tell(person, f"{len(names)} heliostats given to automatic control", "command", names)
         progress = partial(self.automatic.following, self.plant.now())
         return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)
 
@@ -777,15 +777,23 @@ class Operations:
             self.automatic.want(heliostats, wanted=True, by_person=True)
 
     def _told(self, person: Person, ticket: Ticket) -> None:
-        self.logbook.event("command", person.name, f"{ticket.name} {_some(ticket.heliostats)}")
+        text = f"{ticket.name} {_some(ticket.heliostats)}"
+        self._tell(person, text, "command", ticket.heliostats)
 
-    def _tell(self, person: Person, text: str, kind: str = "calibration") -> None:
-        self.logbook.event(kind, person.name, text)
+    def _tell(
+        self,
+        person: Person,
+        text: str,
+        kind: str = "calibration",
+        heliostats: Sequence[str] = (),
+    ) -> None:
+        self.logbook.event(kind, person.name, text, heliostats=heliostats)
 
 
 def _some(heliostats: Sequence[str]) -> str:
-    more = f" and {len(heliostats) - 3} more" if len(heliostats) > 3 else ""
-    return ", ".join(heliostats[:3]) + more
+    left = len(heliostats) - MOST_NAMED
+    more = f" and {left} more" if left > 0 else ""
+    return ", ".join(heliostats[:MOST_NAMED]) + more
 
 
 def _named(places: Sequence[tuple[Kind, str]]) -> str:

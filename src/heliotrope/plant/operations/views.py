@@ -255,12 +255,24 @@ class AlarmRow(Alarm):
 
 @dataclass(frozen=True)
 class EventRow:
-    """One event: POSIX s, kind (command, calibration, authority, plant), person, and one line."""
+    """One event.
+
+    Attributes
+    ----------
+    at, kind, who, text
+        POSIX s; command, calibration, authority or plant; person; one line.
+    number
+        Of the event, since the start of the plant.
+    heliostats
+        How many heliostats it is about, where the text does not name them all; else 0.
+    """
 
     at: float
     kind: str
     who: str
     text: str
+    number: int = 0
+    heliostats: int = 0
 
 
 @dataclass(frozen=True)
