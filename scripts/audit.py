@@ -1,4 +1,4 @@
-"""Check the installed packages: pinned versions, allowed licences, known vulnerabilities.
+"""Check packages and vendored JavaScript: pinned versions, licences, known vulnerabilities.
 
 python scripts/audit.py [--json | --sbom | --vulnerabilities]
 
@@ -32,6 +32,13 @@ ALLOWED = (
     "historical permission", "zlib", "unlicense", "public domain", "cc0", "zpl", "eupl",
     "epl", "eclipse", "edl", "blueoak", "ofl",
 )  # fmt: skip
+#: Folders with minified JavaScript of others, whose first line names it.
+VENDORED = ("src", "tests", "docs")
+_BANNER = re.compile(r"/\*! (?:https://github\.com/[\w.-]+/)?(\w+) \(?v([\d.]+)\)?")
+#: Their names at npm and licences, which stand beside them or in their text.
+SCRIPTS = {"uPlot": ("uplot", "MIT"), "axe": ("axe-core", "MPL-2.0")}
+#: Those of them that only tests use: they are no part of what is installed.
+TEST_ONLY = frozenset({"axe-core"})
 #: Licences that a package's metadata do not name, with the place where they were read.
 KNOWN: dict[str, str] = {"embreex": "BSD-2-Clause"}  # its metadata hold the text without a name
 
@@ -120,8 +127,32 @@ def audit() -> list[Package]:
     ]
 
 
-def bill(packages: list[Package], name: str, edition: str) -> dict[str, Any]:
-    """Return a bill of materials (CycloneDX 1.5, ECMA-424) of a program and its packages."""
+def vendored(root: Path = ROOT) -> list[Package]:
+    """Return the JavaScript libraries that come with the repository.
+
+    A minified file that does not name itself, or a library that `SCRIPTS` lacks, is a problem.
+    """
+    found = []
+    for path in sorted(p for folder in VENDORED for p in (root / folder).rglob("*.min.js")):
+        banner = _BANNER.match(path.read_text(encoding="utf-8")[:200])
+        if banner is None:
+            problem = "its first line names no library and version"
+            found.append(Package(path.name, "", "", "", problem))
+            continue
+        name, licence = SCRIPTS.get(banner[1], (banner[1].lower(), ""))
+        problem = ""
+        if not licence:
+            problem = "its licence is not noted in SCRIPTS; read it, and note it"
+        elif not allowed(licence):
+            problem = f"licence {licence!r} is none of the allowed ones"
+        found.append(Package(name, banner[2], licence, banner[2], problem))
+    return found
+
+
+def bill(
+    packages: list[Package], scripts: list[Package], name: str, edition: str
+) -> dict[str, Any]:
+    """Return a bill of materials (CycloneDX 1.5, ECMA-424) of a program, packages and scripts."""
     installed = {normal(one.metadata["Name"]): one for one in distributions()}
 
     def needs(package: str) -> list[str]:
@@ -131,7 +162,7 @@ def bill(packages: list[Package], name: str, edition: str) -> dict[str, Any]:
         return sorted(reference(one) for one in packages if one.name in names)
 
     def reference(one: Package) -> str:
-        return f"pkg:pypi/{one.name}@{one.version}"
+        return f"pkg:{'npm' if one in scripts else 'pypi'}/{one.name}@{one.version}"
 
     root = f"pkg:pypi/{name}@{edition}"
     content = [
@@ -142,10 +173,13 @@ def bill(packages: list[Package], name: str, edition: str) -> dict[str, Any]:
             "version": one.version,
             "purl": reference(one),
             "licenses": [{"license": {"name": one.licence or "unknown"}}],
+            **({"scope": "excluded"} if one in scripts and one.name in TEST_ONLY else {}),
         }
-        for one in packages
+        for one in (*packages, *scripts)
     ]
-    serial = uuid.uuid5(uuid.NAMESPACE_URL, "\n".join([root, *map(reference, packages)]))
+    shipped = [one for one in scripts if one.name not in TEST_ONLY]
+    parts = map(reference, (*packages, *scripts))
+    serial = uuid.uuid5(uuid.NAMESPACE_URL, "\n".join([root, *parts]))
     program = {"type": "application", "bom-ref": root, "name": name, "version": edition}
     return {
         "bomFormat": "CycloneDX",
@@ -155,8 +189,9 @@ def bill(packages: list[Package], name: str, edition: str) -> dict[str, Any]:
         "metadata": {"component": {**program, "purl": root}},
         "components": content,
         "dependencies": [
-            {"ref": root, "dependsOn": needs(name)},
+            {"ref": root, "dependsOn": [*needs(name), *map(reference, shipped)]},
             *({"ref": reference(one), "dependsOn": needs(one.name)} for one in packages),
+            *({"ref": reference(one), "dependsOn": []} for one in scripts),
         ],
     }
 
@@ -209,20 +244,22 @@ def main() -> None:
     given = parser.parse_args()
     if given.vulnerabilities:
         sys.exit(look_up())
-    packages = audit()
-    wrong = [one for one in packages if one.problem]
+    packages, scripts = audit(), vendored()
+    wrong = [one for one in (*packages, *scripts) if one.problem]
     if given.sbom:
-        print(json.dumps(bill(packages, "heliotrope", version("heliotrope")), indent=1))
+        print(json.dumps(bill(packages, scripts, "heliotrope", version("heliotrope")), indent=1))
         return
     if given.json:
-        print(json.dumps([asdict(one) for one in packages], indent=1))
+        print(json.dumps([asdict(one) for one in (*packages, *scripts)], indent=1))
     else:
         for one in wrong:
             print(f"{one.name} {one.version}: {one.problem}")
         print(
-            f"{len(packages)} packages, {len(packages) - len(wrong)} pinned at the installed "
-            "version with an allowed licence; --vulnerabilities looks up known ones"
+            f"{len(packages)} packages, {sum(not one.problem for one in packages)} pinned at the "
+            "installed version with an allowed licence; --vulnerabilities looks up known ones"
         )
+        listed = ", ".join(f"{one.name} {one.version} ({one.licence})" for one in scripts)
+        print(f"{len(scripts)} JavaScript libraries in the repository: {listed}")
     sys.exit(bool(wrong))
 
 

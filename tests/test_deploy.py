@@ -460,7 +460,8 @@ def test_the_bill_of_materials_names_every_package() -> None:
     assert (bill["bomFormat"], bill["specVersion"], bill["version"]) == ("CycloneDX", "1.5", 1)
     assert re.fullmatch(r"urn:uuid:[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", bill["serialNumber"])
     audit = runpy.run_path(str(ROOT / "scripts" / "audit.py"))
-    assert {one["name"] for one in bill["components"]} == {one.name for one in audit["audit"]()}
+    every = [*audit["audit"](), *audit["vendored"]()]
+    assert {one["name"] for one in bill["components"]} == {one.name for one in every}
     known = {bill["metadata"]["component"]["bom-ref"], *(c["bom-ref"] for c in bill["components"])}
     assert len(known) == 1 + len(bill["components"])
     numpy = next(one for one in bill["components"] if one["name"] == "numpy")
@@ -471,6 +472,31 @@ def test_the_bill_of_materials_names_every_package() -> None:
         assert known.issuperset(one["dependsOn"])
     ours = next(one for one in bill["dependencies"] if "pkg:pypi/heliotrope@" in one["ref"])
     assert numpy["purl"] in ours["dependsOn"]
+    uplot, axe = (
+        next(one for one in bill["components"] if one["name"] == name)
+        for name in ("uplot", "axe-core")
+    )
+    assert uplot["purl"] == f"pkg:npm/uplot@{uplot['version']}"
+    assert uplot["purl"] in ours["dependsOn"]
+    assert (axe["scope"], axe["purl"] in ours["dependsOn"]) == ("excluded", False)
+
+
+def test_each_javascript_library_in_the_repository_is_known(tmp_path: Path) -> None:
+    vendored = runpy.run_path(str(ROOT / "scripts" / "audit.py"))["vendored"]
+    found = {one.name: one for one in vendored()}
+    assert {name: one.licence for name, one in found.items()} == {
+        "uplot": "MIT",
+        "axe-core": "MPL-2.0",
+    }
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+", one.version) for one in found.values())
+    assert not any(one.problem for one in found.values())
+    folder = tmp_path / "src"
+    folder.mkdir()
+    (folder / "new.min.js").write_text("/*! newcomer v1.2.3 */\n")
+    (folder / "nobody.min.js").write_text("var x=1;")
+    problems = {one.name: one.problem for one in vendored(tmp_path)}
+    assert problems["newcomer"].startswith("its licence is not noted")
+    assert problems["nobody.min.js"] == "its first line names no library and version"
 
 
 def test_a_vulnerability_is_named_and_a_package_that_nobody_knows_is_no_good_news() -> None:

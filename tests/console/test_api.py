@@ -62,6 +62,7 @@ NEEDED = {
     ("POST", "flights"): "engineer",
     ("POST", "learning"): "engineer",
     ("POST", "parameters"): "engineer",
+    ("GET", "events/{number}/heliostats"): "viewer",
     ("GET", "parameters/waiting"): "viewer",
     ("POST", "parameters/waiting/{number}/approve"): "engineer",
     ("POST", "parameters/waiting/{number}/refuse"): "engineer",

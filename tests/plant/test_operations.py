@@ -223,6 +223,22 @@ def test_a_book_counts_alarms_until_they_are_over_and_acknowledged() -> None:
     assert len(book.events(1)) == 1
 
 
+def test_a_book_names_all_heliostats_of_an_event_that_counts_them() -> None:
+    book, many = Logbook(VirtualClock(), events=3), tuple(f"P{n}" for n in range(57))
+    book.event("command", "Olga", "STOW P0, P1, P2 and 54 more", heliostats=many)
+    book.event("command", "Olga", "1 heliostats given to automatic control", heliostats=("P5",))
+    book.event("command", "Olga", "STOW P0, P1, P2", heliostats=many[:3])
+    plain, one, all_of_them = book.events()
+    assert [row.heliostats for row in (plain, one, all_of_them)] == [0, 1, 57]
+    assert book.named(all_of_them.number) == many
+    assert book.named(one.number) == ("P5",)
+    with pytest.raises(UnknownNameError, match="event of many heliostats"):
+        book.named(plain.number)
+    book.event("command", "Olga", "the oldest is forgotten, with its names")
+    with pytest.raises(UnknownNameError):
+        book.named(all_of_them.number)
+
+
 def test_an_alarm_that_ends_by_itself_is_an_event_in_the_book() -> None:
     book = Logbook(VirtualClock())
     book.take_alarm(alarms.PARAMETERS_DIFFER.raised("P1", items="armature"))

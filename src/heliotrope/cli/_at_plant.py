@@ -10,7 +10,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from heliotrope.local import EMERGENCY, ORDINARY, CallError, ask_once, socket_folder
+from heliotrope.local import (
+    EMERGENCY,
+    ORDINARY,
+    CallError,
+    ask_once,
+    fetch_once,
+    socket_folder,
+)
 
 #: Requests of the socket for emergencies.
 URGENT = frozenset({"POST emergency", "POST stow", "POST defocus"})
@@ -71,3 +78,7 @@ class AtPlant:
     def get(self, path: str) -> Any:
         """Return the view of a path."""
         return self.ask("GET", path)
+
+    def picture(self, path: str) -> bytes:
+        """Return the JPEG of a path."""
+        return fetch_once(self._folder / ORDINARY, self._hello, f"GET {path}", {})[1]

@@ -1,6 +1,7 @@
 """``heliotrope ctl``: look at and command a running plant, by its console or without."""
 
 import os
+import re
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -317,6 +318,30 @@ def why(
         )
     for alarm in answer["alarms"]:
         print(f"{alarm['severity']}: {alarm['text']}")
+
+
+@app.command()
+def events(
+    context: typer.Context,
+    limit: Annotated[int, typer.Option(min=1, max=2000, help="Most events.")] = 50,
+    all_names: Annotated[
+        bool, typer.Option("--all-names", help="The names of all heliostats of each event.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Print the last events since the start of the plant, the latest first."""
+    with _client(context) as client:
+        found = client.get(f"events?limit={limit}")
+        for one in found if all_names else ():
+            if one["heliostats"]:
+                one["names"] = client.get(f"events/{one['number']}/heliostats")
+    if as_json:
+        print_json(found)
+        return
+    for one in found:
+        print("  ".join(filter(None, (_utc(one["at"]), one["kind"], one["who"], one["text"]))))
+        if "names" in one:
+            print(f"    {', '.join(one['names'])}")
 
 
 @app.command()
@@ -829,13 +854,23 @@ def photographs(
     limit: Annotated[
         int, typer.Option(min=1, max=10_000, help="Newest ones, at most this many.")
     ] = 50,
+    save: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the first and the last photograph of its last calibration, as JPEG.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """List the kept photographs of a heliostat, each with the result of its visit."""
-    from urllib.parse import quote
-
+    if save is not None and not heliostat:
+        raise InputError("ctl photographs: --save needs the heliostat whose calibration it is")
     with _client(context) as client:
         answer = client.get(f"photographs?heliostat={quote(heliostat, safe='')}&limit={limit}")
+        if save is not None:
+            _save_calibration(client, heliostat, answer, save)
+            return
     if as_json:
         print_json(answer)
         return
@@ -843,6 +878,37 @@ def photographs(
         (str(p["identity"]), _utc(p["at"]), p["target"], p["outcome"], p["text"]) for p in answer
     ]
     print_table(("number", "time", "target", "outcome", ""), rows)
+
+
+def _save_calibration(
+    client: "Client | AtPlant", heliostat: str, kept: list[dict[str, Any]], folder: Path
+) -> None:
+    """Save the first and the last photograph of a heliostat's last calibration, as the page does.
+
+    Raises
+    ------
+    InputError
+        If it has no result or no kept photograph, or the folder cannot be written.
+    """
+    results = client.get(f"heliostats/{quote(heliostat, safe='')}")["results"]
+    if not results:
+        raise InputError(f"{heliostat}: it has no result of a calibration yet")
+    *_, before, last = [{"at": 0.0}, *sorted(results, key=lambda result: result["at"])]
+    mine = [one for one in kept if before["at"] < one["at"] <= last["at"] + 1.0]
+    mine.sort(key=lambda one: one["at"])
+    if not mine:
+        raise InputError(f"{heliostat}: no photograph of its last calibration is kept")
+    print(f"{last['outcome']}, {_utc(last['at'])}, {last['target']}: {last['text']}")
+    name = re.sub(r"[^\w.-]", "_", heliostat)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for which, one in zip(("first", "last"), (mine[0], mine[-1])[: len(mine)], strict=False):
+            at = datetime.fromtimestamp(one["at"], UTC)
+            path = folder / f"{name}-{at:%Y%m%dT%H%M%SZ}-{which}.jpg"
+            path.write_bytes(client.picture(f"photographs/{one['identity']}"))
+            print(path)
+    except OSError as error:
+        raise InputError(f"ctl photographs: {error.filename}: {error.strerror}") from None
 
 
 @app.command()

@@ -56,6 +56,18 @@ class Client:
         RemoteError
             If the console refuses it, or cannot be reached.
         """
+        answer = self._request(method, path, body)
+        return None if answer.status_code == 204 else answer.json()
+
+    def get(self, path: str) -> Any:
+        """Return the answer of a path."""
+        return self.ask("GET", path)
+
+    def picture(self, path: str) -> bytes:
+        """Return the JPEG of a path; see `ask`."""
+        return self._request("GET", path, None).content
+
+    def _request(self, method: str, path: str, body: Any) -> httpx.Response:
         try:
             answer = self._http.request(method, path.lstrip("/"), json=body)
         except httpx.HTTPError as error:
@@ -63,12 +75,8 @@ class Client:
                 f"console {self._url}: {str(error) or type(error).__name__}; is it running there?"
             ) from None
         if answer.is_success:
-            return None if answer.status_code == 204 else answer.json()
+            return answer
         raise RemoteError(_detail(answer), answer.status_code)
-
-    def get(self, path: str) -> Any:
-        """Return the answer of a path."""
-        return self.ask("GET", path)
 
     def command(
         self, name: str, heliostats: Sequence[str] = (), values: Sequence[float] = ()

@@ -8,7 +8,7 @@ Begin with `frames`.
 """
 
 from heliotrope.local.buckets import Buckets
-from heliotrope.local.client import AwayError, CallError, LocalConnection, ask_once
+from heliotrope.local.client import AwayError, CallError, LocalConnection, ask_once, fetch_once
 from heliotrope.local.frames import INTERNAL, Frame, FrameError, pack
 from heliotrope.local.server import LocalLimits, LocalServer
 from heliotrope.local.sockets import EMERGENCY, ORDINARY, name_here, socket_folder
@@ -26,6 +26,7 @@ __all__ = [
     "LocalLimits",
     "LocalServer",
     "ask_once",
+    "fetch_once",
     "name_here",
     "pack",
     "socket_folder",

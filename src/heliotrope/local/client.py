@@ -164,7 +164,19 @@ def ask_once(
     blob: bytes = b"",
     timeout: float = 30.0,
 ) -> Any:
-    """Connect, make one call, and return the value of its answer; without an event loop.
+    """Connect, make one call, and return the value of its answer; see `fetch_once`."""
+    return fetch_once(path, hello, call, arguments, blob, timeout)[0]
+
+
+def fetch_once(
+    path: Path,
+    hello: dict[str, Any],
+    call: str,
+    arguments: dict[str, Any],
+    blob: bytes = b"",
+    timeout: float = 30.0,
+) -> tuple[Any, bytes]:
+    """Connect, make one call, and return value and blob of its answer; without an event loop.
 
     Raises
     ------
@@ -178,7 +190,8 @@ def ask_once(
             raw.sendall(pack(hello))
             value_of(_receive(raw))
             raw.sendall(pack({"id": 1, "call": call, "arguments": arguments}, blob))
-            return value_of(_receive(raw))
+            answer = _receive(raw)
+            return value_of(answer), answer.blob
     except (OSError, EOFError, FrameError) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise AwayError(

@@ -366,13 +366,26 @@ export function alarms(box) {
   }, { key: () => store.head?.alarms, every: 4 });
 }
 
+// The text of an event; the names of its many heliostats are asked for when it is unfolded, and stay so.
+const unfoldedEvents = new Map();
+function eventText(r) {
+  if (!r.heliostats) return r.text;
+  const key = `${r.number} ${r.at}`, names = h("div", { className: "hx-hint" }, unfoldedEvents.get(key) ?? ""), box = h("details", { className: "hx-several", open: unfoldedEvents.has(key) },
+    h("summary", { title: t("Show the {n} heliostats", { n: count(r.heliostats) }) }, r.text), names);
+  box.ontoggle = async () => {
+    if (!box.open) unfoldedEvents.delete(key);
+    else if (!unfoldedEvents.has(key)) await act(async () => { names.textContent = (await api("GET", `events/${r.number}/heliostats`)).join(", "); unfoldedEvents.set(key, names.textContent); }, t("heliostats of the event"), false);
+  };
+  return box;
+}
+
 export function logs(box) {
   let which = "events", filter = "";
   const body = h("div"), past = journal(), tabs = ["events", "journal", "packets", "commands"].map((name) => h("button", { className: "hx-button", onclick: () => { which = name; mark(); load(); } }, name));
   const find = h("input", { type: "search", placeholder: "filter", oninput: () => { filter = find.value.toLowerCase(); load(); } });
   const mark = () => tabs.forEach((tab) => tab.classList.toggle("main", tab.textContent === which));
   const columns = {
-    events: [["Time", (r) => moment(r.at)], ["Kind", (r) => r.kind], ["Who", (r) => r.who], ["", (r) => r.text]],
+    events: [["Time", (r) => moment(r.at)], ["Kind", (r) => r.kind], ["Who", (r) => r.who], ["", eventText]],
     packets: [["Time", (r) => clock(r.at)], ["Cluster", (r) => `${r.way === "to" ? "→" : "←"} ${r.cluster}`], ["Kind", (r) => r.kind], ["Bytes", (r) => r.size, "num"], ["", (r) => h("code", {}, r.text)]],
     commands: [["Command", (r) => r.command], ["Heliostats", (r) => count(r.heliostats), "num"], ["", (r) => h("span", { className: r.finished ? (r.good ? "good" : "warn") : "" }, r.text)]],
   };

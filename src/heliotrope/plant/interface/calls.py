@@ -280,8 +280,17 @@ def acknowledge(desk: Desk, who: Person, order: orders.Acknowledged) -> None:
 
 @_call("GET events", "logs", fresh=FRESH)
 def events(desk: Desk, order: orders.Some) -> tuple[views.EventRow, ...]:
-    """Return the last events, newest first."""
+    """Return the last events, newest first.
+
+    `heliostats`: how many it is about, where `text` does not name them all.
+    """
     return desk.operations.logbook.events(order.limit)
+
+
+@_call("GET events/{number}/heliostats", "logs")
+def event_heliostats(desk: Desk, order: orders.OneEvent) -> tuple[str, ...]:
+    """Return the names of all heliostats of an event whose text does not name them all."""
+    return desk.operations.logbook.named(order.number)
 
 
 @_call("GET journal", "logs")

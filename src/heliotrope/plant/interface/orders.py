@@ -210,6 +210,12 @@ class ParameterOrder(Strict):
     reason: Annotated[Words, Field(min_length=1)]
 
 
+class OneEvent(Strict):
+    """The number of an event."""
+
+    number: Annotated[int, Field(ge=1, le=2**53)]
+
+
 class OneChange(Strict):
     """The number of a change that waits for an approval."""
 

@@ -638,12 +638,12 @@ class AutomaticControl:
     def _stow_up(self, *, told: bool) -> None:
         """Stow the wanted heliostats that are up; with ``told`` say so even if there are none."""
         up = self._plant.field.among(states.UP, self._plant.now()) & self._raising.wanted
-        if up.any():
-            names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
+        names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
+        if names:
             self._plant.stow(AUTOMATIC.name, names)
-        if told or up.any():
-            text = f"the sun is low: {int(up.sum())} heliostats go to stow"
-            self._log.event("plant", AUTOMATIC.name, text)
+        if told or names:
+            text = f"the sun is low: {len(names)} heliostats go to stow"
+            self._log.event("plant", AUTOMATIC.name, text, heliostats=names)
 
     # -- parts of the work -----------------------------------------------------------------
 

@@ -435,7 +435,7 @@ class Calibrating:
         proven = sum(result.new > 0 for result in results)
         text = f"{proven} of {len(names)} heliostats proven together"
         said = f"{cycle.kind}: {text}{said and f'; {said}'}"
-        self._log.event("calibration", place, said)
+        self._log.event("calibration", place, said, heliostats=names)
         return results
 
     def _fresh(self) -> npt.NDArray[np.bool_]:

@@ -126,7 +126,7 @@ class Logbook:
     ) -> None:
         """Take an event; see `EventRow`. ``heliostats``: all those that it is about."""
         number, names = next(self._numbers), tuple(heliostats)
-        if names and not all(name in text for name in names[: MOST_NAMED + 1]):
+        if len(names) > MOST_NAMED or not all(name in text for name in names):
             self._named[number] = names
         row = EventRow(self._now(), kind, who, text, number, len(self._named.get(number, ())))
         if len(self._events) == self._events.maxlen:

@@ -486,7 +486,7 @@ class Operations:
             raise refusals.REASON_MISSING.error(what="out of service")
         places = self._places(heliostats, targets, receivers, tower=tower)
         names = self.automatic.hold(person, places, reason, hours)
-        self._tell(person, f"{_named(places)} out of service: {reason}", "command")
+        self._tell(person, f"{_named(places)} out of service: {reason}", "command", names)
         progress = partial(self.automatic.service.progress, places)
         return self.errands.begin("OUT_OF_SERVICE", names, progress, _PARKED)
 
@@ -528,7 +528,8 @@ class Operations:
         still = [place for place in places if locks.on(*place)]
         back = [place for place in places if not locks.on(*place)]
         if back:
-            self._tell(person, f"{_named(back)} back in service", "command")
+            text = f"{_named(back)} back in service"
+            self._tell(person, text, "command", [_named([place]) for place in back])
         for kind, name in still:
             text = f"{person.name} has returned a lock; it stays locked: {locks.text(kind, name)}"
             self._tell(person, f"{_named([(kind, name)])}: {text}", "command")

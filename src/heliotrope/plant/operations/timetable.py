@@ -134,7 +134,8 @@ class Timetable:
         before = self._turns.get(entry.name, _Turn())
         # By night each turn ends alike, and one event says so.
         if text != before.text:
-            self._log.event("calibration", entry.name, f"timetable: {text}")
+            about = entry.heliostats
+            self._log.event("calibration", entry.name, f"timetable: {text}", heliostats=about)
         self._turns[entry.name] = _Turn(self._looked, text)
 
     def _check(self, entries: Sequence[TimetableEntry]) -> None:
