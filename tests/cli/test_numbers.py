@@ -92,6 +92,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "ctl versions": ("A1", "1"),
     "ctl trend": (),
     "ctl journal": (),
+    "ctl events": (),
+    "ctl approvals": (),
     "ctl calibrate": ("A1",),
     "ctl parameters": ("A1",),
     "ctl photographs": ("A1",),
