@@ -30,6 +30,7 @@ from heliotrope.local import EMERGENCY, LocalConnection
 from heliotrope.plant.interface import PlantInterface
 from heliotrope.plant.interface.console_process import Patience
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.pictures import Pictures
 from heliotrope.plant.orders.audit import JsonLines
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.settings import PlantSettings
@@ -98,9 +99,11 @@ class LiveConsole:
         given: frozenset[str] = frozenset(),
         together: bool = False,
         approval: ApprovalSettings | None = None,
+        pictures: Path | None = None,
     ) -> None:
         self.folder, self.address = folder, ""
         self._approval = approval or ApprovalSettings()
+        self._pictures = None if pictures is None else Pictures(pictures)
         self._made, self._child = (heliostats, speed), child
         self._settings = settings or ConsoleSettings(port=0)
         self._marks = marks
@@ -136,9 +139,7 @@ class LiveConsole:
         now = time.time()
         for role in ROLES:
             self.keeper.people.add(role, _secrets.hash_password(PASSWORD), role, now)
-        design = replace(
-            malan_plant(heliostats), keep_outs=(GATE,), approval=self._approval
-        )
+        design = replace(malan_plant(heliostats), keep_outs=(GATE,), approval=self._approval)
         self.live = LivePlant(
             design,
             clock,
@@ -147,6 +148,7 @@ class LiveConsole:
             records=self.keeper,
             extra=lambda: {"speed": speed},
             marks=self._marks,
+            pictures=self._pictures,
         )
         self.interface = PlantInterface(self.live.operations, self.keeper.people, self.folder)
         settings = self._settings
