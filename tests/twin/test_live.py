@@ -231,7 +231,11 @@ BUS_KEY = b"the bus's key..."
 RAISED = 35.0
 
 
-@pytest.mark.parametrize("key", [b"", BUS_KEY], ids=["open-bus", "signed-bus"])
+@pytest.mark.parametrize(
+    "key",
+    [pytest.param(b"", marks=pytest.mark.slow), BUS_KEY],
+    ids=["open-bus", "signed-bus"],
+)
 def test_a_small_plant_raises_itself_learns_and_is_stowed(key: bytes) -> None:
     """With a key of the bus the gates of the firmware judge every order and every new parameter."""
 
@@ -270,8 +274,11 @@ def test_step_counts_that_come_seldom_are_not_taken_for_new(
     monkeypatch.setattr("heliotrope.cluster._orders.FOLLOWED", 0.0)
 
     async def work(plant: LivePlant) -> None:
-        await asyncio.sleep(240.0)
-        results = plant.operations.automatic.view().results
+        for _ in range(240):
+            results = plant.operations.automatic.view().results
+            if len(results) >= 3:
+                break
+            await asyncio.sleep(1.0)
         assert len(results) >= 3
         assert all(entry.text.startswith("calibrated") for entry in results), results
         assert max(entry.after for entry in results) < 0.5 * MRAD
