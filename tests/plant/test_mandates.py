@@ -24,6 +24,11 @@ VERA = Person("Vera", Role.ENGINEER)
 CALIBRATED = CalibrationOutcome.CALIBRATED
 #: Beginnings of the stages of a joint visit; the last is that in which parameters are written.
 STAGES = ("the empty", "6 on the way", "photograph 4 ", "6 on the way back", "taking", "LOCKED")
+#: The same for a test of each; two lie between others that are like them.
+EACH = [
+    pytest.param(one, marks=pytest.mark.slow) if one in ("6 on the way", "taking") else one
+    for one in STAGES
+]
 
 
 async def reached(here: Scene, stage: str, visit: "asyncio.Task[object]") -> None:
@@ -86,7 +91,7 @@ def good(results: dict[str, CycleResult], *but: str) -> bool:
     return all(r.outcome is CALIBRATED for name, r in results.items() if name not in but)
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", EACH)
 def test_who_takes_command_lets_a_joint_visit_end(stage: str) -> None:
     async def scene(here: Scene) -> None:
         plant, aims = here.live.plant, here.live.plant.aims.copy()
@@ -183,7 +188,7 @@ def test_an_order_to_all_ends_the_visit_in_order(stage: str, order: str) -> None
     played(scene)
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", EACH)
 def test_an_emergency_leaves_nothing_locked_and_the_field_goes_up_again(stage: str) -> None:
     async def scene(here: Scene) -> None:
         plant, operations = here.live.plant, here.live.operations
@@ -221,7 +226,7 @@ def test_an_emergency_leaves_nothing_locked_and_the_field_goes_up_again(stage: s
     played(scene)
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", EACH)
 def test_a_cancelled_visit_leaves_nothing(stage: str) -> None:
     async def scene(here: Scene) -> None:
         plant, aims = here.live.plant, here.live.plant.aims.copy()
