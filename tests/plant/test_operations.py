@@ -494,7 +494,7 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
         shown.hold(OPERATOR, (name,), "washing", 2.0)
         (lockout,) = shown.automatic.service.out
         assert lockout.until - lockout.since == 7200.0
-        assert "washing (Olga, since 21 Oct 07:03 UTC" in shown.viewer.heliostat(name).hold
+        assert "washing (Olga, since 21 Oct 07:00 UTC" in shown.viewer.heliostat(name).hold
         await _stand(plant, ["STOWED", "TRACKING", "TRACKING", "TRACKING"], 120.0)
         assert list(shown.viewer.frame().held) == [True, False, False, False]
         # Neither automatic control nor a group's command nor a person's moves it.
@@ -873,7 +873,8 @@ def test_the_night_is_no_emergency_and_people_work_at_the_mirrors() -> None:
 
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.names[0]
-        await asyncio.sleep(400.0)
+        await _until(lambda: shown.sun().elevation < 0.0, 400.0)
+        await asyncio.sleep(30.0)
         assert shown.sun().elevation < 0.0
         assert not shown.summary().emergency
         assert shown.viewer.emergency().text == "no emergency so far"
@@ -909,10 +910,10 @@ def test_the_stow_of_the_evening_is_no_loss_although_it_goes_in_turn() -> None:
         evening += timedelta(minutes=1)
 
     async def work(plant: LivePlant) -> None:
-        await asyncio.sleep(150.0)
-        assert "TRACKING" in _states(plant)
-        await asyncio.sleep(500.0)
-        assert set(_states(plant)) == {"STOWED"}
+        await _until(lambda: "TRACKING" in _states(plant), 150.0)
+        await _until(lambda: "STOWING" in _states(plant), 500.0)
+        await _stand(plant, ["STOWED"] * 16, 150.0)
+        await asyncio.sleep(20.0)
         assert not _waits(plant)
 
     settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0, losses=1)

@@ -307,7 +307,10 @@ def test_anothers_beam_is_not_taken_for_its_own(count: int) -> None:
         assert isinstance(plant.cameras, ExactCamera)
         camera = Strangers(plant.cameras, count)
         plant.cameras.photograph = camera.photograph  # type: ignore[method-assign]
-        await asyncio.sleep(150.0)
+        for _ in range(150):
+            if plant.operations.automatic.view().results:
+                break
+            await asyncio.sleep(1.0)
         assert camera.left == 0
         first = plant.operations.automatic.view().results[-1]
         assert first.text.startswith("calibrated"), first
@@ -346,8 +349,11 @@ def test_boards_learn_as_a_vectorised_field_does() -> None:
     few = replace(design, groups={"azel": group.take([0, 1, 2])})
 
     async def work(plant: LivePlant) -> None:
-        await asyncio.sleep(110.0)
-        view = plant.operations.automatic.view()
+        for _ in range(110):
+            view = plant.operations.automatic.view()
+            if view.done:
+                break
+            await asyncio.sleep(1.0)
         assert view.done >= 1, plant.operations.logbook.events(20)
         assert view.results[-1].text.startswith("calibrated: ")
         assert await plant.stowed()
@@ -497,7 +503,11 @@ def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool, key: byt
         plant, sensor = live.plant, live.world.flux
         assert sensor is not None
         assert "flux_after_emergency" not in plant.sentinel.table.unwatched
-        await asyncio.sleep(100.0)
+        for _ in range(100):
+            if plant.field.among((states.TRACKING,), plant.now()).all():
+                break
+            await asyncio.sleep(1.0)
+        await asyncio.sleep(10.0)
         assert plant.field.among((states.TRACKING,), plant.now()).all(), plant.field.counted()
         assert sensor.share() > 0.9
         order = plant.raise_emergency("Olga")
