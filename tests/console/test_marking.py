@@ -43,9 +43,6 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     while TARGET not in made.call(lambda: list(made.live.cameras._frames)):
         assert time.monotonic() < end, "no picture of the empty target"
         time.sleep(0.1)
-    # Visits would go on drawing photographs, which nobody looks at here.
-    engineer = Person("engineer", Role.ENGINEER)
-    made.call(lambda: made.live.operations.switch_calibration(engineer, on=False))
     yield made
     made.close()
 

@@ -275,9 +275,7 @@ def test_a_heliostat_that_is_raised_in_vain_is_left_alone(tmp_path: Path) -> Non
             working = asyncio.create_task(control.run())
             # It comes to standby, and is not able to go on from there.
             cluster.rows["flags"][cluster.names.index(NAME)] = 0
-            given_up = "raising_given_up"
-            await bench.until(lambda: any(a.condition == given_up for a in log.alarms()), 1500.0)
-            await bench.wait(60.0)
+            await bench.wait(1500.0)
             assert len(cluster.commands("APPROACH")) == RAISING.most - 1
             assert cluster.rows["state"][cluster.names.index(NAME)] == states.STOWED
             (alarm,) = (a for a in log.alarms() if a.active and a.condition == "raising_given_up")

@@ -231,11 +231,7 @@ BUS_KEY = b"the bus's key..."
 RAISED = 35.0
 
 
-@pytest.mark.parametrize(
-    "key",
-    [pytest.param(b"", marks=pytest.mark.slow), BUS_KEY],
-    ids=["open-bus", "signed-bus"],
-)
+@pytest.mark.parametrize("key", [b"", BUS_KEY], ids=["open-bus", "signed-bus"])
 def test_a_small_plant_raises_itself_learns_and_is_stowed(key: bytes) -> None:
     """With a key of the bus the gates of the firmware judge every order and every new parameter."""
 
@@ -274,11 +270,8 @@ def test_step_counts_that_come_seldom_are_not_taken_for_new(
     monkeypatch.setattr("heliotrope.cluster._orders.FOLLOWED", 0.0)
 
     async def work(plant: LivePlant) -> None:
-        for _ in range(240):
-            results = plant.operations.automatic.view().results
-            if len(results) >= 3:
-                break
-            await asyncio.sleep(1.0)
+        await asyncio.sleep(240.0)
+        results = plant.operations.automatic.view().results
         assert len(results) >= 3
         assert all(entry.text.startswith("calibrated") for entry in results), results
         assert max(entry.after for entry in results) < 0.5 * MRAD
@@ -307,10 +300,7 @@ def test_anothers_beam_is_not_taken_for_its_own(count: int) -> None:
         assert isinstance(plant.cameras, ExactCamera)
         camera = Strangers(plant.cameras, count)
         plant.cameras.photograph = camera.photograph  # type: ignore[method-assign]
-        for _ in range(150):
-            if plant.operations.automatic.view().results:
-                break
-            await asyncio.sleep(1.0)
+        await asyncio.sleep(150.0)
         assert camera.left == 0
         first = plant.operations.automatic.view().results[-1]
         assert first.text.startswith("calibrated"), first
@@ -349,11 +339,8 @@ def test_boards_learn_as_a_vectorised_field_does() -> None:
     few = replace(design, groups={"azel": group.take([0, 1, 2])})
 
     async def work(plant: LivePlant) -> None:
-        for _ in range(110):
-            view = plant.operations.automatic.view()
-            if view.done:
-                break
-            await asyncio.sleep(1.0)
+        await asyncio.sleep(110.0)
+        view = plant.operations.automatic.view()
         assert view.done >= 1, plant.operations.logbook.events(20)
         assert view.results[-1].text.startswith("calibrated: ")
         assert await plant.stowed()
@@ -503,11 +490,7 @@ def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool, key: byt
         plant, sensor = live.plant, live.world.flux
         assert sensor is not None
         assert "flux_after_emergency" not in plant.sentinel.table.unwatched
-        for _ in range(100):
-            if plant.field.among((states.TRACKING,), plant.now()).all():
-                break
-            await asyncio.sleep(1.0)
-        await asyncio.sleep(10.0)
+        await asyncio.sleep(100.0)
         assert plant.field.among((states.TRACKING,), plant.now()).all(), plant.field.counted()
         assert sensor.share() > 0.9
         order = plant.raise_emergency("Olga")
