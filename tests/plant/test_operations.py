@@ -5,25 +5,22 @@ import contextlib
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.layouts import lay_out
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Sphere
-from heliotrope.geometry import normalize
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import SendOutcome, Statistics
 from heliotrope.links.messages import Ask, ClusterStatus, Lease, encode
-from heliotrope.optics import FluxView, air_loss, intercept_rectangle, predict_flux
 from heliotrope.plant.interface.desk import Desk
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.logbook import Logbook
@@ -49,103 +46,6 @@ ENGINEER, OPERATOR, VIEWER = (
 )
 RECEIVER = Receiver("R", "planar", np.array([0.0, 0.0, 60.0]), np.array([0.0, -1.0, 0.0]), 6.0, 5.0)
 UP = np.array([0.0, 0.0, 1.0])
-
-
-# -- flux --------------------------------------------------------------------------------------
-
-
-def test_a_beam_along_the_axis_has_the_known_intercept_and_power() -> None:
-    vertex, light = np.array([[0.0, -200.0, 60.0]]), normalize(np.array([0.0, 1.0, 1.0]))
-    view = predict_flux(RECEIVER, vertex, RECEIVER.center[None], [5.0], [2e-3], sun=light)
-    sigma = 200.0 * math.sqrt(2.325e-3**2 + (2 * 1e-3) ** 2 + (2 * 2e-3 / math.sqrt(2)) ** 2)
-    assert view.intercept == pytest.approx(float(intercept_rectangle(6.0, 5.0, sigma)), abs=1e-5)
-    # The ray goes north and the sun is 45° above it: the mirror sees it under 22.5°.
-    cosine = math.cos(math.radians(22.5))
-    all_light = 5.0 * 900.0 * 0.9 * cosine * (1.0 - float(air_loss(200.0)))
-    assert view.power == pytest.approx(all_light * view.intercept, rel=1e-5)
-    cell = (view.right[1] - view.right[0]) * (view.up[1] - view.up[0])
-    assert view.power <= float(view.flux.sum() * cell) <= all_light * (1.0 + 1e-6)
-    assert view.heliostats == 1
-
-
-def test_an_oblique_beam_is_as_wide_as_rays_say() -> None:
-    vertex, light = np.array([[90.0, -80.0, 2.0]]), normalize(np.array([0.2, -0.5, 0.8]))
-    view = predict_flux(RECEIVER, vertex, RECEIVER.center[None], [5.0], [1e-3], sun=light)
-    ray = normalize(RECEIVER.center - vertex[0])
-    slant = float(np.linalg.norm(RECEIVER.center - vertex[0]))
-    sigma = slant * math.sqrt(2.325e-3**2 + 4e-6 + 2e-6)
-    rng = np.random.default_rng(1)
-    across = rng.normal(0.0, sigma, (200_000, 3))
-    across -= (across @ ray)[:, None] * ray
-    # Where rays beside the middle one meet the plane y = 0.
-    places = across - (across[:, 1] / ray[1])[:, None] * ray
-    inside = (np.abs(places[:, 0]) < 3.0) & (np.abs(places[:, 2]) < 2.5)
-    assert view.intercept == pytest.approx(float(inside.mean()), abs=0.01)
-    right = float((view.flux.sum(axis=0) @ view.right**2) / view.flux.sum())
-    assert right == pytest.approx(np.mean(places[np.abs(places[:, 0]) < 4.5, 0] ** 2), rel=0.05)
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(0.0, 5e-3))
-def test_the_map_is_mirrored_with_the_aim(right: float, up: float, error: float) -> None:
-    light = normalize(np.array([0.0, -0.6, 0.8]))
-    vertex = np.array([[0.0, -150.0, 60.0]])
-    views = [
-        predict_flux(
-            RECEIVER, vertex, RECEIVER.center + [[side * right, 0.0, up]], [5.0], [error], sun=light
-        )
-        for side in (1.0, -1.0)
-    ]
-    assert np.allclose(views[0].flux, views[1].flux[:, ::-1], rtol=1e-3, atol=1e-2)
-    assert 0.0 <= views[0].intercept <= 1.0
-
-
-def test_flux_leaves_out_neighbours_and_the_curvature_of_the_receiver() -> None:
-    light = normalize(np.array([0.0, -0.6, 0.8]))
-
-    def view(receiver: Receiver, *places: tuple[float, float, float]) -> FluxView:
-        beams = len(places)
-        aims = np.tile(receiver.center, (beams, 1))
-        return predict_flux(receiver, places, aims, [5.0] * beams, [1e-3] * beams, sun=light)
-
-    behind = (0.0, -200.0, 2.0)
-    # Halfway along the ray of the mirror behind it, which it blocks whole.
-    before = (0.0, -100.0, 31.0)
-    apart = view(RECEIVER, behind).power + view(RECEIVER, before).power
-    assert view(RECEIVER, behind, before).power == pytest.approx(apart)
-    curved = replace(RECEIVER, kind="external_cylinder", radius=3.0, opening_angle=2.0 * math.pi)
-    assert view(curved, behind) == view(RECEIVER, behind)
-    # At 2° from the plane of the aperture, and at 4°.
-    beside = [(100.0, -100.0 * math.tan(math.radians(angle)), 60.0) for angle in (2.0, 4.0)]
-    assert [view(curved, place).heliostats for place in beside] == [0, 1]
-
-
-def test_light_that_is_none() -> None:
-    light = normalize(np.array([0.0, -0.6, 0.8]))
-    nothing = predict_flux(RECEIVER, np.empty((0, 3)), np.empty((0, 3)), [], [], sun=light)
-    assert nothing.power == 0.0
-    assert math.isnan(nothing.intercept)
-    assert not nothing.flux.any()
-    behind = predict_flux(
-        RECEIVER, [[0.0, 100.0, 2.0]], RECEIVER.center[None], [5.0], [0.0], sun=light
-    )
-    assert behind.heliostats == 0
-    night = predict_flux(
-        RECEIVER, [[0.0, -100.0, 2.0]], RECEIVER.center[None], [5.0], [0.0], sun=-UP
-    )
-    assert night.power == 0.0
-    with pytest.raises(InputError, match="2 vertices, 1 aims"):
-        predict_flux(RECEIVER, np.zeros((2, 3)), np.zeros((1, 3)), [1.0], [0.0], sun=UP)
-    with pytest.raises(InputError, match=r"the reflectivity 1\.5"):
-        predict_flux(
-            RECEIVER,
-            [[0.0, -9.0, 2.0]],
-            RECEIVER.center[None],
-            [5.0],
-            [0.0],
-            sun=UP,
-            reflectivity=1.5,
-        )
 
 
 # -- searching ---------------------------------------------------------------------------------
@@ -340,11 +240,13 @@ def test_what_a_plant_shows() -> None:
         assert (one.supply, one.temperature, one.boots) == (pytest.approx(23.85), -7.0, 3)
         light = shown.sun()
         assert light.elevation == pytest.approx(math.asin(light.direction[2]), abs=1e-6)
-        assert shown.receiver_flux().power == 0.0
+        assert (await shown.receiver_flux()).power == 0.0
         assert shown.camera("left").version == 0
-        for wrong in (shown.viewer.heliostat, shown.camera, shown.receiver_flux):
+        for wrong in (shown.viewer.heliostat, shown.camera):
             with pytest.raises(UnknownNameError):
                 wrong("nobody")
+        with pytest.raises(UnknownNameError):
+            await shown.receiver_flux("nobody")
         # A cluster that falls silent is shown as that, and its heliostats as stale.
         plant.links["C2"].plugged = False
         await asyncio.sleep(6.0)
@@ -398,7 +300,7 @@ def test_persons_come_before_the_automat() -> None:
         states = [shown.viewer.heliostat(name).state for name in names]
         assert states == ["STOWED", "STOWED", "TRACKING", "TRACKING"]
         assert shown.viewer.frame().on[2] == 1
-        assert shown.receiver_flux("receiver").heliostats == 2
+        assert (await shown.receiver_flux("receiver")).heliostats == 2
         shown.give_back(OPERATOR, names[1:2])
         await asyncio.sleep(60.0)
         assert shown.viewer.heliostat(names[1]).state in ("IDLE", "TRACKING")
