@@ -405,7 +405,7 @@ class Mechanism(Value, Framed):
         return Pose(normal.reshape(*shape, 3), vertex.reshape(*shape, 3))
 
     def jacobian(self, counts: npt.ArrayLike, names: tuple[str, ...]) -> Jacobian:
-        """Return the pose and its derivatives by parameters ``names`` and by the counts.
+        """Return the pose and its derivatives by the parameters ``names`` and by the counts.
 
         Parameters
         ----------

@@ -557,7 +557,7 @@ def _utc(seconds: float) -> datetime:
 
 
 def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
-    """Return times as unix seconds (UTC) of the same shape: the one reader of times.
+    """Return times as Unix seconds (UTC) of the same shape; every time is read here.
 
     Parameters
     ----------
