@@ -1,17 +1,17 @@
-r"""The flux that a field is expected to bring to a receiver: a map, its power, the intercept.
+r"""The expected flux of a field on a receiver: flux map, power and intercept.
 
-A beam is a Gaussian about its aim, as wide as the sun, the mirror and the mirror's calibration make
-it (`beam_sigma`). Across the ray it is round. On the aperture, which the ray with components
-$d_r, d_u$ meets at an angle of cosine c, its variances are
+A beam is a Gaussian about its aim; its width follows from the sun, the mirror and the mirror's
+calibration (`beam_sigma`). In the plane perpendicular to the ray it is circular. On the aperture,
+which the ray with components $d_r, d_u$ meets at an angle with cosine c, its variances are
 
 $$σ_r^2 = σ^2 (1 + (d_r / c)^2), \qquad σ_u^2 = σ^2 (1 + (d_u / c)^2),$$
 
-and the correlation of the two axes is left out: then each cell's share is a product, and the map of
-a field of 10,000 beams is one product of two matrices. The power of a beam is
+and the correlation between the two axes is neglected. The fraction in each cell is then a product,
+and the map of a field of 10,000 beams is a single product of two matrices. The power of a beam is
 
 $$P = A \, E \, ρ \, \sqrt{(1 + s·t)/2} \, (1 - l(d)),$$
 
-with the loss l in clear air of `air_loss`. `predict_flux` says what is left out.
+with the loss l of `air_loss` in clear air. `predict_flux` lists what is neglected.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from heliotrope.optics.beam import beam_sigma
 from heliotrope.optics.intercept import intercept_rectangle
 from heliotrope.values import Card, Value, amount, span
 
-#: Default number of cells across and up.
+#: Default number of cells, horizontally and vertically.
 CELLS = (24, 24)
 #: Width of the map over that of the aperture, so that it shows the spillage too.
 MARGIN = 1.5
@@ -47,9 +47,9 @@ class FluxView(Value, Framed):
     flux
         W/m², (H, W), lowest row first.
     power
-        Into the aperture, W.
+        Power into the aperture, W.
     intercept
-        Share of the reflected light that falls into the aperture; NaN without beams.
+        Fraction of the reflected light that enters the aperture; NaN without beams.
     heliostats
         Number of beams counted.
     """
@@ -92,12 +92,13 @@ def predict_flux(
     slope: float = 1e-3,
     cells: tuple[int, int] = CELLS,
 ) -> FluxView:
-    """Return the flux of N beams on a receiver, without shading, blocking, canting and curvature.
+    """Return the flux of N beams on a receiver; neglects shading, blocking, canting, curvature.
 
     Parameters
     ----------
     receiver
-        Its aperture is taken as the flat rectangle of its width and height, whatever its kind.
+        The receiver; its aperture is treated as a flat rectangle of its width and height, whatever
+        its kind.
     vertices, aims
         Mirror vertices and aim points, ENU, m, (N, 3).
     areas
@@ -111,9 +112,9 @@ def predict_flux(
     reflectivity
         0 to 1.
     slope
-        Standard deviation of the mirrors' surface per axis, rad.
+        Standard deviation of the mirror surface slope per axis, rad.
     cells
-        Number across and up.
+        Number of cells, horizontally and vertically.
 
     Raises
     ------
@@ -122,16 +123,16 @@ def predict_flux(
 
     Notes
     -----
-    This is left out:
+    The following effects are neglected:
 
     - **shading and blocking** by neighbours and by the tower: every mirror counts in full, so the
       power is too high;
-    - **canting, focus and size** of the mirrors: each is taken as focused on its aim, without
-      astigmatism, so the beams are too narrow where it is not;
-    - **curved receivers**: the map is that of the plane of the aperture, not of the surface behind
-      it, and beams that meet this plane from behind or within 3° of it do not count, so that an
-      external cylinder gets the light of one side only;
-    - the shape of the sun's limb, and reflection by the receiver.
+    - **canting, focus and size** of the mirrors: each mirror is assumed to be focused on its aim
+      without astigmatism, so the beams are too narrow where it is not;
+    - **curved receivers**: the map is that of the aperture plane, not of the surface behind it, and
+      beams that meet this plane from behind or within 3° of it do not count, so an external
+      cylinder receives light from one side only;
+    - the limb darkening of the sun, and reflection by the receiver.
     """
     places = as_vectors(np.reshape(as_float(vertices), (-1, 3)), "vertices")
     points = as_vectors(np.reshape(as_float(aims), (-1, 3)), "aims")
