@@ -1,9 +1,9 @@
-"""The table of calls: request of the API, least role, arguments, answer, and work of each.
+"""The table of calls: API request, minimum role, arguments, reply and implementation of each.
 
-A function with its row is the one definition of an operation: the console makes the routes of the
-HTTP API from it, `heliotrope ctl` at the plant asks by the same requests, and the reference of the
-API lists it. The model of its ``order``, the type of its answer and its docstring are taken as they
-stand.
+A function together with its table entry is the only definition of an operation: the console derives
+the routes of the HTTP API from it, `heliotrope ctl` at the plant makes the same requests, and the
+API reference lists it. The model of its ``order``, the type of its reply and its docstring are used
+unchanged.
 """
 
 import asyncio
@@ -52,7 +52,7 @@ _LINK = re.compile(r"\[([^\]]+)\]\([^)]+\)")
 
 @dataclass(frozen=True)
 class WithBlob:
-    """A value, and the bytes that go with it: for the API those of a JPEG."""
+    """A value, and the bytes that accompany it: for the API those of a JPEG."""
 
     value: Any
     blob: bytes
@@ -75,33 +75,33 @@ class Call:
     Attributes
     ----------
     function
-        Does it in the plant's loop; it names which of ``desk``, ``who``, ``order`` and ``blob`` it
-        needs.
+        Function that does the work in the plant's event loop; its arguments are those of ``desk``,
+        ``who``, ``order`` and ``blob`` that it needs.
     request
-        Method and path of the HTTP API, with arguments in braces; "": only the local interface has
-        it.
+        Method and path in the HTTP API, with arguments in braces; "": available only on the local
+        interface.
     group
-        Heading under which the API describes it.
+        Section heading in the API reference.
     role
-        Least role of the person on whose behalf it is made.
+        Minimum role of the person on whose behalf the call is made.
     arguments
         Model of the arguments.
     answer
-        Type of the value; None: there is none.
+        Type of the value; None: there is no value.
     body
-        Model of a request's body where that is not all the arguments.
+        Model of the request body, if it does not contain all arguments.
     pack
-        Makes arguments and blob of a body; None: it takes no blob.
+        Function that derives arguments and blob from a body; None: the call takes no blob.
     bare
-        Whether a request may come without a body.
+        Whether a request may have no body.
     fresh
-        Time for which all callers share an answer, s; 0: none.
+        Time for which all callers share a reply, s; 0: replies are not shared.
     urgent
         Whether it belongs to the socket for EMERGENCY, DEFOCUS and STOW.
     console
         Whether only a console may make it.
     unlimited
-        Whether it is not counted as an order; see `counted`.
+        Whether it does not count as an order; see `counted`.
     """
 
     function: Callable[..., Any]
@@ -120,7 +120,7 @@ class Call:
 
     @property
     def counted(self) -> bool:
-        """Whether it is an order, of which only so many are admitted."""
+        """Whether it is an order, whose rate is limited."""
         return self.role >= Role.OPERATOR and not (self.urgent or self.unlimited)
 
     @property
@@ -130,18 +130,18 @@ class Call:
 
     @property
     def plain_text(self) -> str:
-        """The same without links."""
+        """The same text without links."""
         return _LINK.sub(r"\1", self.text)
 
     def work(self, desk: Desk, who: Person, order: Any, blob: bytes) -> Any:
-        """Do it; the value is made plain elsewhere, and that of a `Later` has to be waited for."""
+        """Do the work; the value is converted elsewhere, and a `Later` must be awaited."""
         given = {"desk": desk, "who": who, "order": order, "blob": blob}
         named = inspect.signature(self.function).parameters
         ready = functools.partial(self.function, **{name: given[name] for name in named})
         return Later(ready) if inspect.iscoroutinefunction(self.function) else ready()
 
 
-#: All calls that are done in the plant's loop, by name.
+#: All calls that run in the plant's event loop, by name.
 CALLS: dict[str, Call] = {}
 
 
@@ -536,12 +536,11 @@ def switch_calibration(desk: Desk, who: Person, order: orders.Switch) -> views.C
 def calibrate(desk: Desk, who: Person, order: orders.OneCalibration) -> TicketState:
     """Calibrate a heliostat as soon as a target is free, before all others.
 
-    Answers with a ticket that ends with the result. With `search` only its beam is searched;
-    `together` names others that go to the target with it, in one
-    [joint visit](../explanation/plant.md#many-mirrors-on-one-target), as soon as all are ready;
-    with `receiver` all stay in production and are
-    [measured on the receiver](../explanation/plant.md#mirrors-in-production), as soon as all track
-    it.
+    Returns a ticket that ends with the result. With `search` only its beam is searched for;
+    `together` names other heliostats that go to the target with it, in one [joint
+    visit](../explanation/plant.md#many-mirrors-on-one-target), as soon as all are ready; with
+    `receiver` all stay in production and are [measured on the
+    receiver](../explanation/plant.md#mirrors-in-production), as soon as all track it.
     """
     return desk.tickets.put(desk.operations.calibrate(who, **order.model_dump()))
 
@@ -721,9 +720,9 @@ def learning(desk: Desk) -> tuple[views.LearningView, ...]:
 
 @_call("POST learning", "calibration", ENGINEER)
 def learn(desk: Desk, who: Person, order: orders.OneGroup) -> tuple[views.LearningView, ...]:
-    """Learn drift, noise and installation of a `group` ("": all) now, as every night.
+    """Learn drift, noise and installation errors of a `group` ("": all) now, as every night.
 
-    Nothing moves; it runs beside the plant, and `GET learning` says how it ended.
+    No heliostat moves; learning runs beside the plant, and `GET learning` reports the result.
     """
     desk.operations.learn(who, order.group)
     return desk.operations.automatic.learning.views()
