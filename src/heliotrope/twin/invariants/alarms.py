@@ -1,4 +1,4 @@
-"""The observer of alarms: each has its cause in the true world, is raised for it, and ends with it.
+"""The observer of alarms: each alarm has a true cause, is raised for it, and ends with it.
 
 An alarm excuses whom it names from work (`twin.invariants.quiet`), so an alarm without a cause
 hides whatever is wrong. The observer has a table of the alarms that faults of the simulation cause

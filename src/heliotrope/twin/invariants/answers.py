@@ -1,4 +1,4 @@
-"""The observer of answers: what a board says of itself, and a cluster of its boards, is true.
+"""The observer of replies: what boards report of themselves, and clusters of boards, is true.
 
 A board answers questions at one instant of virtual time, so its answer is compared with the true
 board at that instant: where its motors are and whether they turn, how long ago it booted and the

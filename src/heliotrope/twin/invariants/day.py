@@ -34,7 +34,7 @@ class DayObserver(Judge):
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
         All heliostats.
     lowest
@@ -51,28 +51,28 @@ class DayObserver(Judge):
         self._low_at, self._acted_at = inf, -inf
 
     def given(self, heliostats: Iterable[str], now: float) -> None:
-        """Note that a person has given heliostats to automatic control."""
+        """Note that an operator has put heliostats under automatic control."""
         for name in heliostats:
             self._assigned.setdefault(name, now)
 
     def taken(self, heliostats: Iterable[str]) -> None:
-        """Note that a person has moved heliostats: whose they are then is not judged."""
+        """Note that an operator has moved heliostats, whose positions are then not judged."""
         for name in heliostats:
             self._assigned.pop(name, None)
 
     def took(self, now: float) -> None:
-        """Note that a person has the command authority, or asks for it."""
+        """Note that an operator holds the command authority, or requests it."""
         self._acted_at = now
 
     def look(
         self, plant: PlantController | None, quiet: Set[str], sun: FloatArray, now: float
     ) -> None:
-        """Judge where the mirrors are.
+        """Check where the heliostats are.
 
         Parameters
         ----------
         plant
-            None: it does not run.
+            The plant; None: it is not running.
         quiet
             Heliostats in a quiet stretch.
         sun

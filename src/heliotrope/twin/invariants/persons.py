@@ -1,4 +1,4 @@
-"""The observer of persons: what a person has ordered or locked stands until it is ended (17).
+"""The observer of operators: what a person has ordered or locked lasts until it is ended (17).
 
 It keeps a ledger of its own, from the calls of persons and not from the plant: the emergencies that
 each person ordered, with their acts, and withdrew; the heliostats that each person locked, and the

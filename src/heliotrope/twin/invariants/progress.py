@@ -1,4 +1,4 @@
-"""The observer of progress: automatic control raises the field and calibrates it, in time.
+"""The observer of progress: automatic control raises and calibrates the field, in time.
 
 The persons report to it what they have given to automatic control, and the holder of the command
 authority. In a quiet stretch (`quiet`) a heliostat that was given must leave stow, and be measured

@@ -1,4 +1,4 @@
-"""The observer of work: in a quiet stretch, what was ordered is done.
+"""The observer of work: in an undisturbed period, what was ordered is done.
 
 A field that does less, or later, breaks no invariant of safety. Where nothing has failed near a
 heliostat for a while, and no alarm names it, this observer expects that SUN and STATUS come at

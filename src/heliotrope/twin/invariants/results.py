@@ -1,4 +1,4 @@
-"""The observer of results: what visits bring, beside the photographs that were taken.
+"""The observer of results: what visits produce, compared with the photographs that were taken.
 
 The camera reports each photograph to it, and it reads the step counts of the true mirror then. A
 sighting that the plant keeps must have the time, the point and the step counts of a photograph, and

@@ -1,4 +1,4 @@
-"""The observer of what is shown: tables, one heliostat, summary and events, beside what happened.
+"""The observer of displays: tables, heliostat pages, summary and events, against the truth.
 
 It makes the same requests as a page. It knows from the boards where their motors stand and
 how their beams lie, from the bus what they have reported and when, and from the persons what they

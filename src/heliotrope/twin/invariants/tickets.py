@@ -1,4 +1,4 @@
-"""The observer of tickets: who gives a command learns in time what becomes of it.
+"""The observer of tickets: whoever gives a command is told in time what becomes of it.
 
 A ticket says for each heliostat how far its command has come. While the plant's program runs, a
 heliostat must have acknowledged it, or the ticket must have ended for it, within a time of the

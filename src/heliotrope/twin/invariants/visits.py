@@ -1,4 +1,4 @@
-"""The observer of visits: what photographs have taught the plant, beside the true mirrors.
+"""The observer of visits: what the plant learnt from photographs, against the true mirrors.
 
 It judges two things that the plant keeps: a calibration, which must bring the mirror's true beam to
 its aim within the calibration's own covariance (12), and a sighting, which must show the mirror's
