@@ -123,7 +123,7 @@ def read_commands(
     names
         Names of the plant's heliostats.
     cluster, point
-        Cluster and calibration point whose rows to use; "" for all.
+        Select the rows of this cluster and this calibration point; "" for all.
 
     Raises
     ------

@@ -478,7 +478,7 @@ def separation(sorties: Sequence[Sortie], stations: Sequence[HoverStation], craf
 
 @dataclass(frozen=True)
 class CameraTarget:
-    """Duration of the same campaign with camera and target.
+    """Duration of the same measurements if made by a camera at a target.
 
     Attributes
     ----------

@@ -1,8 +1,8 @@
 """The observer of the day: automatic control has the field at stow while the sun is low.
 
-It knows what persons have given to automatic control, and what they have done to it since, from
-these persons; the height of the sun, the boards, and which stretches are quiet (`quiet`). It shares
-no limit with the code under test (invariant 16).
+It knows from the operators what they have put under automatic control, and what they have done to
+it since; and it knows the elevation of the sun, the boards, and which periods are undisturbed
+(`quiet`). It shares no limit with the code under test (invariant 16).
 """
 
 from collections.abc import Iterable, Sequence, Set
@@ -29,7 +29,7 @@ _UP = (
 
 
 class DayObserver(Judge):
-    """Observes that the field is at stow while the sun is low; see the module.
+    """Checks that the field is at stow while the sun is low; see the module.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class DayObserver(Judge):
     boards
         All heliostats.
     lowest
-        Elevation of the sun below which the field belongs at stow, rad.
+        Sun elevation below which the field belongs at stow, rad.
 
     """
 
@@ -74,7 +74,7 @@ class DayObserver(Judge):
         plant
             The plant; None: it is not running.
         quiet
-            Heliostats in a quiet stretch.
+            Heliostats in an undisturbed period.
         sun
             True direction to the sun, (3,).
         now
