@@ -1,15 +1,15 @@
 """Heliotrope runs the heliostat field of a solar power tower.
 
-It computes where every mirror must point, learns each mirror's imperfections from measurements,
-and corrects them. In a notebook::
+It computes where every heliostat must point, learns the imperfections of each heliostat from
+measurements, and corrects them. In a notebook::
 
     import heliotrope as ht
 
     plant = ht.open("plant.toml")
     sun = ht.sun.vector("2026-09-02T10:00Z", plant.site)
 
-A name is loaded when it is first used, so the import itself is light. The names below are the
-usual way in; each package (`heliotrope.mechanism`, `heliotrope.optics`, …) has more.
+A name is loaded when it is first used, so the import itself is fast. The names below are the usual
+entry points; each package (`heliotrope.mechanism`, `heliotrope.optics`, …) has more.
 """
 
 from importlib import import_module

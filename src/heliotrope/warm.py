@@ -1,9 +1,9 @@
 """Compile the numeric kernels once, so that programs start at full speed.
 
-``python -m heliotrope.warm`` takes some twenty seconds of two cores after an installation and a
-second afterwards; the compiled code stays in the package's ``__pycache__``. The compiler works on
-one thread, so the kernels are shared out between two processes. Commands that need most of them
-begin with `compiling`.
+After an installation ``python -m heliotrope.warm`` takes some twenty seconds on two cores, and
+about a second on later runs; the compiled code is stored in the package's ``__pycache__``. The
+compiler uses one thread, so the kernels are divided between two processes. Commands that need most
+kernels begin with `compiling`.
 """
 
 import subprocess

@@ -1,4 +1,4 @@
-"""The page's files, read once and answered from memory: no thread, and no compressing for each."""
+"""The page's files, read once and served from memory, without a thread or compression each."""
 
 import gzip
 import hashlib

@@ -20,9 +20,9 @@ class FluxView(Value, Framed):
     flux
         W/m², (H, W), lowest row first.
     power
-        Into the aperture, W.
+        Power into the aperture, W.
     intercept
-        Share of the reflected light that falls into the aperture; NaN without beams.
+        Fraction of the reflected light that enters the aperture; NaN without beams.
     heliostats
         Number of beams counted.
     """

@@ -1,14 +1,14 @@
-"""What the flux engine and the ray tracer are told: mirrors, surfaces, towers and one sun.
+"""The input of the flux engine and the ray tracer: mirrors, surfaces, towers and a sun vector.
 
-Everything is plain, immutable and given by arrays, ENU metres and radians. `scene_of` makes it from
-a plant, a sun and aims. A `Scene` says nothing of the sun's shape and of the air: whoever computes
-takes those as arguments of their own.
+All data are plain, immutable arrays in ENU metres and radians. `scene_of` creates a `Scene` from a
+plant, a sun vector and aims. A `Scene` contains neither the sun shape nor the atmosphere; the
+functions that compute flux take these as separate arguments.
 
 A mirror is a flat rectangle about its centre with a unit normal and two unit axes in its plane,
-``right`` (as seen from its front) and ``up``. Its surface deviates from the plane by little: at
-(x, y) along the axes the normal is tilted by −(x, y) / 2f, f being its focal length. Facets are
-rectangles in this plane, each with a tilt of its own (canting) and a focal length of its own; then
-the mirror's own focal length only serves to cast the shadows of its neighbours.
+``right`` (as seen from its front) and ``up``. Its surface deviates only slightly from the plane: at
+(x, y) along the axes the normal is tilted by −(x, y) / 2f, where f is the focal length. Facets are
+rectangles in this plane, each with its own tilt (canting) and focal length; the mirror's own focal
+length is then used only for casting shadows of its neighbours.
 """
 
 from collections.abc import Sequence

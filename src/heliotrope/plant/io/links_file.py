@@ -1,8 +1,8 @@
-"""The links file: how a plant reaches its clusters, and the links that follow from it.
+"""The links file: how a plant reaches its clusters, and the resulting links.
 
-A cluster is reached in one of three ways: it connects to this plant over TCP, it meets the plant
-at an MQTT broker, or its bus is at this machine and its cluster file is given. In the last case
-the program that builds the plant also runs the cluster's program in this process
+A cluster is reached in one of three ways: it connects to this plant over TCP, it meets the plant at
+an MQTT broker, or its bus is attached to this computer and its cluster file is specified. In the
+last case the program that builds the plant also runs the cluster program in this process
 (`cluster.program`) and adds its link. Keys are in a separate file that nobody else may read.
 """
 

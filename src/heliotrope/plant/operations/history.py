@@ -1,7 +1,7 @@
-"""Figures of the whole plant over time: taken every minute, kept in the store.
+"""Plant-wide time series: sampled every minute, kept in the store.
 
-The report of a shift and the trends are made of them. A figure has the name of its kind, and after
-a full stop what it is of: ``power.RECEIVER`` (W), ``state.TRACKING`` and ``state.stale`` (number of
+Shift reports and trends are built from them. The name of a series consists of its kind, a full
+stop, and its subject: ``power.RECEIVER`` (W), ``state.TRACKING`` and ``state.stale`` (number of
 heliostats), ``reading.dni`` (in the unit of the safety table).
 """
 

@@ -1,14 +1,14 @@
-"""The plant at work: the one object that a console, an API and the command line talk to.
+"""The running plant: the single object that a console, an API and the command line talk to.
 
-It gives people's commands, and runs automatic control, which raises the field and calibrates it
-with every target's camera. A failure of one part of automatic control becomes an event or an alarm,
-and the rest goes on. Its parts are asked by their names: `viewer` for the field and a heliostat as
-plain values, `logbook` for alarms, events and packets, `automatic` for calibration, plan and
-timetable.
+It executes operator commands, and runs automatic control, which raises the field and calibrates it
+with the camera of every target. A failure in one part of automatic control becomes an event or an
+alarm, and the rest continues. Its parts are accessed by name: `viewer` for the field and a
+heliostat as plain values, `logbook` for alarms, events and packets, `automatic` for calibration,
+plan and timetable.
 
-People's commands go through here so that automatic control knows what they want: a heliostat that a
-person has stowed, defocused or locked stays so until a person gives it back, and one that a person
-has raised and that was lost is left to people.
+Operator commands pass through here so that automatic control knows what operators want: a heliostat
+that an operator has stowed, defocused or locked stays so until an operator gives it back, and a
+heliostat that an operator has raised and that was lost is left to the operators.
 """
 
 import asyncio
@@ -74,10 +74,10 @@ REFUSED_LINK = "refused link"
 
 
 class Photographer(Protocol):
-    """A source of photographs of targets for people."""
+    """A source of target photographs for display."""
 
     def view(self, target: str) -> CameraView:
-        """Return the last photograph."""
+        """Return the latest photograph."""
         ...
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
@@ -86,38 +86,38 @@ class Photographer(Protocol):
 
 
 class Operations:
-    """A plant at work.
+    """A running plant.
 
     Parameters
     ----------
     plant
         The controller; its ``on_alarm`` is ``logbook.take_alarm`` and its links are
-        ``logbook.tapped(links)``. It is run by the owner.
+        ``logbook.tapped(links)``. The owner runs it.
     logbook
         Alarms, events and packets.
     automatic
         Automatic control of the plant.
     cameras
-        Photographs of the targets for people, by name of the target.
+        Photographs of the targets for display, by target name.
     records
-        Store of everything that outlasts a restart; None: nothing is kept.
+        Store of everything that survives a restart; None: nothing is stored.
     extra
-        Returns further rows of the summary, such as the speed of a twin.
+        Function that returns additional rows for the summary, such as the speed of a twin.
     pictures
-        Keeps photographs with their results; None: they are not kept.
+        Stores photographs with their results; None: they are not stored.
     marking
-        Takes views that persons mark; None: there is no camera.
+        Takes views that users mark; None: there is no camera.
     worker
-        Place for computations.
+        Where computations run; see `Worker`.
 
     Attributes
     ----------
     plant, logbook, automatic, viewer, security, pictures, parameters, marking
-        See their classes: whoever reads the plant asks them.
+        See their classes; readers access them directly.
     telemetry
-        Folder of the telemetry; None: none is archived.
+        Folder of the telemetry; None: no telemetry is archived.
     begun
-        Set once it works.
+        Event that is set once the plant is running.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class Operations:
     # -- running ---------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Work until closed; the plant itself is run by the owner."""
+        """Run until closed; the owner runs the plant controller itself."""
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
         self.begun.set()
         async with asyncio.TaskGroup() as group:
@@ -178,7 +178,7 @@ class Operations:
             await sleep_until(self.plant.clock, self.plant.now() + _FOLLOWED)
 
     async def close(self) -> None:
-        """End automatic control; beams stay where they are, so stow the field first."""
+        """Stop automatic control; beams stay where they are, so stow the field first."""
         self._closing.set()
 
     # -- the field -------------------------------------------------------------------------
@@ -228,7 +228,7 @@ class Operations:
         )
 
     def why(self, heliostat: str) -> Explanation:
-        """Explain why a heliostat tracks or does not; see `Explanation`.
+        """Explain why a heliostat tracks or not; see `Explanation`.
 
         Raises
         ------
@@ -249,12 +249,12 @@ class Operations:
         return await self._read("journal", lambda records: records.journal(query))
 
     async def report(self, since: float, until: float) -> ShiftReport:
-        """Return the report of a time; see `report.period`.
+        """Return the report for a time span; see `report.period`.
 
         Raises
         ------
         InputError
-            If the plant keeps no records, or the time is not one.
+            If the plant keeps no records, or the time span is invalid.
         """
         name, now = self.plant.design.name, self.plant.clock.utc().timestamp()
         first, last = period(since, until, now)
@@ -279,7 +279,7 @@ class Operations:
     ) -> Trend:
         """Return a quantity of the plant or of a heliostat over time; see `trends.trend`.
 
-        Without an end: until now; without a beginning: the day before it.
+        Without an end: until now; without a start: one day before the end.
         """
         if heliostat:
             self.plant.field.place(heliostat)
@@ -293,14 +293,14 @@ class Operations:
         )
 
     def note(self, person: Person, text: str) -> None:
-        """Keep a person's note, such as one for the next shift, in the journal.
+        """Store an operator's note, such as one for the next shift, in the journal.
 
         Raises
         ------
         RefusedError
             If the person is a viewer.
         InputError
-            If it is empty.
+            If the note is empty.
         """
         _operator(person, "note")
         if not text.strip():
@@ -363,11 +363,11 @@ class Operations:
         together: Sequence[str] = (),
         receiver: bool = False,
     ) -> Ticket:
-        """Calibrate a heliostat, or only search its beam, on the next free target, before others.
+        """Calibrate a heliostat, or only search for its beam, on the next free target, first.
 
-        With others (``together``) it is calibrated in one joint visit, as soon as all are ready.
-        With ``receiver`` it is measured where it shines, as soon as all track the receiver. The
-        ticket ends with the result of the visit.
+        With other heliostats (``together``) it is calibrated in one joint visit, as soon as all are
+        ready. With ``receiver`` it is measured while it tracks the receiver, as soon as all of them
+        do. The ticket ends with the result of the visit.
 
         Raises
         ------
@@ -402,9 +402,9 @@ class Operations:
         RefusedError
             If the person is a viewer.
         UnknownNameError
-            If no camera looks at it.
+            If no camera covers the target.
         FetchError
-            If its camera gives no frame.
+            If its camera delivers no frame.
         """
         _operator(person, "photograph")
         before = self.camera(target).version
@@ -416,17 +416,17 @@ class Operations:
         return view
 
     def learn(self, person: Person, group: str = "") -> None:
-        """Learn a group of mirrors ("": all) now; see `Learning.order`."""
+        """Learn a heliostat group ("": all) now; see `Learning.order`."""
         self.automatic.learning.order(person, group)
         self._tell(person, f"asked to learn {group or 'all groups'}")
 
     def camera(self, target: str) -> CameraView:
-        """Return the last photograph of a target.
+        """Return the latest photograph of a target.
 
         Raises
         ------
         UnknownNameError
-            If no camera looks at it.
+            If no camera covers the target.
         """
         if target not in self._cameras:
             raise UnknownNameError("target with a camera", target, self._cameras)
@@ -443,11 +443,12 @@ class Operations:
         receivers: Sequence[str] = (),
         tower: bool = False,
     ) -> Ticket:
-        """Lock heliostats, targets, receivers or the tower for a person, with a lock of their own.
+        """Lock heliostats, targets, receivers or the tower with a person's own lock.
 
-        Locked heliostats go to stow, and nobody moves them; so do those whose beams are aimed at a
-        locked target or receiver, and all under a locked tower. What is locked is back in service
-        when everybody has returned their lock. The ticket is done where a heliostat is parked.
+        Locked heliostats go to stow, and nobody moves them; so do heliostats whose beams are aimed
+        at a locked target or receiver, and all heliostats under a locked tower. A locked object
+        returns to service when everyone has removed their lock. The ticket is done for a heliostat
+        once it is parked.
 
         Parameters
         ----------
@@ -458,12 +459,12 @@ class Operations:
         reason
             Why.
         hours
-            Time after which it is expected back; NaN if unknown. It stays locked after it too.
+            Expected time of return to service; NaN if unknown. The lock remains beyond that time.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer or gives no reason.
+            If the person is a viewer or states no reason.
         UnknownNameError
             If there is no such heliostat, target or receiver.
         """
@@ -487,15 +488,15 @@ class Operations:
         owner: str = "",
         reason: str = "",
     ) -> None:
-        """Return a person's own locks; nothing moves.
+        """Remove a person's own locks; no heliostat moves.
 
-        An engineer may remove those of an ``owner`` who cannot, by name and with a reason.
+        An engineer may remove the locks of an ``owner`` who cannot, by name and with a reason.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, has no lock there while others have, or removes another's
-            without being an engineer or without a reason.
+            If the person is a viewer, has no lock where others have one, or removes another
+            person's lock without being an engineer or without a reason.
         UnknownNameError
             If there is no such heliostat, target or receiver.
         """
@@ -545,12 +546,12 @@ class Operations:
     # -- the authority ---------------------------------------------------------------------
 
     def take_authority(self, person: Person) -> Grant:
-        """Take the command authority; automatic control gives way at once.
+        """Take the command authority; automatic control yields at once.
 
         Raises
         ------
         RefusedError
-            If another person has it, or the person is a viewer.
+            If another person holds it, or the person is a viewer.
         """
         _operator(person, "authority")
         self.automatic.give_way()
@@ -559,7 +560,7 @@ class Operations:
         return grant
 
     def seize_authority(self, person: Person, reason: str) -> Grant:
-        """Break another person's command authority and take it.
+        """Take the command authority away from another person.
 
         Raises
         ------
@@ -573,12 +574,12 @@ class Operations:
         return grant
 
     def release_authority(self, person: Person, token: int) -> None:
-        """Give the command authority back; automatic control goes on.
+        """Release the command authority; automatic control continues.
 
         Raises
         ------
         RefusedError
-            If the person does not have it.
+            If the person does not hold it.
         """
         self.plant.release_authority(person, token)
         self._tell(person, "has given the command authority back", "authority")
@@ -622,9 +623,10 @@ class Operations:
         heliostats
             Names; () for all.
         where
-            Receiver or target: the first receiver as the design says, others at their centres.
+            Receiver or target: for the first receiver the aims of the design, for others the
+            centre.
         place
-            Point of the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
+            Point on the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
 
         Raises
         ------
@@ -657,21 +659,21 @@ class Operations:
         return ticket
 
     def stow(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Send heliostats (() for all) to stow; anybody may."""
+        """Send heliostats (() for all) to stow; anyone may order this."""
         ticket = self.plant.stow(person.name, heliostats)
         self._meant("STOW", ticket.heliostats)
         self._told(person, ticket)
         return ticket
 
     def defocus(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Take beams off the receiver; anybody may."""
+        """Move beams off the receiver; anyone may order this."""
         ticket = self.plant.defocus(person.name, heliostats)
         self._meant("DEFOCUS", ticket.heliostats)
         self._told(person, ticket)
         return ticket
 
     def emergency(self, person: Person, act: str = "DEFOCUS", reason: str = "") -> EmergencyOrder:
-        """Order DEFOCUS or STOW of the whole field with proof; anybody may.
+        """Order a field-wide DEFOCUS or STOW with proof; anyone may order this.
 
         Raises
         ------
@@ -688,7 +690,7 @@ class Operations:
         return order
 
     def withdraw(self, person: Person, owner: str = "") -> None:
-        """Withdraw a person's own emergency order, or an ``owner``'s as an engineer.
+        """Withdraw the person's own emergency order, or an ``owner``'s as an engineer.
 
         Raises
         ------
@@ -707,7 +709,7 @@ class Operations:
         Raises
         ------
         RefusedError
-            If the role is too low, or the cause of a latched row has not gone.
+            If the role is too low, or the cause of a latched row persists.
         """
         _operator(person, "acknowledge")
         if not self.logbook.is_plain(condition):
@@ -718,7 +720,7 @@ class Operations:
     def give_back(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
         """Give heliostats (() for all) to automatic control, which raises and calibrates them.
 
-        The ticket is done where a heliostat follows, and says why where it does not.
+        The ticket is done for a heliostat once it follows, and otherwise states why it does not.
 
         Raises
         ------
@@ -733,14 +735,14 @@ class Operations:
         return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)
 
     def resume(self, person: Person) -> None:
-        """Let automatic control go on with its heliostats, after a loss of many or an emergency.
+        """Let automatic control resume with its heliostats, after a large loss or an emergency.
 
-        An emergency whose orders are all withdrawn is acknowledged by it.
+        This also acknowledges an emergency whose orders are all withdrawn.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, an order stands, or something else demands the emergency.
+            If the person is a viewer, an order is active, or something else requires the emergency.
         """
         _operator(person, "resume")
         sentinel = self.plant.sentinel

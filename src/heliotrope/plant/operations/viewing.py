@@ -1,4 +1,4 @@
-"""Views of a plant at work: the field as one table, one heliostat, an emergency."""
+"""Views of a running plant: the field as one table, one heliostat, an emergency."""
 
 from typing import Any
 
