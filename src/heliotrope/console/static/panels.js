@@ -22,7 +22,7 @@ export function plant(box) {
   let [name] = receivers;
   const choice = h("select", { ariaLabel: t("Receiver"), onchange: () => { name = choice.value; predict(); } }, receivers.map((one) => h("option", { value: one }, one)));
   box.append(h("h3", {}, t("Heliostats")), states, proof, h("h3", {}, t("Sun")), light, sensors,
-    ...(name ? [h("h3", {}, t("Predicted flux on {name}", { name: receivers.length > 1 ? "" : name })), receivers.length > 1 ? choice : "", figures, flux,
+    ...(name ? [h("h3", {}, t("Predicted flux on the receiver")), receivers.length > 1 ? choice : "", figures, flux,
       canCommand() ? h("p", { className: "hx-hint" }, t("Click on the picture to aim the heliostats of the scope at that point.")) : ""] : []));
   let seen = null;
   const show = () => {
