@@ -43,6 +43,7 @@ def said_by_the_plant() -> set[str]:
     words = {*states.STATES, *(one.value for one in CalibrationOutcome), *figures}
     words |= {*report.LACKS.values(), *FAULTS, *events, *Kind, *(role.title for role in Role)}
     words |= {Act.DEFOCUS.name, Act.STOW.name, "steps", "note", "event", "alarm", "first", "never"}
+    words |= {"authority", "security"}  # kinds of events that are named by a variable
     return {word.replace("_", " ") for word in words}
 
 
