@@ -404,7 +404,7 @@ function journal() {
     const query = new URLSearchParams({ ...seconds(from.value, false), ...seconds(to.value, true), kind: kind.value, person: who.value.trim(), heliostat: name.value.trim(), text: text.value.trim(), but: all.checked ? "" : "automatic control", limit: most });
     rows = await api("GET", `journal?${query}`);
     said.textContent = rows.length === most ? t("The latest {n}; choose fewer days or a text.", { n: count(most) }) : t("{n} entries.", { n: count(rows.length) });
-    found.replaceChildren(table([[t("Time (UTC)"), (r) => moment(r.at)], [t("Kind"), (r) => h("span", { className: severe[r.severity] ?? "" }, t(r.kind))], [t("What"), (r) => r.what], ["", (r) => (r.heliostats.length ? h("span", {}, several(r.heliostats, `${r.at}${r.what}`, unfolded), " ", r.text) : r.text)]], rows));
+    found.replaceChildren(table([[t("Time (UTC)"), (r) => moment(r.at)], [t("Kind"), (r) => h("span", { className: severe[r.severity] ?? "" }, t(r.kind))], [t("What"), (r) => (r.kind === "event" ? t(r.what) : r.what)], ["", (r) => (r.heliostats.length ? h("span", {}, several(r.heliostats, `${r.at}${r.what}`, unfolded), " ", r.text) : r.text)]], rows));
   };
   const form = h("form", { className: "hx-row hx-search", onsubmit: (event) => { event.preventDefault(); act(search, t("journal"), false); } },
     fromLabel, toLabel, kind, whoLabel, nameLabel, textLabel, allLabel, h("button", { className: "hx-button main" }, t("Search")),

@@ -91,7 +91,7 @@ async function load(days = 1) {
     history.replaceState(null, "", `?${new URLSearchParams([...chosen.map((key) => ["q", key]), ["since", since.toFixed(0)], ["until", until.toFixed(0)]])}`);
     charts.replaceChildren(...(chosen.length ? [] : [h("p", { className: "hx-hint" }, t("Choose a quantity and press Add."))]));
     found.forEach(draw);
-    events.replaceChildren(entries.length ? table([[t("Time"), (r) => moment(r.at)], [t("Kind"), (r) => t(r.kind)], [t("What"), (r) => r.what], ["", (r) => r.text]], entries.slice(0, 100)) : h("p", { className: "hx-hint" }, t("None.")));
+    events.replaceChildren(entries.length ? table([[t("Time"), (r) => moment(r.at)], [t("Kind"), (r) => t(r.kind)], [t("What"), (r) => (r.kind === "event" ? t(r.what) : r.what)], ["", (r) => r.text]], entries.slice(0, 100)) : h("p", { className: "hx-hint" }, t("None.")));
   } catch (error) { if (mine === latest) tell(error.message, true); }
 }
 if (!chosen.length && known.length) chosen = [known.find((one) => one.name.startsWith("power."))?.name ?? known[0].name];
