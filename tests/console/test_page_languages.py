@@ -17,8 +17,8 @@ TABS = (
     "plant", "heliostat", "heliostats", "targets", "calibration", "clusters", "alarms", "logs",
     "schedule", "shift",
 )  # fmt: skip
-#: Names of people here, which are those of their roles; and words of the plant's own texts.
-NAMES = {"viewer", "operator", "engineer", "automatic control", "plant", "safety"}
+#: Names of people here, which are those of their roles; a receiver's; words of the plant's own.
+NAMES = {"viewer", "operator", "engineer", "automatic control", "plant", "safety", "receiver"}
 #: What people read: the texts that are not hidden, and the attributes.
 READ = """() => {
     const found = [document.title];

@@ -200,7 +200,7 @@ function rowsNamed(text) {
   }))];
 }
 
-const missing = (name, close) => (close ? t('there is no heliostat "{name}"; did you mean {close}? Write its name, or: state = TRACKING and error > 1', { name, close })
+const missing = (name, close) => (close ? t('there is no heliostat "{name}"; did you mean {close}?; write its name, or: state = TRACKING and error > 1', { name, close })
   : t('there is no heliostat "{name}"; write its name, or: state = TRACKING and error > 1', { name }));
 
 function nearest(said, names) {

@@ -150,7 +150,7 @@ function heliostatView(one, why, calibration) {
       onclick: () => act(() => calibrate(one.name, true), t("search {name}", { name: one.name })) }, t("Search its beam"))) : "",
     calibration,
     facts([[t("Cluster"), one.cluster], [t("Heard"), t("{age} ago", { age: one.live ? `${number(one.age, 1)} s` : span(one.age) })],
-      [t("Fault"), one.live ? t(one.fault) : t("unknown"), one.live && one.fault !== "none" ? "bad" : stale], [t("Aims at"), one.on ? t(one.on) : t("nothing")],
+      [t("Fault"), one.live ? t(one.fault) : t("unknown"), one.live && one.fault !== "none" ? "bad" : stale], [t("Aims at"), one.on === "elsewhere" ? t("elsewhere") : one.on || t("nothing")],
       [t("Aim E, N, U (m)"), point(one.aim)], [t("Standby E, N, U (m)"), point(one.standby)],
       [t("Position E, N, U (m)"), one.position.map((v) => number(v, 1)).join(", ")], [t("Mirror"), `${number(one.width, 1)} × ${number(one.height, 1)} m`],
       [t("Predicted error"), one.error === null ? t("never calibrated") : `${mrad(one.error)} mrad`],

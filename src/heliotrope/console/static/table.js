@@ -10,7 +10,7 @@ const HIGH = 27, SAVED = "heliotrope-selections";
 const COLUMNS = [
   [word("Name"), (i) => store.field.names[i], (i) => store.field.names[i]],
   [word("State"), (i) => t(store.stateName(i)), (i) => store.stateName(i)],
-  [word("On"), (i) => store.head?.surfaces?.[store.aim[i]] ?? "", (i) => store.head?.surfaces?.[store.aim[i]] ?? ""],
+  [word("On"), (i) => { const on = store.head?.surfaces?.[store.aim[i]] ?? ""; return on === "elsewhere" ? t("elsewhere") : on; }, (i) => store.head?.surfaces?.[store.aim[i]] ?? ""],
   [word("Predicted error (mrad)"), (i) => mrad(store.error[i]), (i) => store.error[i], true],
   [word("Measured error (mrad)"), (i) => mrad(store.measured[i]), (i) => store.measured[i], true],
   [word("Calibrated"), (i) => (Number.isNaN(store.ageOf(i)) ? t("never") : span(store.ageOf(i))), (i) => store.ageOf(i), true],

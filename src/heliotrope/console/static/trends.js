@@ -1,7 +1,7 @@
 // Trends of any quantity over days beside their events: drag to zoom, wheel, buttons to move, export.
 import { api } from "./live.js";
 import { clock, h, moment, saveCsv, table } from "./dom.js";
-import { english, monthDay, plain, t } from "./words.js";
+import { monthDay, plain, t } from "./words.js";
 
 const { uPlot } = window, DAY = 86400, MOST = 6;
 // Units on the screen, by those of the API.
@@ -12,7 +12,7 @@ document.documentElement.classList.toggle("light", localStorage.getItem("heliotr
 const [form, tools] = [document.querySelector("form"), document.querySelector("form + div")], said = document.querySelector("[role=status]");
 const charts = document.querySelector("#charts"), events = document.querySelector("#events"), synced = uPlot.sync("trends");
 // A quantity is a kind of figure, and after a dot what it is of: a receiver, a state, a sensor.
-const named = (quantity) => quantity.split(".").map((part) => t(part.replaceAll("_", " "))).join(": ");
+const named = (quantity) => { const [kind, of] = quantity.replaceAll("_", " ").split(/\.(.*)/); return of ? `${t(kind)}: ${kind === "state" ? t(of) : of}` : t(kind); };
 const titleOf = (key) => { const [name, whose] = key.split("@"); return whose ? `${named(name)}, ${whose}` : named(name); };
 const tell = (text, bad) => { said.textContent = text; said.classList.toggle("bad", Boolean(bad)); };
 const asked = new URLSearchParams(location.search);
@@ -39,7 +39,7 @@ const lately = (days) => { until = 0; since = 0; load(days); };
 const button = (title, go, label) => h("button", { type: "button", className: "hx-button", ariaLabel: label, title: label, onclick: go }, title);
 tools.append(button(t("Day"), () => lately(1)), button(t("Week"), () => lately(7)), button(t("Month"), () => lately(30)),
   button("←", () => move(-0.5), t("Earlier")), button("→", () => move(0.5), t("Later")), button("+", () => move(0, 0.5), t("Zoom in")), button("−", () => move(0, 2), t("Zoom out")),
-  button(t("Save as CSV"), () => saveCsv("trends.csv", ["time", ...shown.flatMap((one) => ["low", "mean", "high"].map((which) => `${english(() => titleOf(one.key))} ${which} (${one.unit})`))],
+  button(t("Save as CSV"), () => saveCsv("trends.csv", ["time", ...shown.flatMap((one) => ["low", "mean", "high"].map((which) => `${one.key.replace("@", ", ").replaceAll("_", " ")} ${which} (${one.unit})`))],
     shown.flatMap((one, k) => one.at.map((at, i) => [new Date(1e3 * at).toISOString(), ...shown.flatMap((_, j) => (j === k ? [one.low[i], one.mean[i], one.high[i]] : ["", "", ""]))])).sort((a, b) => (a[0] < b[0] ? -1 : 1)))),
   h("span", { className: "hx-hint" }, t("Drag over a chart to zoom in; the wheel zooms; a double click shows the last day.")));
 
