@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     )
     from heliotrope.mechanism import kinds as kinds
     from heliotrope.optics import field_flux as flux
-    from heliotrope.optics import flux_day, flux_year, image_offsets, predict_flux
+    from heliotrope.optics import flux_day, flux_year, image_offsets
     from heliotrope.sun import Site
 
 __version__ = "0.1.0"
@@ -111,7 +111,6 @@ _HOMES = {
     "linear_paint": "heliotrope.mechanism",
     "open": "heliotrope.field.formats",
     "predict": "heliotrope.calibration",
-    "predict_flux": "heliotrope.optics",
     "prototype": "heliotrope.field",
     "read_field_sightings": "heliotrope.calibration",
     "read_plant": "heliotrope.field.formats.plant_file",
@@ -181,7 +180,6 @@ __all__ = [
     "optics",
     "plot",
     "predict",
-    "predict_flux",
     "prototype",
     "read_field_sightings",
     "read_plant",

@@ -4,7 +4,7 @@
 - `beam`: the sun's angular radius, the width of a beam and its strength along its axis. Every other
   module takes these from there.
 - `offsets`: where an imperfect heliostat throws its beam (Malan's error model as a forward model).
-- `intercept` and `flux`: the share of a beam, and the flux of round beams, on a receiver.
+- `intercept`: the share of a round beam that meets a disk or a rectangle.
 - `scene`, `surfaces`, `shading` and `receiver_flux`: the engine, from mirrors to the flux in cells;
   `rays` is a second opinion, and `canting` tilts facets.
 - `plant_flux` and `flux_files`: efficiencies and flux of a plant at a sun, a day or a year, and
@@ -36,7 +36,7 @@ from heliotrope.optics.beam import (
     mean_concentration,
 )
 from heliotrope.optics.canting import canted
-from heliotrope.optics.flux import CELLS, FluxView, predict_flux
+from heliotrope.optics.flux import FluxView
 from heliotrope.optics.flux_files import (
     write_heliostats,
     write_map,
@@ -85,13 +85,13 @@ from heliotrope.optics.plant_flux import (
     field_flux,
     flux_day,
     flux_year,
+    scene_flux,
 )
 from heliotrope.optics.rays import RayTrace, trace
 from heliotrope.optics.sun_shape import SUN_SHAPES, Gaussians, SunShape, sun_profile
 
 __all__ = [
     "AIR_MODELS",
-    "CELLS",
     "CHI_SQUARE_90",
     "DAYLIGHT",
     "EFFICIENCIES",
@@ -148,11 +148,11 @@ __all__ = [
     "intercept_rectangle",
     "mean_concentration",
     "nearest",
-    "predict_flux",
     "reflected_beam",
     "safe_distance",
     "safe_range",
     "safe_way",
+    "scene_flux",
     "sun_profile",
     "sweep",
     "target_offsets",

@@ -131,6 +131,10 @@ class FieldOptics:
         mirrors = canted(scene.mirrors, self.facets, self.canting, plant=plant, aim=aim)
         return replace(scene, mirrors=mirrors)
 
+    def engine(self, scene: Scene) -> FieldFlux:
+        """Return the flux of a scene under this light."""
+        return FieldFlux(scene, sun=self.shape, air=self.air, gaussians=self.gaussians)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlantFlux(Value, Framed):
@@ -333,14 +337,31 @@ def field_flux(
         raise InputError(f"flux: none of the {len(plant)} heliostats can reach its aim at this sun")
     if rays:
         return _traced(plant, scene, optics, rays, seed, progress)
-    engine = FieldFlux(scene, sun=optics.shape, air=optics.air, gaussians=optics.gaussians)
-    intercepts = [power / max(float(engine.leaving.sum()), 1e-300) for power in engine.powers]
+    engine = optics.engine(scene)
+    engine.check_met()
+    return _result(plant, scene, engine.efficiencies, _views(engine))
+
+
+def scene_flux(scene: Scene, light: FieldOptics) -> list[FluxView]:
+    """Return the flux on the surfaces of a scene.
+
+    Parameters
+    ----------
+    scene
+        The field as it stands. Without a mirror that shines the maps are zero.
+    light
+        Shape of the sun, air, and number of Gaussians.
+    """
+    return _views(light.engine(scene))
+
+
+def _views(engine: FieldFlux) -> list[FluxView]:
+    leaving, surfaces = float(engine.leaving.sum()), engine.scene.surfaces
     lit = int((engine.leaving > 0.0).sum())
-    maps = [
-        _view(*each, lit)
-        for each in zip(scene.surfaces, engine.maps, engine.powers, intercepts, strict=True)
+    return [
+        _view(surface, flux, power, power / leaving if leaving > 0.0 else np.nan, lit)
+        for surface, flux, power in zip(surfaces, engine.maps, engine.powers, strict=True)
     ]
-    return _result(plant, scene, engine.efficiencies, maps)
 
 
 def _names(receiver: str | tuple[str, ...]) -> tuple[str, ...]:
@@ -628,7 +649,8 @@ def _table(
     heliostat = np.zeros(len(plant))
     for k, sun in enumerate(suns):
         scene = replace(light, dni=float(dni[k])).scene(plant, sun, aim, receivers)
-        engine = FieldFlux(scene, sun=light.shape, air=light.air, gaussians=light.gaussians)
+        engine = light.engine(scene)
+        engine.check_met()
         efficiencies = engine.efficiencies
         rows.append(field_efficiencies(efficiencies, scene.mirrors.area))
         power[k] = sum(engine.powers)

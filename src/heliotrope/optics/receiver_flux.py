@@ -88,7 +88,7 @@ class FieldFlux:
     Raises
     ------
     InputError
-        If no mirror's beam can meet a surface, or a name is unknown.
+        If a name is unknown.
 
     Notes
     -----
@@ -120,9 +120,9 @@ class FieldFlux:
         self._flux = [np.zeros(surface.cells.shape) for surface in scene.surfaces]
         self._power = [np.zeros((len(mirrors), 2)) for _ in scene.surfaces]
         self._cast(np.arange(len(mirrors)), 1.0)
-        self._check_met()
 
-    def _check_met(self) -> None:
+    def check_met(self) -> None:
+        """Raise InputError if mirrors shine, and none sends light to a surface."""
         for surface, power in zip(self.scene.surfaces, self._power, strict=True):
             if power[:, 0].any() and not power[:, 1].any():
                 raise InputError(

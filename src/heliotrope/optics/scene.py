@@ -340,7 +340,7 @@ def scene_of(
     focal = slant if isinstance(focus, str) else np.broadcast_to(as_float(focus), slant.shape)
     size = [np.concatenate([getattr(g, s) for g in plant.groups.values()]) for s in _SIZES]
     built = Mirrors.of(vertex, normal, (size[0], size[1]), ends, focal=focal, **mirrors)
-    table = _facets(plant, focal)
+    table = facets_of(plant, focal)
     if table is not None:
         built = built.with_facets(*table)
     dark = ~np.asarray(tracking.reachable)
@@ -367,8 +367,16 @@ def _aims(plant: Plant, middle: FloatArray, aim: npt.ArrayLike | None) -> FloatA
     return np.where(np.isfinite(ends).all(axis=-1, keepdims=True), ends, middle)
 
 
-def _facets(plant: Plant, focal: FloatArray) -> tuple[FacetTable, npt.NDArray[np.int64]] | None:
-    """Return the facets of all groups, padded to one number; None if no group has any."""
+def facets_of(plant: Plant, focal: FloatArray) -> tuple[FacetTable, npt.NDArray[np.int64]] | None:
+    """Return the facets of a plant's heliostats and the row of each; None if none has facets.
+
+    Parameters
+    ----------
+    plant
+        Facets of groups with fewer are padded with empty ones.
+    focal
+        Focal length of the facets of each heliostat, m, (N,).
+    """
     groups = list(plant.groups.values())
     most = max((g.facets.center.shape[1] for g in groups if g.facets is not None), default=0)
     if most == 0:

@@ -180,6 +180,7 @@ class PlantAssembly:
             extra=ports.facts,
             pictures=ports.pictures,
             marking=None if cameras is None else self._marking(cameras),
+            worker=ports.worker,
         )
         #: When each heliostat last moved, or was ordered to, on its way to stow at the end.
         self._moved_at = np.full(len(self.names), math.inf)

@@ -183,9 +183,9 @@ def sun(desk: Desk) -> views.SunView:
 
 
 @_call("GET receivers/{name}/flux", "plant", fresh=FRESH)
-def flux(desk: Desk, order: orders.Named) -> FluxView:
+async def flux(desk: Desk, order: orders.Named) -> FluxView:
     """Return the predicted flux on a receiver."""
-    return desk.operations.receiver_flux(order.name)
+    return await desk.operations.receiver_flux(order.name)
 
 
 @_call("GET field", "field", fresh=ALWAYS)

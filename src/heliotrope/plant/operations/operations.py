@@ -14,7 +14,6 @@ has raised and that was lost is left to people.
 import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -26,7 +25,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
-from heliotrope.optics import FluxView, predict_flux
+from heliotrope.optics import FluxView
 from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import ORDERED, EmergencyOrder
@@ -38,6 +37,7 @@ from heliotrope.plant.operations.history import History, figures
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.operations.predicted_flux import PredictedFlux
 from heliotrope.plant.operations.report import ShiftReport, period, report
 from heliotrope.plant.operations.security import SecurityLog
 from heliotrope.plant.operations.trends import Quantity, Trend, quantities, trend
@@ -52,6 +52,7 @@ from heliotrope.plant.operations.views import (
 from heliotrope.plant.orders.authority import Grant, Person, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Act
 from heliotrope.store.records import NOTE, JournalEntry, JournalQuery, Kind, Records
 
@@ -62,8 +63,6 @@ _TAKES_FROM_AUTOMATIC = messages.having("manual")
 _GIVES_TO_AUTOMATIC = messages.having("automatic")
 
 _DAY = 86_400.0
-#: Time between predictions of the flux, s.
-_FLUX_EVERY = 5.0
 #: Time between looks after the security events, s.
 _LOOKED = 5.0
 #: Time between looks at operations under way, s.
@@ -84,12 +83,6 @@ class Photographer(Protocol):
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return the light in a new photograph."""
         ...
-
-
-@dataclass(frozen=True)
-class _Cached:
-    at: float
-    value: FluxView
 
 
 class Operations:
@@ -114,6 +107,8 @@ class Operations:
         Keeps photographs with their results; None: they are not kept.
     marking
         Takes views that persons mark; None: there is no camera.
+    worker
+        Place for computations.
 
     Attributes
     ----------
@@ -136,6 +131,7 @@ class Operations:
         extra: Callable[[], Mapping[str, Any]] | None = None,
         pictures: Pictures | None = None,
         marking: Marking | None = None,
+        worker: Worker = at_once,
     ) -> None:
         self.plant, self.logbook, self.pictures, self.marking = plant, logbook, pictures, marking
         self.automatic, self._cameras, self._extra = automatic, dict(cameras or {}), extra
@@ -146,7 +142,7 @@ class Operations:
         self.telemetry: Path | None = None
         self._history = History(plant, records, self._figures)
         self._records = records
-        self._flux: dict[str, _Cached] = {}
+        self._flux = PredictedFlux(plant, self.viewer, automatic.installed, worker)
         self._closing, self.begun = asyncio.Event(), asyncio.Event()
 
     # -- running ---------------------------------------------------------------------------
@@ -318,8 +314,8 @@ class Operations:
         await self._records.confirm()
         return await asyncio.to_thread(read, self._records)
 
-    def _figures(self) -> dict[str, float]:
-        power = {name: self.receiver_flux(name).power for name in self.receivers}
+    async def _figures(self) -> dict[str, float]:
+        power = {name: view.power for name, view in (await self._flux.everywhere()).items()}
         return figures(self.viewer.frame(), self.summary(), self.sun(), power)
 
     # -- light -----------------------------------------------------------------------------
@@ -330,8 +326,8 @@ class Operations:
         found = sun.position(at, self.plant.design.site)
         return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
 
-    def receiver_flux(self, name: str = "") -> FluxView:
-        """Return the predicted flux on a receiver ("": the first), made every five seconds.
+    async def receiver_flux(self, name: str = "") -> FluxView:
+        """Return the predicted flux on a receiver ("": the first); see `PredictedFlux`.
 
         Raises
         ------
@@ -341,13 +337,7 @@ class Operations:
         if not name and not self.receivers:
             raise UnknownNameError("receiver", name, self.receivers)
         receiver = self.plant.design.receiver(name or self.receivers[0])
-        now, known = self.plant.now(), self._flux.get(receiver.name)
-        if known is None or now - known.at >= _FLUX_EVERY:
-            view = predict_flux(
-                receiver, *self.viewer.beams(receiver.name), sun=self.plant.sun_vector()
-            )
-            known = self._flux[receiver.name] = _Cached(now, view)
-        return known.value
+        return (await self._flux.everywhere())[receiver.name]
 
     # -- calibration -----------------------------------------------------------------------
 

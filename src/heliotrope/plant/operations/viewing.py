@@ -106,15 +106,6 @@ class Viewer:
             found[on & (np.linalg.norm(aims - center, axis=-1) <= reach)] = k
         return found
 
-    def beams(self, name: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return vertices, aims, areas and errors of the beams on a receiver."""
-        frame = self.frame()
-        rows = np.flatnonzero(frame.on == self.aim_names.index(name))
-        error = np.where(np.isfinite(frame.error), frame.error, self._automatic.installed)[rows]
-        vertices = self._plant.beams.armature.origin_1[rows]
-        area = np.prod(self.sizes[rows], axis=-1)
-        return vertices, self._plant.aims[rows], area, error.astype(np.float64)
-
     def heliostat(self, name: str) -> HeliostatView:
         """Return one heliostat in detail.
 
