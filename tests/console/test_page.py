@@ -61,7 +61,7 @@ def test_a_one_time_link_opens_the_page_once(field: LiveConsole, browser: Any) -
         assert answer.status == 410
         assert "This link is not valid" in late.inner_text("h1")
         assert "it prints a new link" in late.inner_text("main")
-        late.click("text=sign in with it")
+        late.click("a >> text=Sign in")
         late.wait_for_url("**/login")
         again = first.new_page()
         assert again.goto(link).status == 410

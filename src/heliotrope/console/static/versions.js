@@ -1,10 +1,10 @@
 // Versions of a heliostat's parameters side by side; an engineer brings one back or types values.
 import { api, me, store } from "./live.js";
 import { count, h, lay, moment, number, table } from "./dom.js";
-import { t } from "./words.js";
+import { fixed, t } from "./words.js";
 
 const UNITS = { rad: ["mrad", 1e3], m: ["mm", 1e3], 1: ["", 1] };
-const shown = (value, unit) => (value === null ? "–" : (value * UNITS[unit][1]).toFixed(3));
+const shown = (value, unit) => (value === null ? "–" : fixed(value * UNITS[unit][1], 3));
 
 export async function compareVersions(name) {
   const path = `heliostats/${encodeURIComponent(name)}`, known = await api("GET", `${path}/parameters`);
