@@ -7,6 +7,7 @@ up, and the errors A to D. The day of figures 4.6 to 4.8 and the set of errors o
 given: the day of his measurements and the set of his table 6.1 stand for them.
 """
 
+import functools
 import sys
 from dataclasses import dataclass
 from datetime import date, timedelta
@@ -79,6 +80,7 @@ def path(place: str, error: dict[str, float], day: date = DAY) -> ImagePath:
     return ImagePath(1e3 * found.right / slant, 1e3 * found.up / slant)
 
 
+@functools.cache
 def paths(number: str) -> dict[tuple[str, str], ImagePath]:
     """Return the paths of a figure by place and letter; of figure 4.9 by place and season."""
     if number == "4.9":

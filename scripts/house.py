@@ -9,12 +9,14 @@ public face. ``python -m scripts.pages`` writes its picture of the floors.
 
 import argparse
 import ast
+import gc
 import re
 import sys
 import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 NAME = "heliotrope"
@@ -58,6 +60,16 @@ class Module:
         parts = self.name.split(".")
         return parts[1] if len(parts) > 1 else ""
 
+    @cached_property
+    def tree(self) -> ast.Module:
+        """The syntax of the module."""
+        return ast.parse(self.path.read_text(encoding="utf-8"))
+
+    @cached_property
+    def nodes(self) -> list[ast.AST]:
+        """All that is in the syntax of the module."""
+        return [*ast.walk(self.tree)]
+
 
 def modules(root: Path) -> dict[str, Module]:
     """Return all modules below ``root/src``."""
@@ -69,16 +81,20 @@ def modules(root: Path) -> dict[str, Module]:
         name = ".".join(parts[:-1] if face else parts)
         text = path.read_text(encoding="utf-8")
         found[name] = Module(name, path, text.count("\n"), face, text.count("# fmt: skip"))
-    for module in found.values():
-        read(module, found)
+    # A million nodes stay: searching them for garbage takes a third of the time.
+    gc.disable()
+    try:
+        for module in found.values():
+            read(module, found)
+    finally:
+        gc.enable()
     return found
 
 
 def read(module: Module, known: dict[str, Module]) -> None:
     """Fill in what a module imports from the known ones, and what it offers."""
-    tree = ast.parse(module.path.read_text(encoding="utf-8"))
     package = module.name if module.face else module.name.rpartition(".")[0]
-    for node in ast.walk(tree):
+    for node in module.nodes:
         if isinstance(node, ast.Import):
             module.taken += [(a.name, "") for a in node.names if a.name in known]
         elif isinstance(node, ast.ImportFrom):
@@ -94,7 +110,7 @@ def read(module: Module, known: dict[str, Module]) -> None:
                 module.taken.append(taken)
                 if module.face:
                     module.homes[alias.asname or alias.name] = taken
-    for node in tree.body:
+    for node in module.tree.body:
         if isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             named = any(isinstance(t, ast.Name) and t.id == "__all__" for t in targets)
@@ -214,8 +230,7 @@ def repeated(known: dict[str, Module]) -> dict[str, int]:
     """Return the names of classes that several modules define, with their count."""
     count: Counter[str] = Counter()
     for module in known.values():
-        tree = ast.parse(module.path.read_text(encoding="utf-8"))
-        count.update({n.name for n in ast.walk(tree) if isinstance(n, ast.ClassDef)})
+        count.update({n.name for n in module.nodes if isinstance(n, ast.ClassDef)})
     return {name: n for name, n in sorted(count.items()) if n > 1 and not name.startswith("_")}
 
 
@@ -253,13 +268,13 @@ def _nodes(known: dict[str, Module], rooms_: tuple[str, ...]) -> Iterator[tuple[
     """Yield the syntax of some packages, with the place of each node."""
     for module in known.values():
         if module.room in rooms_:
-            for node in ast.walk(ast.parse(module.path.read_text(encoding="utf-8"))):
+            for node in module.nodes:
                 yield node, f"{module.name.removeprefix(NAME + '.')}:{getattr(node, 'lineno', 0)}"
 
 
 def _table(module: Module, name: str, column: int = 0) -> set[str]:
     """Return the texts of a tuple at the top of a module; of its rows, those of a column."""
-    for node in ast.parse(module.path.read_text(encoding="utf-8")).body:
+    for node in module.tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
             assert isinstance(node.value, ast.Tuple)
             rows = [

@@ -4,6 +4,7 @@ A name that several faces offer is described once, in the package that defines i
 """
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -17,9 +18,15 @@ ORDER = (
 )  # fmt: skip
 
 
+@functools.cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
 def _face(path: Path) -> tuple[list[str], dict[str, str]]:
     """Return the public names of a face, with the modules that they come from."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = _tree(path)
     names: list[str] = []
     homes: dict[str, str] = {}
     for node in ast.walk(tree):
@@ -36,7 +43,7 @@ def _face(path: Path) -> tuple[list[str], dict[str, str]]:
 
 def _defined(path: Path) -> list[str]:
     """Return the public names that a module without a face defines."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = _tree(path)
     kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     return [n.name for n in tree.body if isinstance(n, kinds) and not n.name.startswith("_")]
 
@@ -47,19 +54,24 @@ def _described(place: str) -> bool:
     if _source(place.removeprefix("heliotrope.")).exists():
         return True
     path = _source(module.removeprefix("heliotrope").lstrip("."))
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if getattr(node, "name", "") == name:
-            return True
+    return name in _names(path)
+
+
+@functools.cache
+def _names(path: Path) -> set[str]:
+    """Return the names that a module defines or assigns anywhere."""
+    found = set()
+    for node in ast.walk(_tree(path)):
+        found.add(getattr(node, "name", ""))
         if isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            if any(isinstance(target, ast.Name) and target.id == name for target in targets):
-                return True
-    return False
+            found |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return found
 
 
 def _lead(path: Path) -> str:
     """Return the docstring of a face."""
-    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    text = ast.get_docstring(_tree(path)) or ""
     return re.sub(r"::$", ":", text, flags=re.MULTILINE)
 
 

@@ -1,11 +1,13 @@
 """The benchmarks run and say on what; how long they take is nobody's business here."""
 
+import ast
 import functools
-import importlib
+import importlib.util
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -105,8 +107,11 @@ COLUMNS = {
     },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
-#: A browser with fifty viewers, and plants, take their time.
-SLOW = {"console", "production", "first_run"}
+#: A browser with fifty viewers, plants, days and many pictures take their time.
+SLOW = {
+    "coded", "commission", "console", "control", "day", "drifting", "first_run", "flux", "imaging",
+    "obstruction", "production", "prototype", "spots",
+}  # fmt: skip
 RESULT = {
     "name", "headline", "within_budget", "quick", "seconds", "others_cores", "machine", "rows",
 }  # fmt: skip
@@ -142,14 +147,7 @@ def _no_number(text: str) -> float:
 
 
 @pytest.mark.parametrize(
-    "name",
-    # A browser with fifty viewers, and plants, take their time.
-    [
-        pytest.param(n, marks=pytest.mark.slow)
-        if n in ("console", "production", "first_run")
-        else n
-        for n in COLUMNS
-    ],
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in COLUMNS]
 )
 def test_quick_run_gives_json(name: str) -> None:
     result = _quick(name)
@@ -161,6 +159,23 @@ def test_quick_run_gives_json(name: str) -> None:
     assert result["rows"]
     for row in result["rows"]:
         assert set(row) >= COLUMNS[name]
+
+
+def _taken(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield module and name of all that a file takes from the product and the benchmarks."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            origin = node.module or ""
+            if origin.partition(".")[0] in ("heliotrope", "benchmarks"):
+                yield from ((origin, alias.name) for alias in node.names)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
+def test_what_a_benchmark_takes_exists(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    for origin, name in _taken(path):
+        module = importlib.import_module(origin)
+        assert hasattr(module, name) or importlib.util.find_spec(f"{origin}.{name}"), name
 
 
 def test_the_chain_of_artist_is_ours(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,7 +46,7 @@ def test_a_wheel_runs_a_notebook_in_an_empty_environment(tmp_path: Path) -> None
     (wheel,) = tmp_path.glob("heliotrope-*.whl")
     held = zipfile.ZipFile(wheel).namelist()
     # What a program reads beside its modules, and nothing of the tests.
-    for part in ("console/static/console.css", "py.typed"):
+    for part in ("console/static/console.css", "console/static/languages/de.json", "py.typed"):
         assert f"heliotrope/{part}" in held
     assert not [name for name in held if name.startswith("tests/") or name.endswith(".nbi")]
     _uv("venv", "--quiet", "--python", sys.executable, "environment", folder=tmp_path)

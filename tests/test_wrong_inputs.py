@@ -89,15 +89,7 @@ def row(**given: Any) -> Any:
 
 
 def flux(**given: Any) -> Any:
-    right: dict[str, Any] = {
-        "receiver": plant().receivers[0],
-        "vertices": [(0.0, -30.0, 1.0)],
-        "aims": [(0.0, 0.0, 16.5)],
-        "areas": [2.2],
-        "error": [1e-3],
-        "sun": UP,
-    }
-    return ht.predict_flux(**{**right, **given})
+    return ht.flux(plant(), **{"sun": UP, **given})
 
 
 class Wrong(NamedTuple):
@@ -281,8 +273,8 @@ FIELD = [
     Wrong(lambda: Sphere("tower", ORIGIN, 0.0), "radius", "0.0 m", "above 0"),
     Wrong(lambda: Box("hall", ORIGIN, (1.0, 1.0)), "size", "(2,)", "3 numbers"),
     Wrong(lambda: Cylinder("mast", ORIGIN, ORIGIN, 1.0), "mast", "coincide", "two points"),
-    Wrong(lambda: flux(areas=[1.0, 2.0]), "areas", "2 areas", "same number"),
-    Wrong(lambda: flux(reflectivity=1.2), "reflectivity", "1.2", "0 to 1"),
+    Wrong(lambda: flux(aim=[AIM, AIM]), "aim", "(2, 3)", "give (3,) or"),
+    Wrong(lambda: flux(reflectivity=1.2), "reflectivity", "1.2", "from 0 to 1"),
     Wrong(lambda: flux(sun=(1.0, 0.0)), "sun", "(2,)", "3 numbers"),
     Wrong(lambda: flux(cells=(0, 24)), "cells", "0", "at least 1"),
 ]  # fmt: skip

@@ -1,15 +1,15 @@
 """Heliotrope runs the heliostat field of a solar power tower.
 
-It computes where every mirror must point, learns each mirror's imperfections from measurements,
-and corrects them. In a notebook::
+It computes where every heliostat must point, learns the imperfections of each heliostat from
+measurements, and corrects them. In a notebook::
 
     import heliotrope as ht
 
     plant = ht.open("plant.toml")
     sun = ht.sun.vector("2026-09-02T10:00Z", plant.site)
 
-A name is loaded when it is first used, so the import itself is light. The names below are the
-usual way in; each package (`heliotrope.mechanism`, `heliotrope.optics`, …) has more.
+A name is loaded when it is first used, so the import itself is fast. The names below are the usual
+entry points; each package (`heliotrope.mechanism`, `heliotrope.optics`, …) has more.
 """
 
 from importlib import import_module
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     )
     from heliotrope.mechanism import kinds as kinds
     from heliotrope.optics import field_flux as flux
-    from heliotrope.optics import flux_day, flux_year, image_offsets, predict_flux
+    from heliotrope.optics import flux_day, flux_year, image_offsets
     from heliotrope.sun import Site
 
 __version__ = "0.1.0"
@@ -111,7 +111,6 @@ _HOMES = {
     "linear_paint": "heliotrope.mechanism",
     "open": "heliotrope.field.formats",
     "predict": "heliotrope.calibration",
-    "predict_flux": "heliotrope.optics",
     "prototype": "heliotrope.field",
     "read_field_sightings": "heliotrope.calibration",
     "read_plant": "heliotrope.field.formats.plant_file",
@@ -181,7 +180,6 @@ __all__ = [
     "optics",
     "plot",
     "predict",
-    "predict_flux",
     "prototype",
     "read_field_sightings",
     "read_plant",

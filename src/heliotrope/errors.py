@@ -1,4 +1,4 @@
-"""The one exception tree of Heliotrope.
+"""The exception tree of Heliotrope.
 
 ::
 
@@ -9,9 +9,8 @@
     │   └── UnknownNameError  a heliostat, target, parameter or model not known
     └── FetchError            a download that could not be completed
 
-Every text says what is wrong, where, the value with its unit, the limit and what
-to do. The outcome of a solver (unreachable, not converged) is a value with a text,
-never an exception.
+Every message says what is wrong, where, the value with its unit, the limit and what to do. The
+outcome of a solver (unreachable, not converged) is a value with a text, never an exception.
 """
 
 import numbers

@@ -1,8 +1,8 @@
-"""Records of arrays as tables and as labelled arrays: pandas and xarray.
+"""Array records as tables and as labelled arrays: pandas and xarray.
 
-A class says once which axes its arrays have (`Labelled`); a frame and a dataset follow from that.
-Units stand in ``attrs``: of each variable of a dataset (``units``), and in ``frame.attrs["units"]``
-by column. Times are UTC.
+A class declares once which axes its arrays have (`Labelled`); the data frame and the dataset follow
+from that. Units are stored in ``attrs``: for each variable of a dataset (``units``), and for a
+frame in ``frame.attrs["units"]`` by column. Times are UTC.
 """
 
 from abc import abstractmethod

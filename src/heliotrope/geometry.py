@@ -1,8 +1,8 @@
 """Vectors, rotations and frames.
 
-Frame: ENU (x east, y north, z up), metres, right-handed. Azimuth is clockwise
-from north in [0, 2π), elevation above the horizon. Arrays carry their batch axes
-first and the vector last, ``(..., 3)``.
+Frame: ENU (x east, y north, z up), metres, right-handed. Azimuth is clockwise from north in [0,
+2π), elevation is above the horizon. Arrays have their batch axes first and the vector axis last,
+``(..., 3)``.
 """
 
 from collections.abc import Mapping

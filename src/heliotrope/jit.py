@@ -1,16 +1,16 @@
 """How kernels are compiled.
 
-``nogil`` lets blocks of rows run on threads, ``cache`` keeps the machine code beside the
-source, and numpy's error model divides by zero without a branch. Kernels are plain
-functions without annotations: their docstrings say what they take, and the typed functions
-that call them check it.
+``nogil`` lets blocks of rows run in threads, ``cache`` keeps the machine code beside the source,
+and numpy's error model divides by zero without a branch. Kernels are plain functions without
+annotations: their docstrings list their arguments, and the typed functions that call them check the
+arguments.
 
-Compiling takes most of the time of a first use. An array that may be written and one that may
-not are two types to the compiler, hence `as_input`. Assignments to slices, `np.median` and most
-of `np.linalg` bring in thousands of lines each, wherever they are used: kernels have loops
-instead. At a terminal one line says what is going on when the first kernel is compiled. The
-compiler makes millions of objects that stay; to search them for garbage over and over took a fifth
-of its time, so the collector rests meanwhile.
+Compilation takes most of the time of a first use. To the compiler, a writable array and a read-only
+array are different types; hence `as_input`. Slice assignments, `np.median` and most of `np.linalg`
+bring in thousands of lines each, wherever they are used, so kernels use loops instead. At a
+terminal, one line reports when the first kernel is compiled. The compiler creates millions of
+long-lived objects, and searching them repeatedly for garbage took a fifth of its time, so the
+garbage collector is off during compilation.
 """
 
 import gc

@@ -1,9 +1,8 @@
-"""Splits independent rows over threads.
+"""Splits independent rows across threads.
 
-The numeric kernels are compiled with ``nogil`` and treat every row (heliostat,
-time) on its own, so rows can be cut into contiguous blocks and run on as many
-threads as there are cores. The outcome cannot depend on the number of threads,
-because no row reads what another writes.
+The numeric kernels are compiled with ``nogil`` and treat every row (heliostat, time) independently,
+so rows can be cut into contiguous blocks and run on as many threads as there are cores. The result
+cannot depend on the number of threads, because no row reads what another writes.
 """
 
 import os

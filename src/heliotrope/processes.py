@@ -1,4 +1,4 @@
-"""Processes beside this one that end with it, however it ends, and leave it the machine."""
+"""Child processes that end with this one, however it ends, and yield the CPU to it."""
 
 import contextlib
 import os

@@ -1,6 +1,6 @@
-"""What records of arrays have in common: compared by content, shown in one line or as a table.
+"""What array records have in common: comparison by content, display in one line or as a table.
 
-A class gives a `Card`: one line for ``repr``, and a table with units and a small picture for a
+A class provides a `Card`: one line for ``repr``, and a table with units and a small plot for a
 notebook. Both stay short, whatever the size of the arrays.
 """
 

@@ -1,9 +1,9 @@
 """Compile the numeric kernels once, so that programs start at full speed.
 
-``python -m heliotrope.warm`` takes some twenty seconds of two cores after an installation and a
-second afterwards; the compiled code stays in the package's ``__pycache__``. The compiler works on
-one thread, so the kernels are shared out between two processes. Commands that need most of them
-begin with `compiling`.
+After an installation ``python -m heliotrope.warm`` takes some twenty seconds on two cores, and
+about a second on later runs; the compiled code is stored in the package's ``__pycache__``. The
+compiler uses one thread, so the kernels are divided between two processes. Commands that need most
+kernels begin with `compiling`.
 """
 
 import subprocess
@@ -138,11 +138,23 @@ def guarding() -> None:
 
 
 def lighting() -> None:
-    """Cast the light of three mirrors on a receiver."""
-    from heliotrope.field.layouts import malan_plant
-    from heliotrope.optics.plant_flux import field_flux
+    """Cast the light of three mirrors on a receiver and on a mesh, and cut one mirror."""
+    from dataclasses import replace
 
-    field_flux(malan_plant(3), sun=(0.0, 0.6, 0.8))
+    import numpy as np
+
+    from heliotrope.field.layouts import malan_plant
+    from heliotrope.geometry import normalize
+    from heliotrope.optics.plant_flux import FieldOptics
+    from heliotrope.optics.shading import Shading
+    from heliotrope.optics.surfaces import Mesh
+
+    plant, light, sun = malan_plant(3), FieldOptics(), normalize((0.0, 0.6, 0.8))
+    scene = light.scene(plant, sun, None, ())
+    light.engine(scene)
+    mesh = Mesh("mesh", plant.targets[0].corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    light.engine(replace(scene, surfaces=(mesh,)))
+    Shading(scene).pieces(0)
 
 
 def _case() -> "tuple[Mechanism, Sightings]":

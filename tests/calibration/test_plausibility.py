@@ -444,7 +444,7 @@ def faulty(seen: Sightings, rng: np.random.Generator, faults: list[str], kind: s
     return seen
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     faults=st.lists(st.sampled_from(ROW_FAULTS), max_size=6),

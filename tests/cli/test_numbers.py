@@ -256,7 +256,7 @@ def test_a_number_ends_in_a_value_or_in_one_line(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     quick = [(path, param) for path, param in ASKED if path not in SLOW]
-    assert _faults(cases(1, 2 * len(quick), quick), place, monkeypatch) == []
+    assert _faults(cases(1, len(quick), quick), place, monkeypatch) == []
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -94,14 +95,19 @@ def test_a_command_works_or_names_its_extra(tmp_path: Path) -> None:
             assert (code, err) == (0, ""), (words, code, err)
 
 
+@pytest.fixture(scope="module")
+def owners() -> Mapping[str, list[str]]:
+    """Return the distributions of every package that is installed."""
+    return importlib.metadata.packages_distributions()
+
+
 @pytest.mark.parametrize("module", sorted(EXTRAS))
-def test_the_extra_brings_the_package(module: str) -> None:
+def test_the_extra_brings_the_package(module: str, owners: Mapping[str, list[str]]) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    owners = importlib.metadata.packages_distributions()[module]
     extra = project["optional-dependencies"][EXTRAS[module]]
     brought = {re.split(r"[\[<>=]", each)[0].lower() for each in extra}
     indirect = {"starlette": "fastapi"}.get(module)
-    assert indirect in brought or brought & {owner.lower() for owner in owners}
+    assert indirect in brought or brought & {owner.lower() for owner in owners[module]}
 
 
 def test_another_missing_package_is_no_matter_of_extras() -> None:

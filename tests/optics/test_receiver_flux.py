@@ -227,7 +227,7 @@ def test_dark_mirrors_and_mirrors_behind_the_sun_send_nothing() -> None:
 def test_bad_scenes_are_refused_in_one_line() -> None:
     away = Plate("back", AIM, -EAST, UP, 6.0, 5.0)
     with pytest.raises(InputError, match="receiver back: no mirror sends light to it"):
-        FieldFlux(Scene(SUN, 1000.0, mirrors(), (away,)))
+        FieldFlux(Scene(SUN, 1000.0, mirrors(), (away,))).check_met()
     with pytest.raises(InputError, match=r"DNI -1\.0 W/m² must be 0 or more"):
         Scene(SUN, -1.0, mirrors(), (plate(),))
     with pytest.raises(InputError, match="mirror 0 stands inside a tower"):

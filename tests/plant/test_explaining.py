@@ -20,6 +20,15 @@ async def _cut(plant: LivePlant, cluster: str) -> None:
     plant.links[cluster].plugged = True
 
 
+async def _tracking(plant: LivePlant, *names: str) -> None:
+    """Wait until heliostats track, and a moment more."""
+    for _ in range(200):
+        if all(plant.operations.viewer.heliostat(name).state == "TRACKING" for name in names):
+            break
+        await asyncio.sleep(1.0)
+    await asyncio.sleep(5.0)
+
+
 def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() -> None:
     async def work(plant: LivePlant) -> None:
         shown, (name, other, *_) = plant.operations, plant.operations.names
@@ -32,7 +41,7 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         assert (
             shown.why(name).text == f"{name} is APPROACHING: automatic control has it: APPROACHING"
         )
-        await asyncio.sleep(180.0)
+        await _tracking(plant, name)
         up = shown.why(name)
         assert up.tracks
         assert (up.text, up.button) == (f"{name} is TRACKING on receiver", Button.NONE)
@@ -90,9 +99,9 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
 def test_a_field_that_waits_for_a_person_says_so() -> None:
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.operations.names[-1]
-        await asyncio.sleep(200.0)
+        await _tracking(plant, *plant.names)
         await _cut(plant, "C2")
-        await asyncio.sleep(120.0)
+        await asyncio.sleep(30.0)
         why = shown.why(name)
         assert "left the receiver without an order" in why.text
         assert why.button is Button.RESUME
@@ -106,7 +115,7 @@ def test_a_field_that_waits_for_a_person_says_so() -> None:
 def test_work_that_is_tried_again_is_shown_with_its_end() -> None:
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.operations.names[-1]
-        await asyncio.sleep(200.0)
+        await _tracking(plant, *plant.names)
         await _cut(plant, "C2")
         await asyncio.sleep(10.0)
         why = shown.why(name)

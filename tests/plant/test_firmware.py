@@ -3,16 +3,19 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Ask
+from heliotrope.plant.field import firmware
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import alarms
 from support.plant_bench import Bench, running
 
 
-def here(name: str, firmware: int, serial: int = 7) -> dict[str, Any]:
+def here(name: str, version: int, serial: int = 7) -> dict[str, Any]:
     """One answer to a search of the bus."""
-    return {"name": name, "firmware": firmware, "serial": serial, "address": 1, "expected": 1}
+    return {"name": name, "firmware": version, "serial": serial, "address": 1, "expected": 1}
 
 
 def named(bench: Bench) -> dict[str, str]:
@@ -23,8 +26,10 @@ def named(bench: Bench) -> dict[str, str]:
 
 
 def test_boards_with_another_version_are_named_until_they_have_the_expected_one(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(firmware, "SEARCH", 90.0)
+
     async def main(clock: VirtualClock) -> None:
         bench = Bench(clock, tmp_path, settings=PlantSettings(firmware=12))
         for name, cluster in bench.clusters.items():
@@ -47,7 +52,7 @@ def test_boards_with_another_version_are_named_until_they_have_the_expected_one(
             line.heal()
             await bench.wait(30.0)
             assert named(bench).keys() == set()
-            await bench.wait(600.0)
+            await bench.wait(60.0)
             assert named(bench).keys() == {"pod-3"}, "it was asked again"
             # A bus that was searched is not searched again before its cluster connects.
             assert [ask.what for ask in odd.of(Ask)].count("discover") == 2

@@ -47,7 +47,7 @@ async def work(clock: VirtualClock, worker: Callable[..., Any]) -> None:
     live = PlantAssembly(design, replace(world.ports(), worker=worker), settings)
     async with live.running():
         await asyncio.sleep(WORKING)
-        live.operations.receiver_flux()
+        await live.operations.receiver_flux()
         assert live.operations.automatic.view().done
         live.operations.emergency(Person("engineer", Role.ENGINEER))
         await asyncio.sleep(STOWING)

@@ -1,5 +1,7 @@
 """The vectorised field beside firmware-true boards: the same steps, from stow to stow."""
 
+import copy
+import functools
 from datetime import timedelta
 from typing import Any
 
@@ -159,13 +161,35 @@ class Both:
         return {states.STATES[state] for state in self.field.state}
 
 
-def test_field_and_boards_make_the_same_steps() -> None:
-    both = Both()
+@functools.cache
+def _raised(count: int) -> Both:
+    both, every = Both(count=count), tuple(range(count))
     both.run(2)
-    both.order("AIM", *RECEIVER)
-    both.order("APPROACH")
-    both.run(60)
+    both.order("AIM", *RECEIVER, rows=every)
+    both.order("APPROACH", rows=every)
+    both.run(45)
     assert both.states() == {"IDLE"}
+    return both
+
+
+def standing_by(count: int = COUNT) -> Both:
+    """Boards and a field of their own, of which all have gone up to standby."""
+    return copy.deepcopy(_raised(count))
+
+
+def test_boards_that_go_on_from_a_copy_do_as_those_that_were_copied() -> None:
+    one, other = standing_by(), standing_by()
+    for both in (one, other):
+        both.order("TRACK")
+        both.run(2)
+        both.order("DEFOCUS")
+        both.run(2)
+    np.testing.assert_array_equal(one.field.axes["count"], other.field.axes["count"])
+    assert standing_by().states() == {"IDLE"}
+
+
+def test_field_and_boards_make_the_same_steps() -> None:
+    both = standing_by()
     both.order("TRACK")
     both.run(15)
     assert both.states() == {"TRACKING"}
@@ -189,11 +213,7 @@ def test_field_and_boards_make_the_same_steps() -> None:
 
 
 def test_a_lock_and_a_hold_end_with_the_cluster_as_on_the_boards() -> None:
-    both = Both()
-    both.run(2)
-    both.order("AIM", *RECEIVER)
-    both.order("APPROACH")
-    both.run(60)
+    both = standing_by()
     both.order("TRACK", rows=(0, 1))
     both.run(12)
     both.order("LOCK")
@@ -211,11 +231,7 @@ def test_a_lock_and_a_hold_end_with_the_cluster_as_on_the_boards() -> None:
 
 
 def test_a_lock_in_motion_gives_the_goals_up_as_on_the_boards() -> None:
-    both = Both()
-    both.run(2)
-    both.order("AIM", *RECEIVER)
-    both.order("APPROACH")
-    both.run(60)
+    both = standing_by()
     both.order("TRACK")
     both.run(0.5)
     assert not both.field.still().any()
@@ -336,11 +352,7 @@ def test_gears_faults_locks_and_supplies_are_those_of_the_boards() -> None:
 
 
 def standing_at_the_receiver() -> Both:
-    both = Both()
-    both.run(2)
-    both.order("AIM", *RECEIVER)
-    both.order("APPROACH")
-    both.run(70)
+    both = standing_by()
     both.order("TRACK")
     both.run(12)
     assert both.states() == {"TRACKING"}
@@ -532,13 +544,8 @@ def test_after_any_two_orders_a_defocus_takes_the_beam_off(first: str) -> None:
     The angles of an earlier defocus must not count: from standby it goes down the way, and turns
     nothing beside. Boards and field do the same at every tick.
     """
-    both = Both(count=2 * len(ORDERS))
+    both = standing_by(2 * len(ORDERS))
     every = tuple(range(2 * len(ORDERS)))
-    both.run(2)
-    both.order("AIM", *RECEIVER, rows=every)
-    both.order("APPROACH", rows=every)
-    both.run(45)
-    assert both.states() == {"IDLE"}
     both.order("TRACK", rows=every[len(ORDERS) :])
     both.run(6)
     both.order(first, rows=every)

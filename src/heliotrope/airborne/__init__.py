@@ -1,15 +1,15 @@
 """Calibration from the air: a drone with a lamp beside its camera (HelioPoint).
 
-A mirror that shows the lamp to the camera points at the drone. The package plans such flights,
-evaluates their photographs, and simulates both.
+A mirror in which the camera sees the lamp is normal to the line of sight from the drone. The
+package plans such flights, evaluates their photographs, and simulates both.
 
-- `heliotrope.airborne.plan`: clusters, calibration points, hover patterns, airspace, sorties
-  and waypoint files. Begin with ``plan_flight``.
-- `heliotrope.airborne.evaluate`: photographs to orientations, report and sightings. Begin with
+- `heliotrope.airborne.plan`: clusters, calibration points, hover patterns, airspace, sorties and
+  waypoint files. Begin with ``plan_flight``.
+- `heliotrope.airborne.evaluate`: from photographs to orientations, report and sightings. Begin with
   ``evaluate_flight``.
-- `heliotrope.airborne.simulate`: flights with their truth, with or without images.
+- `heliotrope.airborne.simulate`: flights with ground truth, with or without images.
 
-The package itself holds what all three share: mirrors and their poses, photographs and cameras.
+The package itself contains what all three share: mirrors and their poses, photographs and cameras.
 """
 
 from heliotrope.airborne.mirror import MirrorShape, ideal, measured_normal, rectangle, tiled

@@ -1,4 +1,4 @@
-"""EXIF and XMP as DJI drones write them into their photographs, read and written."""
+"""EXIF and XMP metadata as DJI drones write them into photographs, read and written."""
 
 import math
 import struct

@@ -1,8 +1,8 @@
-"""Coded targets on the ground: photogrammetry locates the drone from them (appendix A).
+"""Coded targets on the ground, from which photogrammetry locates the drone (appendix A).
 
-A target is a black square with a pattern that tells its number (OpenCV's ArUco, dictionary 4×4,
+A target is a black square with a pattern that encodes its number (OpenCV's ArUco, dictionary 4×4,
 250 numbers), on a white sheet whose margin is one cell wide. Its four outer corners are measured;
-where it lies need not be known.
+its position need not be known.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
-"""Measured surfaces of mirrors as PAINT publishes them (HDF5): points and normals become slopes.
+"""Mirror surfaces measured and published by PAINT (HDF5): points and normals become slopes.
 
-A file holds the groups ``facet1``, ``facet2``, … of one heliostat, in the order of its properties,
-each with the datasets ``surface_points``, m, and ``surface_normals``, (K, 3), in the axes in which
-the properties give the facets. Canting that differs from theirs is part of the slopes.
+A file contains the groups ``facet1``, ``facet2``, … of one heliostat, in the order of its
+properties, each with the datasets ``surface_points``, m, and ``surface_normals``, (K, 3), in the
+axes in which the properties define the facets. Differences in canting from the properties become
+part of the slopes.
 """
 
 from pathlib import Path

@@ -1,23 +1,25 @@
-r"""A mirror's surface in concentrator coordinates, and where it reflects a lamp to a camera.
+r"""A mirror surface in concentrator coordinates, and where it reflects a lamp to a camera.
 
-Concentrator coordinates (HelioPoint's CCS): origin at the mirror's vertex, x to the right and y up
-along the mirror as seen from the front, z along its normal, m. The *rotation* of a mirror turns
-them into ENU.
+Concentrator coordinates (HelioPoint's CCS): origin at the mirror vertex, x to the right and y up
+along the mirror as seen from the front, z along its normal, m. The *rotation* of a mirror
+transforms them into ENU.
 
 A facet is a rectangle with its own axes u (right) and v (up). Its surface lies
 
 $$ w(u, v) = (u^2 + v^2) / 4 f $$
 
 above its plane, and a slope map adds measured deviations $∂z/∂u, ∂z/∂v$ of the slope. The
-corresponding heights are neglected: over half a metre 1 mrad is 0.5 mm, which turns a ray to a
-drone at 100 m by 5 µrad.
+corresponding height changes are neglected: over half a metre 1 mrad is 0.5 mm, which deflects a ray
+to a drone at 100 m by 5 µrad.
 
-A reflection lies where the surface's normal bisects the directions to lamp and camera, so where
+A reflection lies where the surface normal bisects the directions to the lamp and the camera, that
+is, where
 
 $$ g = (p + b_u / b_w, \; q + b_v / b_w) = 0 $$
 
-with the slopes p, q and the bisector b in the facet's axes. In a cell of the slope map g is
-bilinear but for the change of the directions; its (at most two) roots start Newton's method.
+with the slopes p, q and the bisector b in the facet axes. Within a cell of the slope map g is
+bilinear except for the change of the directions; its (at most two) roots are the starting points
+for Newton's method.
 """
 
 from collections.abc import Iterator
@@ -46,21 +48,21 @@ _ITERATIONS = 30
 
 @dataclass(frozen=True)
 class MirrorShape:
-    """The surface of one mirror of F facets, in concentrator coordinates.
+    """The surface of one mirror with F facets, in concentrator coordinates.
 
     Attributes
     ----------
     center
         Centres of the facets, m, (F, 3).
     half_width, half_height
-        Vectors from a facet's centre to the middle of its right and of its upper edge, m, (F, 3).
+        Vectors from the centre of a facet to the midpoints of its right and upper edges, m, (F, 3).
     focal
         Focal lengths of the facets, m, (F,); inf if flat.
     slope
-        Deviations ∂z/∂u and ∂z/∂v from the slopes of that surface along each facet's own right
-        and upward edges, rad, (F, H, W, 2), or None. Row 0 is at the lower edge, column 0 at the
-        left one; values are at the middles of the H × W cells, with bilinear interpolation. A
-        positive ∂z/∂u leans the normal to the left.
+        Deviations ∂z/∂u and ∂z/∂v from the slopes of that surface along each facet's own right and
+        upward edges, rad, (F, H, W, 2), or None. Row 0 is at the lower edge, column 0 at the left
+        edge; values are at the centres of the H × W cells, with bilinear interpolation. A positive
+        ∂z/∂u tilts the normal to the left.
     """
 
     center: FloatArray
@@ -210,7 +212,7 @@ class MirrorShape:
 
     @cached_property
     def lines(self) -> tuple[FloatArray, FloatArray]:
-        """Positions of the cells' corners, as shares of the half width and half height."""
+        """Positions of the cell corners, as fractions of the half width and half height."""
         rows, columns = self.nodes.shape[1:3]
         if self.slope is None:
             return np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows)
@@ -292,12 +294,12 @@ class ReflectionPoints:
 
 
 def ideal(heliostats: Heliostats, row: int, focal: npt.ArrayLike = np.inf) -> MirrorShape:
-    """Return the mirror of heliostat ``row`` as designed.
+    """Return the mirror of the heliostat at index ``row`` as designed.
 
     Parameters
     ----------
     heliostats, row
-        A heliostat without facets is one facet of its width and height.
+        Heliostats; without facets the mirror is one facet of its width and height.
     focal
         Focal length of the facets, m, () or (F,); inf for flat ones.
     """
@@ -378,7 +380,7 @@ def measured_normal(point: npt.ArrayLike, camera: npt.ArrayLike, led: npt.ArrayL
     Raises
     ------
     InputError
-        If lamp and camera are on opposite sides of a point, or at it.
+        If the lamp and the camera are on opposite sides of a point, or coincide with it.
     """
     m = as_vectors(point, "point")
     return bisector(

@@ -1,4 +1,4 @@
-"""Photographs from the air: camera, position and attitude.
+"""Aerial photographs: camera, position and attitude.
 
 The camera model and its conventions are those of `heliotrope.field.camera`: camera axes x
 right, y down, z forward, and rotations from camera axes to ENU.
@@ -51,7 +51,7 @@ class LedCamera:
     distortion
         k1, k2, p1, p2, k3, (5,).
     led_offset
-        Vector from the projection centre to the lamp, m, in camera axes, (3,). HelioPoint's
+        Vector from the projection centre to the lamp, m, in camera axes, (3,); HelioPoint's
         d_cam-led.
     """
 
@@ -85,7 +85,7 @@ class Photo:
     name
         Name of the file.
     time
-        UTC; None if no time with its zone is stated.
+        UTC; None if no time with a time zone is stated.
     position
         Position of the projection centre, ENU metres, (3,).
     rotation
@@ -95,7 +95,7 @@ class Photo:
     path
         The file; None if there is no image.
     by_hand
-        Whether the rotation follows from mirrors that a person has named in the photograph.
+        Whether the rotation comes from mirrors that a user identified in the photograph.
     """
 
     name: str
@@ -122,7 +122,7 @@ class Photo:
         return as_float(self.position + self.rotation @ camera.led_offset)
 
     def pixels(self, camera: LedCamera, points: npt.ArrayLike) -> FloatArray:
-        """Return the pixels (..., 2) at which points, ENU metres (..., 3), are seen.
+        """Return the pixels (..., 2) at which points, ENU metres (..., 3), appear.
 
         NaN behind the camera or beyond `REACH`.
         """
@@ -130,7 +130,7 @@ class Photo:
         return local_pixels(camera, local, REACH)
 
     def moved(self, position: npt.ArrayLike, rotation: npt.ArrayLike) -> "Photo":
-        """Return the photograph with another exterior orientation."""
+        """Return the photograph with a different exterior orientation."""
         return replace(self, position=as_float(position), rotation=as_float(rotation))
 
 
@@ -165,7 +165,7 @@ def gimbal_of_rotation(turned: npt.ArrayLike) -> tuple[float, float, float]:
 
 
 def read_camera(path: str | Path) -> LedCamera:
-    """Return the camera of a TOML file written by `write_camera`.
+    """Return the camera from a TOML file written by `write_camera`.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def read_camera(path: str | Path) -> LedCamera:
 
 
 def write_camera(path: str | Path, camera: LedCamera) -> None:
-    """Write a camera as a TOML file; the lamp's offset is right, down and forward of the camera."""
+    """Write a camera as TOML; the lamp offset is to the right of, below and ahead of the camera."""
     m = camera.matrix
     rows = {
         "size_px": list(camera.size),
@@ -220,28 +220,30 @@ def write_camera(path: str | Path, camera: LedCamera) -> None:
 def read_photos(
     folder: str | Path, plant_origin: tuple[float, float, float]
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Return the photographs of a folder in the order of their names, and the problems.
+    """Return the photographs in a folder in the order of their names, and the problems.
 
-    Position, gimbal angles and time come from ``photos.csv`` in the folder if there is one,
-    otherwise from the EXIF and XMP that DJI writes.
+    Position, gimbal angles and time come from ``photos.csv`` in the folder if it exists, otherwise
+    from the EXIF and XMP metadata that DJI drones write.
 
     Parameters
     ----------
     folder
         Folder of JPEG files, see `SUFFIXES`.
     plant_origin
-        Latitude and longitude (degrees) and height (m) of ENU's origin. Heights of photographs
-        must be of the same kind (both above the ellipsoid, or both above the geoid).
+        Latitude and longitude (degrees) and height (m) of the ENU origin. This height and those of
+        the photographs must be of the same kind (both above the ellipsoid, or both above the
+        geoid).
 
     Returns
     -------
-    Photographs, and a line for each that cannot be used: position or angles missing, no RTK
-    solution stated as fixed, or a size unlike that of most others (mixed cameras).
+    Photographs, and a message for each that cannot be used because position or angles are missing,
+    no RTK solution is marked as fixed, or its size differs from that of most photographs (mixed
+    cameras).
 
     Raises
     ------
     InputError
-        If there is no such folder, or no photograph in it that can be used.
+        If the folder does not exist, or contains no usable photograph.
     FormatError
         If ``photos.csv`` is not such a table.
     """

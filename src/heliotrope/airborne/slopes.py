@@ -1,7 +1,7 @@
-"""Slope maps of mirrors: measured ones in files, random ones for simulation.
+"""Slope maps of mirrors: measured maps in files, random maps for simulation.
 
-A map comes from deflectometry (QDec-H and the like): for each facet a grid of the slope's
-deviations from the ideal surface, (F, H, W, 2); its signs are those of
+A map comes from deflectometry (QDec-H and similar systems): for each facet a grid of slope
+deviations from the ideal surface, (F, H, W, 2), with the signs of
 `heliotrope.airborne.mirror.MirrorShape`.
 """
 
@@ -38,7 +38,7 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
     Raises
     ------
     FormatError
-        If the file cannot be read, is for another number of facets, has values above 100 mrad, or
+        If the file cannot be read, has a different number of facets, has values above 100 mrad, or
         lacks more than half of a facet.
     """
     file = check_file(path, "a slope map (.npz or .csv)", binary=True)
@@ -77,7 +77,7 @@ def checked_slopes(file: Path, slope: FloatArray, facets: int) -> FloatArray:
 
 
 def write_slopes(path: str | Path, slope: FloatArray) -> None:
-    """Write a slope map as `read_slopes` reads it, completely or not at all."""
+    """Write a slope map in the form that `read_slopes` reads, completely or not at all."""
     file = Path(path)
     suffix = file.suffix.casefold()
     if suffix == ".npz":

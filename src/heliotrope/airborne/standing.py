@@ -1,4 +1,4 @@
-"""Poses of mirrors: vertex, rotation and outline of each at its drive positions.
+"""Mirror poses: vertex, rotation and outline of each mirror at its drive positions.
 
 Concentrator coordinates: origin at the vertex, x to the right as seen from the front, y up along
 the mirror, z the normal.
@@ -53,7 +53,7 @@ class MirrorPoses:
         return as_float(self.vertex[:, None, :] + turned)
 
     def take(self, rows: npt.ArrayLike) -> "MirrorPoses":
-        """Return the mirrors at ``rows``, in that order."""
+        """Return the mirrors at indices ``rows``, in that order."""
         index = np.asarray(rows, dtype=np.intp).reshape(-1)
         return MirrorPoses(
             tuple(self.names[i] for i in index),
@@ -113,24 +113,24 @@ def outline(heliostats: Heliostats) -> FloatArray:
 def read_commands(
     path: str | Path, names: Sequence[str], cluster: str = "", point: str = ""
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Return rows of heliostats and their drive counts (M, D) from a table of commands.
+    """Return heliostat indices and drive counts (M, D) from a table of commands.
 
     Parameters
     ----------
     path
-        CSV with the columns ``heliostat``, ``count_1``, ``count_2`` (one or two drives); that of a
-        flight plan also has ``cluster``, ``point`` and ``reachable``.
+        CSV with the columns ``heliostat``, ``count_1``, ``count_2`` (one or two drives); the table
+        of a flight plan also has ``cluster``, ``point`` and ``reachable``.
     names
         Names of the plant's heliostats.
     cluster, point
-        Only rows of this cluster and this calibration point; "" for all.
+        Select the rows of this cluster and this calibration point; "" for all.
 
     Raises
     ------
     FormatError
         If a column is missing, a value is not a number, or a heliostat is listed twice.
     UnknownNameError
-        If a heliostat is not in the plant: the wrong field.
+        If a heliostat is not in the plant, which indicates the wrong field.
     """
     rows = read_rows(Path(path), "a table of commands", ("heliostat", *_COUNTS))
     rows.need(["heliostat", "count_1"])
@@ -159,7 +159,7 @@ def read_commands(
 
 
 def write_commands(path: str | Path, names: Sequence[str], counts: npt.ArrayLike) -> None:
-    """Write drive counts (N, D) of heliostats as `read_commands` reads them."""
+    """Write the drive counts (N, D) of heliostats in the form that `read_commands` reads."""
     table = as_float(counts)
     header = ["heliostat", *(f"count_{k + 1}" for k in range(table.shape[1]))]
     lines = [",".join(header)]

@@ -1,7 +1,7 @@
-"""Which parts of which mirrors a camera in the air sees: nearer mirrors hide those behind them.
+"""Which parts of which mirrors an airborne camera sees, given that nearer mirrors hide others.
 
-From a low drone the mirrors of a dense field overlap. Planning and detection ask this one model,
-so a flight is planned only where its photographs can be evaluated.
+Seen from a low drone, the mirrors of a dense field overlap. Planning and detection use this same
+model, so a flight is planned only where its photographs can be evaluated.
 """
 
 from dataclasses import dataclass

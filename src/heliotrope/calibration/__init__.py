@@ -1,17 +1,18 @@
-"""From sightings to the parameters of each mirror, with their covariance.
+"""From sightings to the parameters of each heliostat, with their covariance.
 
 A sighting is one measurement of where a mirror points; `camera_target`, `drone`, `sun_sensor` and
-`field_camera` make `Sightings` of every kind, `read_sightings` reads a table. The rooms:
+`field_camera` create `Sightings` of every kind, and `read_sightings` reads a table. The
+subpackages:
 
-- `calibration.fit`: parameters of each heliostat (`fit`);
+- `calibration.fit`: the parameters of each heliostat (`fit`);
 - `calibration.learn`: a whole field, with drift, steps and outliers (`learn`, `predict`);
-- `calibration.plan`: the measurements that tell most (`plan_sightings`, `plan_campaign`);
-- `calibration.report`: a page and files for other programs (`write_report`).
+- `calibration.plan`: the most informative measurements (`plan_sightings`, `plan_campaign`);
+- `calibration.report`: a report page, and files for other programs (`write_report`).
 
-`calibrate` and `evaluate` run all steps from files to figures. Functions with the name of their
-room or module are imported from there: ``from heliotrope.calibration.fit import fit``,
-``from heliotrope.calibration.learn import learn``, ``from heliotrope.calibration.sightings import
-sightings``.
+`calibrate` and `evaluate` run all steps from files to results. Functions that share the name of
+their subpackage or module must be imported from there: ``from heliotrope.calibration.fit import
+fit``, ``from heliotrope.calibration.learn import learn``, ``from heliotrope.calibration.sightings
+import sightings``.
 """
 
 from heliotrope.calibration.clock import ClockCheck, check_clock

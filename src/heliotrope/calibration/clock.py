@@ -1,10 +1,11 @@
-"""A common error of the clock, tested as a hypothesis over all mirrors of a field.
+"""Clock error, tested as a hypothesis common to all heliostats of a field.
 
-The sun's direction is computed from the time. A clock that is fast by a minute moves all suns by
-4 mrad, and each mirror's parameters take up most of that; what they cannot take up shows the error.
-Trials move the suns along their path by one time for all, and fit all mirrors again; the best is
-refined by Gauss-Newton. The uncertainty is that of the noise, or of the scatter between mirrors if
-that is larger. An error is stated, never corrected: the times and suns are the plant's to mend.
+The sun's direction is computed from the time. A clock that is fast by a minute shifts every sun
+position by 4 mrad. The parameters of each heliostat absorb most of that shift, and the remainder
+reveals the error. The check shifts all sun positions along the sun's path by one trial time offset
+and refits all heliostats; the best offset is refined by Gauss-Newton. The uncertainty is that of
+the noise, or that of the scatter between heliostats if it is larger. The check only reports an
+error and never corrects it, because times and sun vectors must be corrected at the plant.
 """
 
 from dataclasses import dataclass, replace
@@ -42,14 +43,14 @@ FREEDOM = 5.0
 
 @dataclass(frozen=True)
 class ClockCheck:
-    """A common error of the clock.
+    """A clock error common to all heliostats.
 
     Attributes
     ----------
     error, sigma
-        Recorded less true time, and its standard deviation, s.
+        Recorded minus true time, and its standard deviation, s.
     heliostats
-        Number of mirrors that were tested.
+        Number of heliostats that were tested.
     """
 
     error: float
@@ -58,7 +59,7 @@ class ClockCheck:
 
     @property
     def found(self) -> bool:
-        """Whether the error explains the sightings far better than the clock as it is."""
+        """Whether the error explains the sightings far better than a correct clock does."""
         return abs(self.error) > CLEAR * self.sigma
 
     def __str__(self) -> str:
@@ -79,7 +80,7 @@ class ClockCheck:
         )
 
     def document(self) -> dict[str, float | bool]:
-        """Return the figures for JSON."""
+        """Return the results for JSON."""
         return {
             "error_s": self.error,
             "sigma_s": self.sigma,
@@ -93,22 +94,22 @@ def check_clock(
     model: tuple[str, ...],
     site: Site,
 ) -> ClockCheck | None:
-    """Return the common error of the clock that explains the sightings best.
+    """Return the common clock error that best explains the sightings.
 
     Parameters
     ----------
     mechanism
-        Nominal, (N,).
+        Nominal mechanisms, (N,).
     sightings
-        M of these heliostats; those with other light than the sun's say nothing.
+        M sightings of these heliostats; sightings whose light source is not the sun are ignored.
     model
         The parameters to fit.
     site
-        The plant's, for the path of the sun.
+        Site of the plant, for the path of the sun.
 
     Returns
     -------
-    None if no mirror has `FEWEST` sightings of the sun.
+    None if no heliostat has `FEWEST` sightings of the sun.
     """
     suns = sightings.take(sightings.source_at_infinity)
     counts = np.bincount(suns.heliostat, minlength=len(mechanism))

@@ -1,4 +1,4 @@
-"""A field in simulation for demonstrations: measured on a target, and tracked for a day."""
+"""A simulated field for demonstrations: measured on a target, then tracked for a day."""
 
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
@@ -94,7 +94,7 @@ class TrackedDay:
 def track_day(
     group: Heliostats, truth: Mechanism, aim: FloatArray, site: Site, day: date
 ) -> TrackedDay:
-    """Return the beam errors of a day, every 5 minutes.
+    """Return the beam errors over a day, every 5 minutes.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def track_day(
     truth
         Mechanisms as built, (N,).
     aim, site, day
-        Aim point, (3,); place and air; UTC day.
+        Aim point, (3,); site; UTC day.
     """
     times = solar.daylight(day, site, every=timedelta(minutes=5), min_elevation=0.1)
     suns = solar.vector(times, site)

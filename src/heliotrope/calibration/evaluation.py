@@ -1,4 +1,4 @@
-"""Errors of beam and normal under given parameters, and splits of sightings for testing."""
+"""Beam and normal errors under given parameters, and splits of sightings for testing."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -84,7 +84,7 @@ def beam_errors(mechanism: Field, sightings: Sightings) -> BeamErrors:
     Parameters
     ----------
     mechanism
-        Mechanisms, batch shape (N,) or (); a heliostat, a group or a plant counts as calibrated.
+        Mechanisms, batch shape (N,) or (); or a heliostat, a group or a plant, taken as calibrated.
     sightings
         M sightings of these heliostats.
     """
@@ -122,15 +122,15 @@ def split(
     sightings
         Sightings of any number of heliostats.
     kind
-        "random"; "chronological" and "sequential" (the earliest are for training; the second
-        then learns on from each held-out sighting after predicting it); or "neighbour" (whole
-        neighbourhoods of source directions are held out). A random choice flatters: it
-        leaves sightings of ten minutes earlier in the training part. The others are PAINT's; see
-        `heliotrope.calibration.paint_splits`, which sets their counts.
+        "random"; "chronological" and "sequential" (train on the earliest sightings; "sequential"
+        also learns from each held-out sighting once it has been predicted); or "neighbour" (hold
+        out whole neighbourhoods of source directions). A random split is optimistic, because it
+        leaves sightings from ten minutes earlier in the training part. The other splits are
+        PAINT's; see `heliotrope.calibration.paint_splits`, which sets their sizes.
     fraction
-        Between 0 and 1.
+        Training fraction, between 0 and 1.
     seed
-        Seed of the random choice.
+        Seed of the random split.
 
     Raises
     ------
@@ -208,7 +208,7 @@ class ErrorSummary:
 
 
 def summarise(beam: FloatArray) -> ErrorSummary:
-    """Return median, RMS and 95th percentile of beam errors (M,), NaN if there are none."""
+    """Return median, RMS and 95th percentile of beam errors (M,), NaN if there are no errors."""
     if not len(beam):
         return ErrorSummary(0, np.nan, np.nan, np.nan)
     return ErrorSummary(

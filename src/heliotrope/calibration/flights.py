@@ -1,9 +1,10 @@
-"""Flights of a drone as a plant takes them: sightings with the errors that they share.
+"""Drone flights as a plant imports them: sightings together with their shared errors.
 
-`drone evaluate` writes the file ``flight.json``, and a plant reads it. Each row is the orientation
-of one mirror in one pose; see ``docs/reference/formats.md``. A row holds what is its own, and the
-file what all rows share: a wrong position of the RTK base displaces the drone alike in all rows,
-and a wrong focal length displaces each mirror away from the middle of the flight.
+`drone evaluate` writes the file ``flight.json``, and a plant reads it. Each record is the
+orientation of one mirror in one pose; see ``docs/reference/formats.md``. A record contains what
+belongs to one measurement, and the file header what all records share: an error in the RTK base
+position displaces the drone equally in all records, and an error in the focal length displaces each
+mirror away from the middle of the flight.
 """
 
 import json

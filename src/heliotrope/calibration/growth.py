@@ -1,12 +1,13 @@
-r"""Growth of a calibration's covariance with time: drift after the last photograph.
+r"""Growth of a calibration's covariance with time, through drift after the last photograph.
 
-The parameters drift as `heliotrope.calibration.learn.drift` describes. A mirror that goes on with
-the values of its calibration misses, after a time Δ, by what its processes have moved since:
+The parameters drift as `heliotrope.calibration.learn.drift` describes. A heliostat that keeps the
+values of its calibration is off, after a time Δ, by the amount that its drift processes have moved
+since:
 
 $$ \langle (d(t + Δ) - d(t))^2 \rangle = 2 a^2 (1 - e^{-Δ/τ}) + r Δ s^2 , $$
 
-the structure function of an Ornstein-Uhlenbeck process of standard deviation a and time constant
-τ, and the steps of standard deviation s that come r times a day.
+which is the structure function of an Ornstein-Uhlenbeck process with standard deviation a and time
+constant τ, plus steps of standard deviation s that occur r times a day.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
-"""Heliostats as the functions of calibration take them, and sightings that find theirs by name.
+"""Heliostats as calibration functions accept them, and matching of sightings by name.
 
-Functions take mechanisms, one heliostat of a plant, a group, or a whole plant of one kind. Where
-heliostats and sightings both have names, they are matched by them; else by their rows.
+The functions accept mechanisms, one heliostat of a plant, a group, or a whole plant of one kind. If
+both heliostats and sightings have names, they are matched by name; otherwise by index.
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,7 @@
-"""Corrects sightings on targets for the shading and blocking of their mirrors by neighbours.
+"""Corrects sightings on targets for shading and blocking by neighbouring heliostats.
 
-Where each mirror stands is known; where its neighbours looked at the time is assumed: at their own
-aims. As in the schedule, mirrors turn about their feet.
+The position of each heliostat is known, but the pose of its neighbours at the time is assumed: each
+is taken to track its own aim. As in the schedule, mirrors rotate about the foot of the heliostat.
 """
 
 from dataclasses import dataclass, replace

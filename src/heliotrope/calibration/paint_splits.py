@@ -1,10 +1,11 @@
-"""PAINT's four official splits of a heliostat's measurements, by the sun's place or the season.
+"""PAINT's four official splits of a heliostat's measurements, by sun position or season.
 
 The rules are those of ``paint-csp`` 3.1 (``paint.data.dataset_splits``): for each heliostat a
-number of measurements for training, for validation, and at least as many for testing. Where a
-heliostat has fewer than PAINT asks for, all numbers shrink in proportion. Learning here needs no
-validation part, so that part is neither learnt from nor tested on. PAINT draws its clusters and
-samples with another generator: the balanced split follows its rule, not its draw.
+number of measurements for training, for validation, and at least as many for testing. If a
+heliostat has fewer measurements than PAINT requires, all numbers are reduced in proportion.
+Learning here needs no validation part, so that part is used neither for learning nor for testing.
+PAINT draws its clusters and samples with a different random generator, so the balanced split
+follows PAINT's rule but not its draw.
 """
 
 from datetime import UTC, datetime

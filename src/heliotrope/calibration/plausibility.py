@@ -1,9 +1,10 @@
-"""Physical plausibility of sightings: the one place that judges them, whatever their source.
+"""Physical plausibility of sightings, judged in this one place for all sources.
 
-A table, a folder of measurements, a log of photographs, a flight and a plant's own camera all ask
-`judge`. It gives a reason for each sighting that cannot have happened; such a sighting is left out
-and named. What contradicts most sightings of a mirror is no mistake of single rows: the fit judges
-it (`learn.misfits`). What contradicts most rows of a source is a note.
+Tables, measurement folders, photograph logs, flights and the plant's own cameras all call `judge`.
+It returns a reason for each sighting that is physically impossible; such a sighting is left out and
+named. If most sightings of a heliostat are contradicted, the fault does not lie in single
+sightings, and the fit judges the heliostat (`learn.misfits`). If most sightings of a source are
+contradicted, they stay and a note is returned.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -59,9 +60,9 @@ class Judgement:
     Attributes
     ----------
     reasons
-        Why a sighting cannot have happened, by its row.
+        Why a sighting is impossible, by its index.
     notes
-        Lines on what contradicts most of the sightings; these stay.
+        Notes on contradictions that affect most of the sightings; these sightings stay.
     """
 
     reasons: Mapping[int, str] = field(default_factory=dict)
@@ -77,25 +78,25 @@ def judge(
     kinds: Sequence[str] = (),
     now: float | None = None,
 ) -> Judgement:
-    """Return the reasons why some of the sightings cannot have happened.
+    """Return the reasons why some of the sightings are impossible.
 
-    A sighting gets the first reason that applies. The more is known of the plant, the more is
-    judged.
+    A sighting gets the first reason that applies. The more of the optional arguments are given, the
+    more is checked.
 
     Parameters
     ----------
     sightings
         M sightings.
     mechanism
-        The mechanisms of its rows, (N,): for stops, the back of a mirror, points on it.
+        The mechanisms of the heliostats, (N,): to check stops, light behind a mirror, points on it.
     site
-        For the sun at the time of each sighting.
+        To check the sun position at the time of each sighting.
     surfaces
-        Targets and receivers of the plant: for the destinations of kind "camera_target".
+        Targets and receivers of the plant: to check the destinations of kind "camera_target".
     kinds
         Kind of each sighting, (M,), empty if unknown.
     now
-        The computer's clock, Unix seconds: for times that are still to come.
+        The computer's clock, Unix seconds: to check for times in the future.
     """
     reasons: dict[int, str] = {}
     for rows, text in _impossible(sightings, now):

@@ -1,8 +1,9 @@
-"""The belief about one heliostat: the record that a calibration makes, once.
+"""The belief about one heliostat: the record that a calibration creates, once.
 
-The learner makes a `HeliostatCalibration` from a fit. All others (automatic control, schedule, beam
-checks, local controllers, store, pages) hold a reference to that same record; none fits or inverts
-again. `CalibrationOutcome` is the outcome of an attempt, whether or not it made a record.
+The learner creates a `HeliostatCalibration` from a fit. All users (automatic control, schedule,
+beam checks, local controllers, store, pages) hold a reference to the same record; none of them fits
+or inverts again. `CalibrationOutcome` is the outcome of an attempt, whether or not it produced a
+record.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
-"""Tables of sightings: every kind in one CSV or Parquet file, and Malan's own CSV.
+"""Sighting tables: all kinds of sighting in one CSV or Parquet file, and Malan's own CSV.
 
-One row is one sighting. A row that cannot be used is left out and reported in one line (file, line,
-heliostat, column, value, remedy); a file that cannot be used raises an error.
+Each row is one sighting. A row that cannot be used is left out and reported in one line (file,
+line, heliostat, column, value, remedy); a file that cannot be used raises an error.
 """
 
 import csv
@@ -65,7 +65,7 @@ def read_sightings(
     names: Sequence[str],
     judge: Callable[[Sightings, Sequence[str]], Mapping[int, str]] | None = None,
 ) -> tuple[Sightings, tuple[str, ...], list[str]]:
-    """Return the sightings of a table, their kinds, and a line for each row left out.
+    """Return the sightings of a table, their kinds, and a message for each row left out.
 
     Parameters
     ----------
@@ -75,14 +75,14 @@ def read_sightings(
         the covariances are optional; ``sigma_mrad`` may replace ``sigma_rad``. A missing time
         is NaN. Other columns are ignored.
     names
-        Names of the heliostats in the order of their rows, (N,).
+        Names of the heliostats in the order of their indices, (N,).
     judge
-        Gives the sightings that cannot have happened, by row, with the reason: it is called with
+        Function that returns the impossible sightings, by index, with the reason; it is called with
         all sightings and their kinds. See `heliotrope.calibration.plausibility`.
 
     Returns
     -------
-    M sightings in the order of the file, their kinds ("" where not given), and one line for
+    M sightings in the order of the file, their kinds ("" if not specified), and one message for
     each row that could not be used.
 
     Raises
@@ -152,7 +152,7 @@ def write_sightings(
     Parameters
     ----------
     path
-        A file ``.csv`` or ``.parquet``, written whole or not at all.
+        A file ``.csv`` or ``.parquet``, written completely or not at all.
     sightings
         M sightings.
     names
@@ -184,7 +184,7 @@ def read_malan(
     aim: tuple[float, float] = (0.0, 0.0),
     sigma: float = 5e-4,
 ) -> tuple[Sightings, list[str]]:
-    """Return the camera-target sightings of one heliostat in Malan's form.
+    """Return the camera-target sightings of one heliostat from a file in Malan's format.
 
     Parameters
     ----------
@@ -199,22 +199,22 @@ def read_malan(
     names
         Names of all heliostats, (N,).
     target
-        Target with the beam.
+        Target on which the beam was measured.
     aim
-        Aim point, m to the right of and above the target's center.
+        Aim point, m to the right of and above the target's centre.
     sigma
         Standard deviation of a centroid as seen from the mirror, rad of beam.
 
     Returns
     -------
-    The sightings in the order of the file, and one line for each row left out.
+    The sightings in the order of the file, and one message for each row left out.
 
     Raises
     ------
     FormatError
         If the file cannot be read or lacks a column.
     UnknownNameError
-        If there is no such heliostat.
+        If the heliostat does not exist.
     """
     index = rows_of(names)
     if heliostat not in index:

@@ -1,9 +1,9 @@
-"""Sightings: light observed to go from a source over a mirror to a destination.
+"""Sightings: light observed on its way from a source via a mirror to a destination.
 
 Every measurement of where a mirror points is one record: heliostat, time, drive counts, source and
 destination (each a direction at infinity or a point), and the uncertainty of the ray between them.
 A photograph of the beam on a target, a reflection seen by a drone, a sun sensor and a camera in the
-field all give this record.
+field all produce this record.
 """
 
 from collections.abc import Iterable
@@ -34,23 +34,24 @@ class Sightings(Value, Framed):
     Attributes
     ----------
     heliostat
-        Row of the heliostat, 0 to N − 1, (M,).
+        Index of the heliostat, 0 to N − 1, (M,).
     time
         Unix seconds (UTC), (M,).
     counts
         Drive counts, (M, D).
     source, destination
-        Unit vector from the mirror if at infinity, else a point in ENU metres, (M, 3).
+        Unit vector from the mirror if at infinity, otherwise a point in ENU metres, (M, 3).
     source_at_infinity, destination_at_infinity
         (M,).
     sigma
         Standard deviation of the ray's direction (source and destination together) in
         each of two directions across it, rad of beam, (M,).
     source_covariance, destination_covariance
-        Further covariance of each end, ENU, (M, 3, 3): m² for a point, rad² for a
-        direction, of which only the part across the direction counts.
+        Additional covariance of each end, ENU, (M, 3, 3): m² for a point, rad² for a direction, of
+        which only the part across the direction counts.
     names
-        Names of the heliostats by row, (N,); () where rows count the mechanisms given with them.
+        Names of the heliostats by index, (N,); () if the indices refer to mechanisms passed
+        alongside.
     """
 
     heliostat: npt.NDArray[np.intp]
@@ -120,19 +121,19 @@ class Sightings(Value, Framed):
         return len(self.heliostat)
 
     def take(self, rows: npt.ArrayLike) -> "Sightings":
-        """Return the sightings at ``rows`` (indices or a mask), in that order."""
+        """Return the sightings at indices ``rows`` (or a mask), in that order."""
         index = np.asarray(rows)
         # NumPy makes an array of floats of an empty list.
         index = index if index.size else index.astype(np.intp)
         return replace(self, **{name: getattr(self, name)[index] for name in _COLUMNS})
 
     def of(self, heliostat: int | str) -> "Sightings":
-        """Return the sightings of one heliostat, by row or name, renumbered to 0.
+        """Return the sightings of one heliostat, by index or name, renumbered to 0.
 
         Raises
         ------
         UnknownNameError
-            If no heliostat of that name was seen.
+            If there is no sighting of a heliostat with that name.
         """
         if isinstance(heliostat, str) and heliostat not in self.names:
             raise UnknownNameError("heliostat (of the sightings)", heliostat, self.names)
@@ -145,7 +146,7 @@ class Sightings(Value, Framed):
         )
 
     def renumbered(self, rows: npt.ArrayLike) -> "Sightings":
-        """Return the sightings as those of other mechanisms, by row (M,) and without names."""
+        """Return the sightings assigned to other mechanisms, by index (M,) and without names."""
         return replace(self, heliostat=np.asarray(rows, dtype=np.intp), names=())
 
     def __getitem__(self, heliostat: str) -> "Sightings":
@@ -173,25 +174,25 @@ def sightings(
     source_covariance: npt.ArrayLike = 0.0,
     destination_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return checked sightings; everything broadcasts to the M rows of ``counts``.
+    """Return checked sightings; all arguments broadcast to the M rows of ``counts``.
 
-    Counts of several batch axes, such as (T, N, D) of N heliostats at T times, give as many
-    sightings, the last axis fastest; all else broadcasts to (T, N), and a list of times goes
-    along the first axis.
+    Counts with several batch axes, such as (T, N, D) for N heliostats at T times, produce one
+    sighting per element, the last axis varying fastest; all other arguments broadcast to (T, N),
+    and a list of times runs along the first axis.
 
     Parameters
     ----------
     heliostat
-        Name of the heliostat of each sighting, or its row among the mechanisms, () or (M,).
+        Name of the heliostat of each sighting, or its index among the mechanisms, () or (M,).
     counts
         Drive counts, (M, D).
     source, destination
-        Directions (of any length) or points (m), ENU, (M, 3). A direction of length 1 is
-        kept to the last bit.
+        Directions (of any length) or points (m), ENU, (M, 3). A direction of length 1 is kept
+        unchanged to the last bit.
     time
         See `heliotrope.sun.Times`, () or (M,); NaN: unknown.
     source_at_infinity, destination_at_infinity
-        The sun is at infinity, the centroid on a target is not.
+        Whether each end is at infinity: the sun is, the centroid on a target is not.
     sigma
         Standard deviation of the ray's direction, rad of beam, (M,).
     source_covariance, destination_covariance
@@ -201,8 +202,8 @@ def sightings(
     Raises
     ------
     InputError
-        If a value is not finite, a direction is zero, sigma is out of range, or a
-        covariance is not symmetric and positive semidefinite; the text names the row.
+        If a value is not finite, a direction is zero, sigma is out of range, or a covariance is not
+        symmetric and positive semidefinite; the message names the row.
     """
     table = np.atleast_2d(_numbers(counts, "counts"))
     if not table.shape[-1]:
@@ -406,14 +407,14 @@ def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike
 def of_measurements(
     measurements: Measurements, heliostats: Heliostats, sigma: float = 5e-4
 ) -> tuple[Sightings, list[str]]:
-    """Return sightings of camera-target measurements, and a line for each name left out.
+    """Return sightings from camera-target measurements, and a message for each name left out.
 
     Parameters
     ----------
     measurements
         Measurements as read from files.
     heliostats
-        Heliostats that include the names in the measurements.
+        Heliostats that include all names in the measurements.
     sigma
         Standard deviation of a centroid as seen from the mirror, rad of beam.
     """
@@ -444,7 +445,7 @@ def camera_target(
     sun_covariance: npt.ArrayLike = 0.0,
     centroid_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of the sun's image on a target (Malan): sun to centroid.
+    """Return sightings of the sun's image on a target (Malan): from the sun to the centroid.
 
     Parameters
     ----------
@@ -480,18 +481,18 @@ def drone(
     led_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of a lamp's reflection from the air (HelioPoint): lamp to camera.
+    """Return sightings of a lamp's reflection seen from a drone (HelioPoint): lamp to camera.
 
     Parameters
     ----------
     heliostat, counts, time, sigma
         As for `sightings`.
     led, camera
-        Lamp, and centre of projection of the camera, ENU metres, (M, 3).
+        Position of the lamp, and centre of projection of the camera, ENU metres, (M, 3).
     led_covariance, camera_covariance
-        m², as for `sightings`. The two are taken as independent. Where the lamp is mounted
-        beside the camera, an error of the drone's position moves both: give four times its
-        variance to one of them and 0 to the other.
+        m², as for `sightings`. The two covariances are taken as independent. If the lamp is mounted
+        beside the camera, an error in the drone's position moves both: pass four times its variance
+        for one end and 0 for the other.
     """
     return sightings(
         heliostat,
@@ -515,7 +516,7 @@ def sun_sensor(
     normal_sigma: npt.ArrayLike = 2.5e-4,
     normal_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of a sensor that holds the mirror square to the sun: sun to sun.
+    """Return sightings of a sensor that keeps the mirror normal to the sun: from sun to sun.
 
     Parameters
     ----------
@@ -524,10 +525,10 @@ def sun_sensor(
     sun
         Directions to the apparent sun while the loop was closed, ENU, (M, 3).
     normal_sigma
-        Standard deviation of the mirror's normal, rad, (M,); the ray turns by twice that.
+        Standard deviation of the mirror normal, rad, (M,); the ray turns by twice that angle.
     normal_covariance
-        Covariance of the normal, rad². Source and destination are one measurement, so four
-        times this covariance is given to the destination.
+        Covariance of the normal, rad². Source and destination are one measurement, so four times
+        this covariance is assigned to the destination.
     """
     return sightings(
         heliostat,
@@ -552,7 +553,7 @@ def field_camera(
     sun_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of the sun in the mirror by a camera in the field (eSolar): sun to camera.
+    """Return sightings of the sun seen in the mirror by a field camera (eSolar): sun to camera.
 
     Parameters
     ----------
@@ -561,7 +562,7 @@ def field_camera(
     sun
         Directions to the apparent sun, ENU, (M, 3).
     camera
-        Its centre of projection, ENU metres, (M, 3).
+        The camera's centre of projection, ENU metres, (M, 3).
     sun_covariance, camera_covariance
         rad² and m², as for `sightings`.
     """
@@ -579,12 +580,12 @@ def field_camera(
 
 
 def join(parts: Iterable[Sightings]) -> Sightings:
-    """Return sightings of several kinds or campaigns as one, in the order given.
+    """Join sightings of several kinds or campaigns, in the order given.
 
     Raises
     ------
     InputError
-        If there are none, or they are of mechanisms with different numbers of drives.
+        If there are no sightings, or their mechanisms have different numbers of drives.
     """
     if isinstance(parts, Sightings):
         raise InputError("join: one Sightings; give a list of them")

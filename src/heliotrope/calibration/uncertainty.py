@@ -1,10 +1,11 @@
-"""Uncertainty of mechanisms, and the expected error of their beams.
+"""Uncertainty of mechanism parameters, and the expected error of the beams.
 
-Priors and sightings give `precision`, the information on the parameters; its inverse is their
-covariance C. With B the derivative of the beam's direction by the parameters, the beam from one
-sun to one aim has the covariance B C Bᵀ (`expected_error`), and over many suns the mean squared
-error tr(F C) with F the mean of BᵀB (`error_form`). `unobservable` names what the sightings leave
-to the prior, `year_map` shows the error for every sun of the year.
+Priors and sightings determine `precision`, the information on the parameters; its inverse is their
+covariance C. Let B be the derivative of the beam direction with respect to the parameters. The beam
+from one sun position to one aim has the covariance B C Bᵀ (`expected_error`); over many sun
+positions the mean squared error is tr(F C) with F the mean of BᵀB (`error_form`). `unobservable`
+names what the sightings leave to the prior, and `year_map` shows the error for every sun position
+in the year.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,18 +41,18 @@ def precision(
     *,
     priors: Mapping[str, npt.ArrayLike] | None = None,
 ) -> FloatArray:
-    """Return the information of priors and sightings on the parameters, (N, P, P).
+    """Return the information from priors and sightings on the parameters, (N, P, P).
 
     Parameters
     ----------
     mechanism
-        Best estimates, batch shape (N,); derivatives are taken there.
+        Best estimates, batch shape (N,), at which the derivatives are taken.
     names
         P parameters of the table.
     made
-        Sightings made so far, with the standard deviations that they state.
+        Sightings made so far, with their stated standard deviations.
     priors
-        Standard deviations that replace the table's, by name, (N,) or scalars.
+        Standard deviations that replace those of the table, by name, (N,) or scalars.
 
     Returns
     -------
@@ -60,7 +61,7 @@ def precision(
     Raises
     ------
     InputError
-        If a sighting is of a heliostat that is not there, or a prior is not above 0.
+        If a sighting refers to a heliostat that does not exist, or a prior is not above 0.
     UnknownNameError
         If a parameter is not in the table.
     """
@@ -93,12 +94,12 @@ def expected_error(
     *,
     current: npt.ArrayLike | None = None,
 ) -> ExpectedError:
-    """Return the expected error of beams of mechanisms that track by their calibration.
+    """Return the expected beam errors of mechanisms that track by their calibration.
 
     Parameters
     ----------
     mechanism
-        Calibrated: one, or M.
+        Calibrated mechanisms: one, or M.
     names
         The P parameters of ``covariance``.
     covariance
@@ -106,10 +107,11 @@ def expected_error(
     sun, aim
         Unit vectors to the sun and aim points (m), ENU, (3,) or (M, 3).
     noise
-        Standard deviation in each direction to be added, rad of beam.
+        Additional standard deviation in each direction, rad of beam.
     current
-        Present step counts, (D,) or (M, D): a mechanism without stops reaches most aims in two
-        poses, takes the nearer one, and its error is not that of the other; see `track`.
+        Present step counts, (D,) or (M, D). A mechanism without stops reaches most aims in two
+        poses and takes the nearer one, whose error differs from that of the other pose; see
+        `track`.
 
     Notes
     -----
@@ -133,10 +135,10 @@ def expected_error(
 def error_form(
     mechanism: Mechanism, aim: npt.ArrayLike, suns: npt.ArrayLike, names: tuple[str, ...]
 ) -> FloatArray:
-    """Return the mean squared beam error over ``suns`` as a form of the parameters, (N, P, P).
+    """Return the mean squared beam error over ``suns`` as a quadratic form, (N, P, P).
 
-    With F the form and C the covariance of the parameters, the expected RMS error of the beam
-    (two-dimensional) is √tr(F C), rad.
+    With F the form and C the covariance of the parameters, the expected two-dimensional RMS error
+    of the beam is √tr(F C), rad.
 
     Parameters
     ----------
@@ -145,8 +147,9 @@ def error_form(
     aim
         Aim points in operation, ENU metres, (3,) or (N, 3).
     suns
-        K unit vectors of equal weight, (K, 3), for example `suns_of_year`. Suns that a
-        heliostat cannot serve do not count for it; if it can serve none, its form is 0.
+        K unit vectors of equal weight, (K, 3), for example from `suns_of_year`. Sun vectors for
+        which a heliostat cannot reach its aim do not count for that heliostat; if it can reach its
+        aim for none, its form is 0.
     names
         P parameters of the table.
 
@@ -204,7 +207,7 @@ def suns_of_year(
     Parameters
     ----------
     site
-        Place and air.
+        Location and atmosphere.
     year
         Calendar year (UTC).
     days
@@ -239,18 +242,18 @@ def suns_of_year(
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """A combination of parameters on which the sightings give no information.
+    """A combination of parameters about which the sightings contain no information.
 
     Attributes
     ----------
     text
-        One clause for people.
+        Description in one clause, for display.
     loadings
-        Parameters with their share, largest first, in units of their priors.
+        Parameters with their shares, largest first, in units of their priors.
     remaining
-        Remaining share of the prior variance, 0 to 1.
+        Remaining fraction of the prior variance, 0 to 1.
     beam
-        RMS beam error that it causes, rad; NaN if no beams were given.
+        RMS beam error that the combination causes, rad; NaN if no beams were passed.
     """
 
     text: str
@@ -266,20 +269,21 @@ def unobservable(
     line_of_sight: npt.ArrayLike | None = None,
     slope: npt.ArrayLike | None = None,
 ) -> tuple[BlindSpot, ...]:
-    """Return the combinations of parameters that are known by the prior only.
+    """Return the combinations of parameters that are known only from the prior.
 
     Parameters
     ----------
     names
         The P parameters.
     covariance
-        After the sightings, (P, P).
+        Covariance after the sightings, (P, P).
     prior
-        Standard deviations before them, (P,); parameters with 0 are skipped.
+        Standard deviations before the sightings, (P,); parameters with 0 are skipped.
     line_of_sight
-        Vector from the heliostat to its target, (3,), so that a position along it is named.
+        Vector from the heliostat to its target, (3,), used to recognise a position error along it.
     slope
-        Derivatives of beams by the parameters, (M, 2, P), for the beam error that each causes.
+        Derivatives of beams with respect to the parameters, (M, 2, P), to compute the beam error
+        that each combination causes.
     """
     before = as_float(prior)
     used = np.flatnonzero(before > 0)
@@ -325,10 +329,10 @@ class YearMap:
     Attributes
     ----------
     declination, hour
-        Centres of the grid, rad: the sun's declination (D,), and its hour angle from true
-        noon, west positive (H,).
+        Centres of the grid cells, rad: declination of the sun (D,), and hour angle from true noon,
+        west positive (H,).
     rms
-        rad, (D, H); NaN where the sun is down or the pose out of reach.
+        rad, (D, H); NaN where the sun is below the horizon or the pose is out of reach.
     """
 
     declination: FloatArray
@@ -345,7 +349,7 @@ def year_map(
     noise: float = 0.0,
     size: tuple[int, int] = (25, 49),
 ) -> YearMap:
-    """Return the expected error for every position of the sun in a year.
+    """Return the expected error for every sun position in a year.
 
     Parameters
     ----------

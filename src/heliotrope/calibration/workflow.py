@@ -1,6 +1,6 @@
 """Calibrates a field from its files: read the sightings, choose a model, learn, test, report.
 
-`read_field_sightings` reads a folder or a table, `calibrate` gives the content of a report,
+`read_field_sightings` reads a folder or a table, `calibrate` returns the content of a report, and
 `evaluate` only tests how well held-out sightings are predicted.
 """
 
@@ -48,20 +48,20 @@ Steps = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class FieldSightings:
-    """Sightings with the heliostats that they show.
+    """Sightings together with the heliostats that they measure.
 
     Attributes
     ----------
     plant, group
-        The plant, and the name of the group with the heliostats.
+        The plant, and the name of the group that contains the heliostats.
     sightings
         The sightings.
     ids
         Name of each sighting.
     left_out
-        One line for each measurement that could not be used.
+        One message for each measurement that could not be used.
     notes
-        Lines on what contradicts most of the sightings.
+        Notes on contradictions that affect most of the sightings.
     """
 
     plant: Plant
@@ -85,20 +85,20 @@ def read_field_sightings(
     centroid: Literal["utis", "helios"] = "utis",
     now: float | None = None,
 ) -> FieldSightings:
-    """Return the plausible sightings of a folder in PAINT's form, or of a table.
+    """Return the plausible sightings from a folder in PAINT's format, or from a table.
 
     Parameters
     ----------
     plant
         Plant with one group of heliostats.
     place
-        The folder or file that the plant was read from.
+        The folder or file from which the plant was read.
     table
-        Table of sightings; without one ``place`` must be a folder with measurements.
+        Table of sightings; without a table ``place`` must be a folder with measurements.
     centroid
         Which published centroid to use.
     now
-        The computer's clock, Unix seconds: sightings that are still to come are left out.
+        The computer's clock, Unix seconds; sightings with times in the future are left out.
 
     Raises
     ------
@@ -247,11 +247,11 @@ class HeldOutEvaluation:
     Attributes
     ----------
     learned
-        Learnt from the training part alone.
+        Field learnt from the training part alone.
     assessment
-        Figures of the held-out part.
+        Results for the held-out part.
     choice
-        How the model was chosen; None if it was given.
+        How the model was chosen; None if it was specified.
     """
 
     learned: Learned
@@ -259,7 +259,7 @@ class HeldOutEvaluation:
     choice: ModelChoice | None = None
 
     def document(self) -> dict[str, Any]:
-        """Return the figures for JSON."""
+        """Return the results for JSON."""
         document = {"model": list(self.learned.model), **self.assessment.document()}
         if self.choice is not None and self.choice.scores:
             document["models"] = {c.name: c.document() for c in self.choice.scores}
@@ -286,7 +286,7 @@ def evaluate(
 ) -> HeldOutEvaluation:
     """Learn from a part of each heliostat's sightings and assess the rest.
 
-    Everything, the model and the hyperparameters of the field included, is learnt from the
+    Everything, including the model and the hyperparameters of the field, is learnt from the
     training part alone.
 
     Parameters
@@ -294,20 +294,21 @@ def evaluate(
     names, mechanism
         Names and nominal mechanisms of N heliostats.
     sightings
-        M of these heliostats.
+        M sightings of these heliostats.
     model
         Name of a model, names of parameters, or "auto".
     split, fraction, seed
-        Choose the training part; see `heliotrope.calibration.evaluation.split`.
+        How to choose the training part; see `heliotrope.calibration.evaluation.split`.
     priors
-        Standard deviations that replace the table's, by name.
+        Standard deviations that replace those of the table, by name.
     runner
-        Learns chunks elsewhere; see `heliotrope.calibration.learn.on_dask`.
+        Runner that learns chunks elsewhere; see `heliotrope.calibration.learn.on_dask`.
     steps
         Progress.
     learner
-        For the split "sequential": "stream" updates a belief by one sighting after another
-        (`heliotrope.calibration.learn.stream`); "batch" learns every history afresh.
+        For the split "sequential": "stream" updates a belief sighting by sighting
+        (`heliotrope.calibration.learn.stream`); "batch" learns from the whole history again each
+        time.
     misfits
         As for `learn`.
     targets
@@ -366,7 +367,7 @@ def calibrate(
     model, split, seed, priors, runner, steps
         As for `evaluate`; the model is chosen once, from all sightings.
     fraction
-        Share to learn from when testing; 1: no test.
+        Fraction to learn from in the test; 1: no test.
     """
     require("field", field, FieldSightings, "what read_field_sightings returns")
     require("fraction", fraction, numbers.Real, "a share from 0 to 1")

@@ -23,7 +23,7 @@ Place = Annotated[
 ]
 ModelOption = Annotated[
     str,
-    typer.Option(help="auto; jacks, full, malan8, guo6, khalsa8; or parameters: a,b,c."),
+    typer.Option(help="auto; jacks, full, malan8, guo6, khalsa8; or parameter names: a,b,c."),
 ]
 TableOption = Annotated[
     Path | None, typer.Option(help="Table of sightings (CSV, Parquet) for a plant file.")
@@ -46,11 +46,12 @@ SplitOption = Annotated[
         "high-variance",
     ],
     typer.Option(
-        help="Held-out sightings: random, the latest, whole neighbourhoods of the sun, or the "
-        "latest, each predicted from all before it; or one of PAINT's four splits."
+        help="How to choose the held-out sightings: random; chronological (the latest); "
+        "neighbour (whole neighbourhoods of sun positions); sequential (the latest, "
+        "each predicted from all earlier ones); or one of PAINT's four splits."
     ),
 ]
-SeedOption = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the random choice.")]
+SeedOption = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the random split.")]
 SchedulerOption = Annotated[
     str | None, typer.Option(help="Address of a dask scheduler, or local:N.")
 ]

@@ -24,22 +24,26 @@ if TYPE_CHECKING:
     from heliotrope.cli._at_plant import AtPlant
     from heliotrope.console.client import Client
 
-app = typer.Typer(help="Look at and command a running plant.", no_args_is_help=True)
+app = typer.Typer(help="Monitor and command a running plant.", no_args_is_help=True)
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Whom = Annotated[list[str] | None, typer.Argument(help="Heliostats.", show_default=False)]
 All = Annotated[bool, typer.Option("--all", help="The whole field.")]
 LockedTargets = Annotated[
-    list[str] | None, typer.Option("--target", help="Target; repeat it.", show_default=False)
+    list[str] | None, typer.Option("--target", help="Target; may be repeated.", show_default=False)
 ]
 LockedReceivers = Annotated[
-    list[str] | None, typer.Option("--receiver", help="Receiver; repeat it.", show_default=False)
+    list[str] | None,
+    typer.Option("--receiver", help="Receiver; may be repeated.", show_default=False),
 ]
 LockedTower = Annotated[bool, typer.Option("--tower", help="The tower: all heliostats.")]
 #: Statuses of answers: name, password or code is wrong; the code of a second factor is needed.
 _REFUSED, _NEEDS_CODE = 401, 428
 Wait = Annotated[
-    float, typer.Option("--wait", min=0, max=86_400, help="Longest wait for the end, s; 0: none.")
+    float,
+    typer.Option(
+        "--wait", min=0, max=86_400, help="Maximum time to wait for completion, s; 0: do not wait."
+    ),
 ]
 
 
@@ -51,15 +55,17 @@ def _where(
     ] = "http://127.0.0.1:8080/",
     token_file: Annotated[
         Path | None,
-        typer.Option(help="File with the API token; else HELIOTROPE_TOKEN.", show_default=False),
+        typer.Option(
+            help="File with the API token; default: HELIOTROPE_TOKEN.", show_default=False
+        ),
     ] = None,
     data: Annotated[
         Path | None,
         typer.Option(
             envvar="HELIOTROPE_PLANT",
-            help="Data folder of a plant on this machine: speak to the plant itself, without its "
-            "console, as the plant's user or root; EMERGENCY, DEFOCUS, STOW and views need no "
-            "token.",
+            help="Data folder of a plant on this computer: connect to the plant itself, "
+            "without its console, as the plant's user or root; EMERGENCY, DEFOCUS, "
+            "STOW and views need no token.",
             show_default=False,
         ),
     ] = None,
@@ -129,7 +135,7 @@ def token(
         ),
     ] = 30.0,
 ) -> None:
-    """Make an API token; it is printed once. It asks for your password."""
+    """Create an API token, which is printed once. Asks for your password."""
     password = typer.prompt("Password", hide_input=True, err=True)
     with _sign_in_client(context) as client:
         _sign_in(client, name, password)
@@ -162,10 +168,14 @@ def factor(
     name: Annotated[str, typer.Option(help="Name of your account.")] = "engineer",
     remove: Annotated[bool, typer.Option("--remove", help="Remove your second factor.")] = False,
     reset: Annotated[
-        str, typer.Option(help="Remove that of another account, as an engineer with one.")
+        str,
+        typer.Option(
+            help="Remove the second factor of another account; requires an "
+            "engineer with a second factor."
+        ),
     ] = "",
 ) -> None:
-    """Set up the second factor of your account: codes of an authenticator."""
+    """Set up the second factor of your account: authenticator codes."""
     own = typer.prompt("Password", hide_input=True)
     with _sign_in_client(context) as client:
         _sign_in(client, name, own)
@@ -201,13 +211,15 @@ def account(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the account.")],
     role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "viewer",
-    by: Annotated[str, typer.Option(help="Your account; it must be an engineer's.")] = "engineer",
+    by: Annotated[
+        str, typer.Option(help="Your account, which must be an engineer's.")
+    ] = "engineer",
     disable: Annotated[bool, typer.Option("--disable", help="Disable the account.")] = False,
     reset: Annotated[
-        bool, typer.Option("--reset", help="Make a new password; it is printed once.")
+        bool, typer.Option("--reset", help="Create a new password, which is printed once.")
     ] = False,
 ) -> None:
-    """Make or disable an account, or give it a password that must be changed at first use."""
+    """Create or disable an account, or set a password that must be changed at first use."""
     if disable and reset:
         raise InputError("ctl: give --disable or --reset, not both")
     own = typer.prompt("Your password", hide_input=True)
@@ -300,7 +312,7 @@ def why(
     heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
     as_json: Json = False,
 ) -> None:
-    """Say why a heliostat tracks or does not, what is next, and what you can do."""
+    """Explain why a heliostat tracks or not, what happens next, and what you can do."""
     from urllib.parse import quote
 
     with _client(context) as client:
@@ -352,13 +364,15 @@ def journal(
     kind: Annotated[
         str, typer.Option(help="event, alarm, command or note.", show_default=False)
     ] = "",
-    person: Annotated[str, typer.Option(help="Person.", show_default=False)] = "",
+    person: Annotated[str, typer.Option(help="Name of the person.", show_default=False)] = "",
     heliostat: Annotated[str, typer.Option(help="Heliostat.", show_default=False)] = "",
-    text: Annotated[str, typer.Option(help="Text in it, in any case.", show_default=False)] = "",
+    text: Annotated[
+        str, typer.Option(help="Text to search for, ignoring case.", show_default=False)
+    ] = "",
     everybody: Annotated[
-        bool, typer.Option("--all", help="The commands of automatic control, too.")
+        bool, typer.Option("--all", help="Include the commands of automatic control.")
     ] = False,
-    limit: Annotated[int, typer.Option(min=1, max=2000, help="Most entries.")] = 200,
+    limit: Annotated[int, typer.Option(min=1, max=2000, help="Maximum number of entries.")] = 200,
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
 ) -> None:
     """Print events, alarms and commands of all days, the latest first."""
@@ -387,14 +401,17 @@ def journal(
 def report(
     context: typer.Context,
     since: Annotated[
-        str, typer.Option(help="From this time, ISO 8601; else 8 h before.", show_default=False)
+        str,
+        typer.Option(
+            help="From this time, ISO 8601; default: 8 h before the end.", show_default=False
+        ),
     ] = "",
     until: Annotated[
-        str, typer.Option(help="Before this time; else now.", show_default=False)
+        str, typer.Option(help="Before this time; default: now.", show_default=False)
     ] = "",
     as_json: Json = False,
 ) -> None:
-    """Print the report of a shift: production, availability, calibrations, alarms, work, notes."""
+    """Print the shift report: production, availability, calibrations, alarms, work, notes."""
     given = {"since": since, "until": until}
     times = [f"{name}={parse_time(at).timestamp():.3f}" for name, at in given.items() if at]
     with _client(context) as client:
@@ -436,18 +453,23 @@ def _line(one: dict[str, Any]) -> str:
 def trend(
     context: typer.Context,
     quantity: Annotated[
-        str, typer.Argument(help="Name of a quantity; none: list them.", show_default=False)
+        str, typer.Argument(help="Name of a quantity; default: list the names.", show_default=False)
     ] = "",
-    heliostat: Annotated[str, typer.Option(help="Of this heliostat.", show_default=False)] = "",
+    heliostat: Annotated[
+        str, typer.Option(help="Heliostat, for a quantity of one heliostat.", show_default=False)
+    ] = "",
     since: Annotated[
-        str, typer.Option(help="From this time, ISO 8601; else a day before.", show_default=False)
+        str,
+        typer.Option(
+            help="From this time, ISO 8601; default: one day before the end.", show_default=False
+        ),
     ] = "",
     until: Annotated[
-        str, typer.Option(help="Before this time; else now.", show_default=False)
+        str, typer.Option(help="Before this time; default: now.", show_default=False)
     ] = "",
-    points: Annotated[int, typer.Option(min=10, max=5000, help="Most points.")] = 1000,
+    points: Annotated[int, typer.Option(min=10, max=5000, help="Maximum number of points.")] = 1000,
 ) -> None:
-    """Print a quantity over time as CSV: least, mean and largest value."""
+    """Print a quantity over time as CSV: minimum, mean and maximum."""
     import csv
     import sys
     from urllib.parse import urlencode
@@ -474,9 +496,9 @@ def trend(
 @app.command()
 def note(
     context: typer.Context,
-    text: Annotated[str, typer.Argument(help="What the next shift has to know.")],
+    text: Annotated[str, typer.Argument(help="What the next shift needs to know.")],
 ) -> None:
-    """Keep a note for the next shift, in the journal and the report."""
+    """Store a note for the next shift, in the journal and the report."""
     with _client(context) as client:
         client.ask("POST", "notes", {"text": text})
     print("noted")
@@ -486,7 +508,7 @@ def note(
 def stow(
     context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 0.0
 ) -> None:
-    """Send heliostats to stow; needs no authority."""
+    """Send heliostats to stow; needs no command authority."""
     _give(context, "STOW", _names(heliostats, everybody), (), wait)
 
 
@@ -494,7 +516,7 @@ def stow(
 def defocus(
     context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 0.0
 ) -> None:
-    """Take beams off the receiver; needs no authority."""
+    """Move beams off the receiver; needs no command authority."""
     _give(context, "DEFOCUS", _names(heliostats, everybody), (), wait)
 
 
@@ -512,7 +534,7 @@ def command(
     ] = None,
     wait: Wait = 60.0,
 ) -> None:
-    """Take the authority, give a command, wait for its end, and release the authority."""
+    """Take the command authority, give a command, wait for completion, and release it."""
     _give(context, name.upper(), _names(heliostats, everybody), tuple(value or ()), wait)
 
 
@@ -529,17 +551,22 @@ def aim(
         typer.Option(
             min=-1e5,
             max=1e5,
-            help="On the unrolled receiver, right of its middle as seen from outside, m.",
+            help="Point on the unrolled receiver, right of its middle as seen from outside, m.",
             show_default=False,
         ),
     ] = None,
     up: Annotated[
         float | None,
-        typer.Option(min=-1e5, max=1e5, help="The same above its middle, m.", show_default=False),
+        typer.Option(
+            min=-1e5,
+            max=1e5,
+            help="Point on the unrolled receiver, above its middle, m.",
+            show_default=False,
+        ),
     ] = None,
     wait: Wait = 60.0,
 ) -> None:
-    """Aim heliostats at a receiver or a point of it, a target, standby or a point."""
+    """Aim heliostats at a receiver or a point on it, a target, standby or a point in space."""
     names = _names(heliostats, everybody)
     order: dict[str, Any] = {"heliostats": names, "where": where}
     if where == "standby":
@@ -559,15 +586,16 @@ def aim(
 def emergency(
     context: typer.Context,
     act: Annotated[str, typer.Option(help="DEFOCUS or STOW.")] = "DEFOCUS",
-    reason: Annotated[str, typer.Option(help="Reason, for the audit.")] = "",
+    reason: Annotated[str, typer.Option(help="Reason, recorded in the audit.")] = "",
     withdraw: Annotated[
         bool, typer.Option("--withdraw", help="Withdraw your order instead.")
     ] = False,
     owner: Annotated[
-        str, typer.Option(help="With --withdraw, as an engineer: whose order to withdraw.")
+        str,
+        typer.Option(help="With --withdraw, as an engineer: the person whose order to withdraw."),
     ] = "",
 ) -> None:
-    """Take all beams off the receiver now."""
+    """Move all beams off the receiver now."""
     with _client(context) as client:
         if withdraw:
             answer = client.ask("DELETE", "emergency", {"owner": owner})
@@ -612,19 +640,26 @@ def calibration(
 def calibrate(
     context: typer.Context,
     heliostats: Annotated[list[str], typer.Argument(help="Heliostats.")],
-    target: Annotated[str, typer.Option(help="Target; any if left out.")] = "",
+    target: Annotated[str, typer.Option(help="Target; default: any.")] = "",
     search: Annotated[
-        bool, typer.Option("--search", help="Only search its beam with the camera.")
+        bool, typer.Option("--search", help="Only search for the beam with the camera.")
     ] = False,
     together: Annotated[
-        bool, typer.Option("--together", help="All at once on one target, in a joint visit.")
+        bool,
+        typer.Option(
+            "--together", help="Calibrate all of them together on one target, in a joint visit."
+        ),
     ] = False,
     receiver: Annotated[
-        bool, typer.Option("--receiver", help="All at once where they shine, in a receiver visit.")
+        bool,
+        typer.Option(
+            "--receiver",
+            help="Calibrate all of them while they track the receiver, in a receiver visit.",
+        ),
     ] = False,
     wait: Wait = 3600.0,
 ) -> None:
-    """Have automatic control calibrate heliostats next, and wait for the results."""
+    """Let automatic control calibrate heliostats next, and wait for the results."""
     if search and (together or receiver):
         raise InputError("calibrate: --search looks for one beam; leave out --together, --receiver")
     if receiver and (together or target):
@@ -647,12 +682,14 @@ def error_parameters(
     values: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME=VALUE]…", help="New values; none: show them.", show_default=False
+            metavar="[NAME=VALUE]…",
+            help="New values; default: show the present values.",
+            show_default=False,
         ),
     ] = None,
-    reason: Annotated[str, typer.Option(help="Reason, kept with the values.")] = "",
+    reason: Annotated[str, typer.Option(help="Reason, stored with the values.")] = "",
     version: Annotated[
-        int, typer.Option(min=0, max=1_000_000_000, help="Bring back this earlier version.")
+        int, typer.Option(min=0, max=1_000_000_000, help="Restore this earlier version.")
     ] = 0,
     wait: Wait = 60.0,
     as_json: Json = False,
@@ -798,12 +835,15 @@ def versions(
     second: Annotated[
         int | None,
         typer.Argument(
-            min=0, max=1_000_000_000, help="Else the version in use.", show_default=False
+            min=0,
+            max=1_000_000_000,
+            help="Second version; default: the version in use.",
+            show_default=False,
         ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare two versions of a heliostat's error parameters, and the change of its beam."""
+    """Compare two versions of a heliostat's error parameters, and their effect on its beam."""
     path = f"heliostats/{quote(heliostat, safe='')}"
     with _client(context) as client:
         if second is None:
@@ -849,10 +889,10 @@ def photograph(
 def photographs(
     context: typer.Context,
     heliostat: Annotated[
-        str, typer.Argument(help="Heliostat; those that persons asked for if left out.")
+        str, typer.Argument(help="Heliostat; default: photographs requested by operators.")
     ] = "",
     limit: Annotated[
-        int, typer.Option(min=1, max=10_000, help="Newest ones, at most this many.")
+        int, typer.Option(min=1, max=10_000, help="Maximum number of photographs, newest first.")
     ] = 50,
     save: Annotated[
         Path | None,
@@ -863,7 +903,7 @@ def photographs(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """List the kept photographs of a heliostat, each with the result of its visit."""
+    """List the stored photographs of a heliostat, each with the result of its visit."""
     if save is not None and not heliostat:
         raise InputError("ctl photographs: --save needs the heliostat whose calibration it is")
     with _client(context) as client:
@@ -915,10 +955,12 @@ def _save_calibration(
 def frames(
     context: typer.Context,
     cluster: Annotated[str, typer.Argument(help="Cluster.")],
-    heliostat: Annotated[str, typer.Option(help="Only its frames, and those to all.")] = "",
+    heliostat: Annotated[
+        str, typer.Option(help="Only frames to and from this heliostat, and broadcasts.")
+    ] = "",
     as_json: Json = False,
 ) -> None:
-    """Record the frames of a cluster's bus for five seconds, and print them decoded."""
+    """Record the frames on a cluster's bus for five seconds, and print them decoded."""
     from urllib.parse import quote
 
     with _client(context) as client:
@@ -949,7 +991,7 @@ def flight(
     file: Annotated[Path, typer.Argument(help="flight.json of `heliotrope drone evaluate`.")],
     name: Annotated[str, typer.Option(help="Another name for the flight.")] = "",
 ) -> None:
-    """Give a drone's flight to the plant, which fits all its mirrors together; nothing moves."""
+    """Import a drone flight; the plant fits all its heliostats together, and nothing moves."""
     from heliotrope.calibration.flights import read_flight
 
     document = read_flight(file).model_dump()
@@ -976,7 +1018,7 @@ def learn(
         str, typer.Option(help="Group of the plant file.", show_default="all groups")
     ] = "",
 ) -> None:
-    """Learn drift, noise and installation of the mirrors now, as at night; nothing moves."""
+    """Learn drift, noise and installation errors now, as at night; nothing moves."""
     with _client(context) as client:
         answer = client.ask("POST", "learning", {"group": group})
     for entry in answer:
@@ -988,10 +1030,10 @@ def learn(
 def timetable(
     context: typer.Context,
     name: Annotated[
-        str, typer.Argument(help="Entry to set or remove; none: show all.", show_default=False)
+        str, typer.Argument(help="Entry to set or remove; default: show all.", show_default=False)
     ] = "",
     heliostats: Whom = None,
-    target: Annotated[str, typer.Option(help="Target; any if left out.")] = "",
+    target: Annotated[str, typer.Option(help="Target; default: any.")] = "",
     at: Annotated[
         list[str] | None,
         typer.Option(help="Time of day: 08:30Z, 10:30+02:00.", show_default=False),
@@ -1002,17 +1044,18 @@ def timetable(
     rule: Annotated[
         str,
         typer.Option(
-            help="Instead of times: first (before others) or never (only by persons).",
+            help="Instead of times: first (before others) or never (only when an operator "
+            "requests it).",
             show_default=False,
         ),
     ] = "",
     remove: Annotated[bool, typer.Option("--remove", help="Remove the entry.")] = False,
     plant_file: Annotated[
-        bool, typer.Option("--plant-file", help="Put the plant file's timetable in force again.")
+        bool, typer.Option("--plant-file", help="Restore the timetable of the plant file.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Show or change the calibrations at times of day and at intervals."""
+    """Show or change the calibrations scheduled at times of day and at intervals."""
     gives = bool(heliostats or target or at or every or rule)
     if plant_file and (name or gives or remove):
         raise InputError("ctl timetable: --plant-file goes alone")
@@ -1059,10 +1102,11 @@ def reading(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Reading of the safety table.")],
     value: Annotated[
-        float, typer.Argument(min=-1e9, max=1e9, help="Value, made now, in the unit of its row.")
+        float,
+        typer.Argument(min=-1e9, max=1e9, help="Value, measured now, in the unit of its row."),
     ],
 ) -> None:
-    """Give a reading of a sensor to the safety table, where the links file says "api"."""
+    """Submit a sensor reading to the safety table, if the links file says "api"."""
     from urllib.parse import quote
 
     with _client(context) as client:
@@ -1073,7 +1117,7 @@ def reading(
 @app.command("out-of-service")
 def out_of_service(
     context: typer.Context,
-    reason: Annotated[str, typer.Option(help="Reason, shown to everybody.")],
+    reason: Annotated[str, typer.Option(help="Reason, shown to all users.")],
     heliostats: Whom = None,
     targets: LockedTargets = None,
     receivers: LockedReceivers = None,
@@ -1081,12 +1125,15 @@ def out_of_service(
     hours: Annotated[
         float | None,
         typer.Option(
-            min=0.01, max=87_600, help="Hours until they are expected back.", show_default=False
+            min=0.01,
+            max=87_600,
+            help="Hours until the expected return to service.",
+            show_default=False,
         ),
     ] = None,
     wait: Wait = 600.0,
 ) -> None:
-    """Put your lock on heliostats, targets, receivers or the tower; wait until all is parked."""
+    """Lock heliostats, targets, receivers or the tower; wait until all are parked."""
     order = {**_places(heliostats, targets, receivers, tower), "reason": reason, "hours": hours}
     with _client(context) as client:
         _follow_all(client, [client.ask("POST", "holds", order)], wait)
@@ -1100,11 +1147,11 @@ def give_back(
     receivers: LockedReceivers = None,
     tower: LockedTower = False,
     owner: Annotated[
-        str, typer.Option(help="As an engineer: whose lock to remove; needs --reason.")
+        str, typer.Option(help="As an engineer: the person whose lock to remove; needs --reason.")
     ] = "",
     reason: Annotated[str, typer.Option(help="Why another person's lock is removed.")] = "",
 ) -> None:
-    """Return your locks; nothing moves. In service again once nobody's lock is left."""
+    """Remove your locks; nothing moves. An object is in service when nobody's lock is left."""
     order = {**_places(heliostats, targets, receivers, tower), "owner": owner, "reason": reason}
     with _client(context) as client:
         print_json(client.ask("POST", "holds/release", order))

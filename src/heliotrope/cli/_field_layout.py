@@ -23,18 +23,18 @@ def layout(
     pivot: Annotated[
         float | None,
         typer.Option(
-            min=0.01, max=50, help="Height of the pivots, m; default 0.7 above half a mirror."
+            min=0.01, max=50, help="Height of the pivots, m; default: half a mirror plus 0.7."
         ),
     ] = None,
     clearance: Annotated[
-        float, typer.Option(min=0, max=50, help="Gap between two mirrors in any pose, m.")
+        float, typer.Option(min=0, max=50, help="Clearance between two mirrors in any pose, m.")
     ] = 0.3,
     tower: Annotated[
         float | None,
         typer.Option(
             min=1,
             max=1000,
-            help="Receiver above the pivots, m; default in proportion to the field.",
+            help="Height of the receiver above the pivots, m; default: in proportion to the field.",
         ),
     ] = None,
     latitude: Annotated[
@@ -46,8 +46,10 @@ def layout(
     altitude: Annotated[
         float, typer.Option(min=-500, max=9000, help="Altitude of the site, m.")
     ] = 830.0,
-    name: Annotated[str, typer.Option(help="Name of the plant; default the kind.")] = "",
-    table: Annotated[str, typer.Option(help="Table of heliostats: csv or parquet.")] = "csv",
+    name: Annotated[str, typer.Option(help="Name of the plant; default: the kind of layout.")] = "",
+    table: Annotated[
+        str, typer.Option(help="Format of the heliostat table: csv or parquet.")
+    ] = "csv",
     picture: Annotated[
         Path | None, typer.Option(help="Draw the field to this file (PNG, SVG or PDF).")
     ] = None,

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from heliotrope.links.keys import KeyFile
 
 app = typer.Typer(
-    help="Make and replace the keys of the links between plant and clusters.",
+    help="Create and replace the keys of the links between plant and clusters.",
     no_args_is_help=True,
 )
 
@@ -20,21 +20,23 @@ PlantFile = Annotated[Path, typer.Argument(help="Key file of the plant.")]
 Clusters = Annotated[list[str], typer.Argument(help="Names of clusters.")]
 FolderOption = Annotated[
     Path,
-    typer.Option("--to", help="Folder for the files that carry the new keys to the clusters."),
+    typer.Option(
+        "--to", help="Folder for the files in which the new keys are carried to the clusters."
+    ),
 ]
 
 
 bus_app = typer.Typer(
-    help="Make and replace the key that signs the frames of a bus.", no_args_is_help=True
+    help="Create and replace the key that signs the frames on a bus.", no_args_is_help=True
 )
 app.add_typer(bus_app, name="bus")
 
-BusFile = Annotated[Path, typer.Argument(help="File of the key, as the cluster file names it.")]
+BusFile = Annotated[Path, typer.Argument(help="Key file, as named in the cluster file.")]
 
 
 @app.callback()
 def _root() -> None:
-    """Make and replace the keys of the links between plant and clusters."""
+    """Create and replace the keys of the links between plant and clusters."""
 
 
 def _open(path: Path) -> "KeyFile":
@@ -51,7 +53,7 @@ def _open(path: Path) -> "KeyFile":
 
 @app.command()
 def new(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
-    """Make a key for each cluster, in the plant's file and in one to carry to the cluster."""
+    """Create a key per cluster, in the plant's key file and in a file to carry to the cluster."""
     from heliotrope.links.keys import carried_files
 
     keys = _open(file)
@@ -62,7 +64,7 @@ def new(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
 
 @app.command()
 def rotate(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
-    """Make a second key for each cluster; plant and cluster may both keep running."""
+    """Create a second key for each cluster; plant and cluster may both keep running."""
     from heliotrope.links.keys import carried_files
 
     keys = _open(file)
@@ -74,9 +76,9 @@ def rotate(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
 @app.command()
 def take(
     file: Annotated[Path, typer.Argument(help="Key file of the cluster.")],
-    carried: Annotated[Path, typer.Argument(help="File that keys new or keys rotate made.")],
+    carried: Annotated[Path, typer.Argument(help="File created by keys new or keys rotate.")],
 ) -> None:
-    """Take a carried key into the cluster's file, beside the old one if there is one."""
+    """Import a carried key into the cluster's key file, beside the old key if there is one."""
     from heliotrope.errors import InputError
     from heliotrope.links.keys import fingerprint
 
@@ -95,7 +97,7 @@ def end(
         list[str] | None, typer.Argument(help="Names of clusters; default: all with an old key.")
     ] = None,
 ) -> None:
-    """Remove the old keys: from now on only the new ones are accepted."""
+    """Remove the old keys, so that only the new ones are accepted."""
     ended = _open(file).end(names or [])
     print(f"{file}: old keys removed: {', '.join(ended)}")
 
@@ -105,7 +107,7 @@ def list_(
     file: Annotated[Path, typer.Argument(help="Key file of the plant or of a cluster.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print whose keys a file has, by fingerprints that reveal nothing; the newest first."""
+    """List whose keys a file contains, by fingerprints that reveal nothing; newest first."""
     from heliotrope.errors import InputError
     from heliotrope.links.keys import fingerprint
 
@@ -121,18 +123,18 @@ def list_(
 
 @app.command()
 def tls(
-    folder: Annotated[Path, typer.Argument(help="Folder of the keys and certificates.")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the keys and certificates.")],
     name: Annotated[
-        list[str], typer.Option(help="Host name or address that people type; repeat it.")
+        list[str], typer.Option(help="Host name or address that users type; may be repeated.")
     ],
     days: Annotated[
         int, typer.Option(min=1, max=825, help="Validity of the certificate, days.")
     ] = 825,
     request: Annotated[
-        bool, typer.Option("--request", help="Make a request to another authority instead.")
+        bool, typer.Option("--request", help="Create a request to another authority instead.")
     ] = False,
 ) -> None:
-    """Make or renew the console's certificate, under a private authority that is made once."""
+    """Create or renew the console's certificate, under a private authority that is created once."""
     from heliotrope.cli._common import parse_time
     from heliotrope.errors import InputError
 
@@ -170,7 +172,7 @@ def _bus(path: Path) -> "BusKeyFile":
 
 @bus_app.command(name="new")
 def bus_new(file: BusFile) -> None:
-    """Make the key of a bus; the cluster gives it to its local controllers."""
+    """Create the bus key; the cluster distributes it to its local controllers."""
     keys = _bus(file)
     keys.new()
     _show(keys)
@@ -178,7 +180,7 @@ def bus_new(file: BusFile) -> None:
 
 @bus_app.command(name="rotate")
 def bus_rotate(file: BusFile) -> None:
-    """Make a second key beside the present one; the cluster keeps running."""
+    """Create a second key beside the present one; the cluster keeps running."""
     keys = _bus(file)
     keys.rotate()
     _show(keys)
@@ -186,7 +188,7 @@ def bus_rotate(file: BusFile) -> None:
 
 @bus_app.command(name="end")
 def bus_end(file: BusFile) -> None:
-    """Remove the old key, once the new one signs."""
+    """Remove the old key, once frames are signed with the new one."""
     keys = _bus(file)
     keys.end()
     _show(keys)
@@ -194,7 +196,7 @@ def bus_end(file: BusFile) -> None:
 
 @bus_app.command(name="off")
 def bus_off(file: BusFile) -> None:
-    """Remove all keys; the cluster takes them from its local controllers, while these stand."""
+    """Remove all keys; the cluster removes them from local controllers that are at rest."""
     keys = _bus(file)
     keys.off()
     print(f"{file}: no key; local controllers lose theirs while their mirrors stand")
@@ -202,7 +204,7 @@ def bus_off(file: BusFile) -> None:
 
 @bus_app.command(name="list")
 def bus_list(file: BusFile) -> None:
-    """Print the keys by fingerprints that reveal nothing, the newest first."""
+    """List the keys by fingerprints that reveal nothing, newest first."""
     from heliotrope.errors import InputError
 
     if not file.exists():

@@ -9,7 +9,7 @@ from heliotrope.cli._common import parse_time, print_json, print_table
 from heliotrope.cli._noted import note_use, this_person
 
 app = typer.Typer(
-    help="Look at, back up, restore and export the store of a plant.", no_args_is_help=True
+    help="Inspect, back up, restore and export the store of a plant.", no_args_is_help=True
 )
 
 #: Ending of an audit in a file, as the library's `JsonLines` writes it.
@@ -25,7 +25,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 @app.callback()
 def _root() -> None:
-    """Look at, back up, restore and export the store of a plant."""
+    """Inspect, back up, restore and export the store of a plant."""
 
 
 @app.command()
@@ -54,17 +54,17 @@ def info(place: Place, as_json: JsonOption = False) -> None:
 @app.command()
 def backup(
     place: Place,
-    to: Annotated[Path, typer.Option("--to", help="Folder to make.")],
+    to: Annotated[Path, typer.Option("--to", help="Folder to create.")],
     telemetry: TelemetryOption = None,
     without_telemetry: Annotated[
         bool, typer.Option("--without-telemetry", help="Leave the telemetry out.")
     ] = False,
     sign: Annotated[
-        Path | None, typer.Option(help="Private key that `store key` made: signs the backup.")
+        Path | None, typer.Option(help="Private key created by `store key`, to sign the backup.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a backup; the plant may keep running."""
+    """Create a backup; the plant may keep running."""
     from heliotrope.store import backup as backups
     from heliotrope.store.database import Database
     from heliotrope.store.signing import SigningKey
@@ -83,14 +83,18 @@ def restore(
     place: Place,
     telemetry: TelemetryOption = None,
     key: Annotated[
-        Path | None, typer.Option(help="Public key (FILE.pub) that must have signed the backup.")
+        Path | None,
+        typer.Option(help="Public key (FILE.pub) that must match the signature of the backup."),
     ] = None,
     unsigned: Annotated[
-        bool, typer.Option("--unsigned", help="Restore it whoever made it; no key is asked for.")
+        bool,
+        typer.Option(
+            "--unsigned", help="Restore it whoever made it, without checking a signature."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a backup and restore it into an empty place."""
+    """Check a backup and restore it to an empty destination."""
     from heliotrope.errors import InputError
     from heliotrope.store import backup as backups
     from heliotrope.store.database import Database
@@ -110,9 +114,9 @@ def restore(
 
 @app.command()
 def key(
-    file: Annotated[Path, typer.Argument(help="File to make; the public key becomes FILE.pub.")],
+    file: Annotated[Path, typer.Argument(help="File to create; the public key is FILE.pub.")],
 ) -> None:
-    """Make the key that signs backups: the private one stays here, the public one checks."""
+    """Create the key pair for backups: the private key signs, the public key checks."""
     from heliotrope.store.signing import make_key
 
     print(f"{file}: private key; {make_key(file)}: give it to those who restore")
@@ -121,12 +125,12 @@ def key(
 @app.command()
 def export(
     place: Place,
-    to: Annotated[Path, typer.Option("--to", help="Folder to make.")],
+    to: Annotated[Path, typer.Option("--to", help="Folder to create.")],
     heliostat: Annotated[
-        list[str] | None, typer.Option(help="Only these; may be given several times.")
+        list[str] | None, typer.Option(help="Only these heliostats; may be repeated.")
     ] = None,
 ) -> None:
-    """Write every step of the calibrations as CSV, one folder for each heliostat."""
+    """Write every calibration step as CSV, one folder per heliostat."""
     from heliotrope.store import export as exports
     from heliotrope.store.database import Database
 
@@ -138,7 +142,7 @@ def export(
 
 @app.command()
 def migrate(place: Place) -> None:
-    """Bring the tables of a store up to date; the plant must be stopped."""
+    """Migrate the tables of a store to the current version; the plant must be stopped."""
     from heliotrope.store import backup as backups
     from heliotrope.store.database import HEAD
 
@@ -153,9 +157,9 @@ def migrate(place: Place) -> None:
 @app.command()
 def purge(
     folder: Annotated[Path, typer.Argument(help="Data folder of a plant that is stopped.")],
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
 ) -> None:
-    """Overwrite and remove all that a plant keeps, for a machine that leaves service."""
+    """Overwrite and remove all data of a plant, before its computer is decommissioned."""
     from heliotrope.store.purge import purge as remove
 
     if not yes:
@@ -168,7 +172,7 @@ def purge(
 
 @app.command()
 def head(place: Place) -> None:
-    """Print the heads of the hash chains: note them on another machine."""
+    """Print the heads of the hash chains, to be noted on another computer."""
     if place.endswith(_LINES):
         from heliotrope.plant.orders import audit
 
@@ -189,12 +193,12 @@ def verify(
     head: Annotated[
         list[str] | None,
         typer.Option(
-            help="File of exported heads (heads, or a log of syslog), or what `store head` printed "
-            "before; may be given several times."
+            help="File of exported heads (heads, or a syslog file), or the output of an "
+            "earlier `store head`; may be repeated."
         ),
     ] = None,
 ) -> None:
-    """Check that nobody added, altered or removed events, audit, accounts or tokens."""
+    """Check that no events, audit records, accounts or tokens were added, altered or removed."""
     from heliotrope.store import chain
     from heliotrope.store.database import Database
     from heliotrope.store.digests import Head

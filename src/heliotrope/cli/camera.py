@@ -46,12 +46,13 @@ def calibrate(
         float | None, typer.Option(min=0.001, max=100, help="Side of its squares, m.")
     ] = None,
     anew: Annotated[
-        bool, typer.Option("--anew", help="From marks: solve for a known lens again.")
+        bool,
+        typer.Option("--anew", help="With marks: solve for the lens again even if it is known."),
     ] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate a lens by a chessboard, or lens and pose by the marks of targets."""
+    """Calibrate a lens with a chessboard, or lens and pose from the marks of targets."""
     if (chessboard is None) != (square is None):
         raise InputError("--chessboard and --square go together: --chessboard 9x6 --square 0.03")
     board = None if chessboard is None or square is None else (_pattern(chessboard), square)
@@ -198,18 +199,18 @@ def _from_marks(
 
 @app.command()
 def teach(
-    plant: Annotated[Path, typer.Argument(help="Plant file, or a folder in PAINT's form.")],
+    plant: Annotated[Path, typer.Argument(help="Plant file, or a folder in PAINT's format.")],
     image: Annotated[Path, typer.Argument(help="A picture of the target.")],
     target: Annotated[str, typer.Option("--target", help="Name of the target.")],
     at: Annotated[
         list[str] | None,
-        typer.Option(help="Place of a point, NAME=X,Y in pixels; give four or more."),
+        typer.Option(help="Position of a point, NAME=X,Y in pixels; at least four points."),
     ] = None,
     click: Annotated[bool, typer.Option("--click", help="Click the points in a browser.")] = False,
     kind: Annotated[
         list[str] | None,
         typer.Option(
-            help="Marks at the points: corner, tee, square, disc or picture; "
+            help="Kind of mark at the points: corner, tee, square, disc or picture; "
             "NAME=KIND for one point."
         ),
     ] = None,
@@ -222,13 +223,16 @@ def teach(
     ] = None,
     camera: Annotated[str, typer.Option("--camera", help="Name of the camera.")] = "camera",
     sigma_px: Annotated[
-        float, typer.Option(min=0.001, max=1000, help="Error of the given points, px.")
+        float,
+        typer.Option(min=0.001, max=1000, help="Standard deviation of the specified points, px."),
     ] = 1.0,
-    anew: Annotated[bool, typer.Option("--anew", help="Solve for a known lens again.")] = False,
+    anew: Annotated[
+        bool, typer.Option("--anew", help="Solve for the lens again even if it is known.")
+    ] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Point out a target's points in one picture; gives its marks and the camera's pose."""
+    """Mark a target's points in one picture, to obtain its marks and the camera pose."""
     from heliotrope.imaging.targets import teaching
 
     place = _place_to_write(plant, out)
@@ -374,26 +378,26 @@ def receiver(
     camera: Annotated[str, typer.Option("--camera", help="Name of the camera.")],
     capped: Annotated[list[Path], typer.Option(help="Pictures with the lens capped.")],
     dark: Annotated[
-        list[Path], typer.Option(help="Pictures by day without a beam on the receiver.")
+        list[Path], typer.Option(help="Pictures in daylight without a beam on the receiver.")
     ],
     lit: Annotated[
         list[str],
-        typer.Option(help="Picture with beams, FILE=SHARE of the nominal flux, as a.png=0.1."),
+        typer.Option(help="Picture with beams, FILE=FRACTION of the nominal flux, as a.png=0.1."),
     ],
     out: Annotated[Path, typer.Option("--out", help="File to write (TOML), with a PNG beside it.")],
     outline: Annotated[
         list[str] | None,
         typer.Option(
-            help="Corner of the receiver in the picture, X,Y in pixels, in order around it; "
-            "default: by the camera's position."
+            help="Corner of the receiver in the picture, X,Y in pixels, in order around "
+            "it; default: from the camera position."
         ),
     ] = None,
     gamma: Annotated[
-        float, typer.Option(min=0.1, max=10, help="Of the camera's response; 1: linear.")
+        float, typer.Option(min=0.1, max=10, help="Gamma of the camera response; 1: linear.")
     ] = 1.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Take the reference for a camera's measurements of the flux on the receiver."""
+    """Create the reference for a camera that measures the flux on the receiver."""
     from heliotrope.imaging.receiver_file import write_reference
     from heliotrope.imaging.receiver_light import ReceiverSight, take_reference
     from heliotrope.imaging.sources import average
@@ -464,7 +468,7 @@ def _lit_frame(text: str) -> "tuple[Frame, float]":
 
 @app.command()
 def show(
-    plant: Annotated[Path, typer.Argument(help="Plant file, or a folder in PAINT's form.")],
+    plant: Annotated[Path, typer.Argument(help="Plant file, or a folder in PAINT's format.")],
     as_json: JsonOption = False,
 ) -> None:
     """Print the cameras of a plant and their views of its targets."""

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 def cluster(
     config: Annotated[Path, typer.Argument(help="Cluster file (TOML).")],
-    check: Annotated[bool, typer.Option("--check", help="Only read the file.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Only check the file.")] = False,
     every: Annotated[
-        float, typer.Option(min=1, max=86_400, help="Seconds between lines of the log.")
+        float, typer.Option(min=1, max=86_400, help="Interval between log lines, s.")
     ] = 10.0,
 ) -> None:
     """Run a cluster of heliostats until SIGTERM or Ctrl-C; it then defocuses them."""

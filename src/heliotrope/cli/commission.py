@@ -26,11 +26,13 @@ def commission(
     begin: Annotated[
         str, typer.Option("--from", help="ISO 8601 with a time zone, or now.")
     ] = "now",
-    days: Annotated[float, typer.Option(min=0.01, max=3660, help="Length of the span.")] = 3.0,
+    days: Annotated[float, typer.Option(min=0.01, max=3660, help="Length of the plan.")] = 3.0,
     goal_mrad: Annotated[
         float,
         typer.Option(
-            min=0.001, max=1000, help="Beam error that 90 % of the mirrors shall not exceed, mrad."
+            min=0.001,
+            max=1000,
+            help="Beam error that 90 % of the heliostats must not exceed, mrad.",
         ),
     ] = 0.6,
     installed_mrad: Annotated[
@@ -47,7 +49,7 @@ def commission(
         typer.Option(
             min=1,
             max=1000,
-            help="Mirrors of a later joint visit. Default: the plant file's; 1: none.",
+            help="Heliostats per later joint visit. Default: the plant file's; 1: none.",
         ),
     ] = None,
     first: Annotated[
@@ -55,39 +57,37 @@ def commission(
         typer.Option(
             min=0,
             max=1000,
-            help="Mirrors of a joint first visit. Default: the plant file's; 0: alone.",
+            help="Heliostats per joint first visit. Default: the plant file's; 0: single visits.",
         ),
     ] = None,
-    step: Annotated[str, typer.Option(help="Time of each photograph of a joint visit.")] = "2.2s",
-    shots: Annotated[
-        int, typer.Option(min=1, max=1000, help="Photographs of a visit of one mirror.")
-    ] = 3,
-    interval: Annotated[str, typer.Option(help="Time of each.")] = "20s",
-    settle: Annotated[str, typer.Option(help="Time of a visit beside the photographs.")] = "20s",
-    look: Annotated[str, typer.Option(help="Time of a further look for a lost beam.")] = "20s",
+    step: Annotated[str, typer.Option(help="Time per photograph in a joint visit.")] = "2.2s",
+    shots: Annotated[int, typer.Option(min=1, max=1000, help="Photographs in a single visit.")] = 3,
+    interval: Annotated[str, typer.Option(help="Time per photograph.")] = "20s",
+    settle: Annotated[str, typer.Option(help="Time of a visit excluding the photographs.")] = "20s",
+    look: Annotated[str, typer.Option(help="Time of each further search for a lost beam.")] = "20s",
     sigma_mrad: Annotated[
         float,
-        typer.Option(min=0.001, max=1000, help="Accuracy of a photograph in each direction, mrad."),
+        typer.Option(min=0.001, max=1000, help="Accuracy of a photograph per direction, mrad."),
     ] = 0.5,
     sigma_together_mrad: Annotated[
         float,
-        typer.Option(
-            min=0.001, max=1000, help="Accuracy of visits of several in each direction, mrad."
-        ),
+        typer.Option(min=0.001, max=1000, help="Accuracy of joint visits per direction, mrad."),
     ] = 0.22,
     repeat_mrad: Annotated[
         float,
         typer.Option(
-            min=0, max=1000, help="What a visit does not repeat, in each direction, mrad."
+            min=0,
+            max=1000,
+            help="Error that is not repeatable between visits, per direction, mrad.",
         ),
     ] = 0.0,
     drone: Annotated[
         int,
         typer.Option(
-            min=0, max=1000, help="Fly a drone first, with this many poses of each mirror."
+            min=0, max=1000, help="Fly a drone first, with this many poses per heliostat."
         ),
     ] = 0,
-    drones: Annotated[int, typer.Option(min=1, max=50, help="Drones that fly at once.")] = 1,
+    drones: Annotated[int, typer.Option(min=1, max=50, help="Drones flying at the same time.")] = 1,
     model: Annotated[
         str, typer.Option(help="auto, jacks, malan8, guo6, khalsa8 or full.")
     ] = "auto",
@@ -95,7 +95,7 @@ def commission(
         Path | None, typer.Option(help="Table of the sightings made so far.")
     ] = None,
     clear: Annotated[
-        float, typer.Option(min=0.01, max=1, help="Share of the time without clouds.")
+        float, typer.Option(min=0.01, max=1, help="Fraction of the time without clouds.")
     ] = 1.0,
     every: Annotated[str, typer.Option(help="Interval at which gains are computed.")] = "30m",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,

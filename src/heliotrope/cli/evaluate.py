@@ -19,7 +19,7 @@ def evaluate(
     place: shared.Place,
     split: shared.SplitOption = "random",
     fraction: Annotated[
-        float, typer.Option(min=0.01, max=0.999, help="Share of the sightings to learn from.")
+        float, typer.Option(min=0.01, max=0.999, help="Fraction of the sightings to learn from.")
     ] = 0.7,
     seed: shared.SeedOption = 0,
     model: shared.ModelOption = "auto",
@@ -29,7 +29,10 @@ def evaluate(
     scheduler: shared.SchedulerOption = None,
     learner: Annotated[
         Literal["stream", "batch"],
-        typer.Option(help="How --split sequential learns on: one update each, or all afresh."),
+        typer.Option(
+            help="How --split sequential continues learning: by one update per sighting, or "
+            "from scratch each time."
+        ),
     ] = "stream",
     neighbours: Annotated[
         bool,

@@ -12,9 +12,9 @@ from heliotrope.errors import UnknownNameError
 def fetch(
     source: Annotated[str, typer.Argument(help="Data set: juelich (PAINT).")],
     heliostats: Annotated[list[str], typer.Argument(help="Names, for example AA39.")],
-    into: Annotated[Path, typer.Option(help="Folder to put the files in.")],
+    into: Annotated[Path, typer.Option(help="Folder for the files.")],
     base_url: Annotated[
-        str | None, typer.Option(help="Address of a copy of the catalogue.")
+        str | None, typer.Option(help="Address of a mirror of the catalogue.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

@@ -12,12 +12,12 @@ _SUNS = ((0.0, 65.0), (0.0, 40.0), (90.0, 30.0), (-70.0, 20.0))
 #: How far from the receiver beams are followed there, m.
 _AROUND = 100.0
 
-app = typer.Typer(help="Make and check plant files.", no_args_is_help=True)
+app = typer.Typer(help="Create and check plant files.", no_args_is_help=True)
 
 
 @app.callback()
 def _root() -> None:
-    """Make and check plant files."""
+    """Create and check plant files."""
 
 
 @app.command()
@@ -25,7 +25,7 @@ def check(
     file: Annotated[Path, typer.Argument(help="Plant file (TOML).")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print everything that is wrong or strange in a plant file; exit code 2 if it cannot run."""
+    """Print all errors and warnings in a plant file; exit code 2 if the plant cannot run."""
     from heliotrope.field.formats import plant_file
     from heliotrope.plant.field.aims import BeamCheck
 
@@ -58,9 +58,9 @@ def safety(
     file: Annotated[Path, typer.Argument(help="Plant file (TOML).")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print the numbers of the safety table that a plant may set, with defaults and ranges.
+    """Print the safety-table limits that a plant may set, with defaults and ranges.
 
-    An asterisk marks those that the tables [safety.CONDITION] of its file change.
+    An asterisk marks limits changed by the tables [safety.CONDITION] of the plant file.
     """
     from heliotrope.field.formats import plant_file
     from heliotrope.safety import CONDITIONS, limited, settings_of
@@ -100,10 +100,11 @@ def defocus(
     file: Annotated[Path, typer.Argument(help="Plant file (TOML).")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print how hot the air beside the receiver is after a DEFOCUS of the whole field.
+    """Print how intense the light beside the receiver is after a field-wide DEFOCUS.
 
-    In suns, at the hottest place: with all mirrors turned by the same angles, and as the file
-    spreads them; then how far from the receiver's centre more than 10 suns reach.
+    In suns, at the most intense point: with all heliostats turned by the same angles, and as spread
+    by the plant file; and the distance from the receiver centre up to which there are more than 10
+    suns.
     """
     import numpy as np
 
@@ -149,7 +150,7 @@ def defocus(
 
 
 Plant = Annotated[Path, typer.Argument(help="Plant file (TOML).")]
-Note = Annotated[str, typer.Option(help="Reason, kept with the stored version.")]
+Note = Annotated[str, typer.Option(help="Reason, stored with the version.")]
 _RUNNING = (
     "a running plant reads its file at the start: stow the field, end the plant, "
     "`heliotrope run --check`, start it"
@@ -163,17 +164,19 @@ def change(
     values: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME=VALUE]…", help="New values; none: show them.", show_default=False
+            metavar="[NAME=VALUE]…",
+            help="New values; default: show the present values.",
+            show_default=False,
         ),
     ] = None,
     note: Note = "",
     dry: Annotated[bool, typer.Option("--dry-run", help="Check, but write nothing.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show or change the position, orientation or parameters of one thing; keep the old file.
+    """Show or change the position, orientation or parameters of one object; keep the old file.
 
-    Angles may be given in _mrad or _deg and lengths in _mm. Nothing is written if `field check`
-    would refuse the result.
+    Angles may be in _mrad or _deg and lengths in _mm. Nothing is written if `field check` would
+    reject the result.
     """
     from heliotrope.errors import InputError
     from heliotrope.field.formats import plant_edit
@@ -210,7 +213,7 @@ def versions(
     file: Plant,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """List the stored versions of a plant file, each with the change that ended it."""
+    """List the stored versions of a plant file, each with the change that replaced it."""
     from heliotrope.field.formats import plant_edit
 
     stored = plant_edit.versions(file)
@@ -226,10 +229,10 @@ def versions(
 @app.command()
 def restore(
     file: Plant,
-    version: Annotated[str, typer.Argument(help="A name of `heliotrope field versions`.")],
+    version: Annotated[str, typer.Argument(help="A name from `heliotrope field versions`.")],
     note: Note = "",
 ) -> None:
-    """Bring back a stored version of a plant file and its table; keep the present one."""
+    """Restore a stored version of a plant file and its table; keep the present one."""
     from heliotrope.field.formats import plant_edit
 
     kept = plant_edit.restore(file, version, note=note)

@@ -46,48 +46,59 @@ def flux(
     time: Annotated[
         str | None, typer.Option(help="ISO 8601 with a time zone, or now. Default: noon today.")
     ] = None,
-    sun: Annotated[str | None, typer.Option(help="East,north,up instead of a time.")] = None,
+    sun: Annotated[
+        str | None, typer.Option(help="Sun vector east,north,up instead of a time.")
+    ] = None,
     every: Annotated[
-        str | None, typer.Option(help="A table of the whole day, at this step, such as 30min.")
+        str | None,
+        typer.Option(help="Write a table of the whole day with this step, such as 30min."),
     ] = None,
     year: Annotated[
-        bool, typer.Option("--year", help="A table over the sun's positions in a year.")
+        bool, typer.Option("--year", help="Write a table over the sun positions of a year.")
     ] = False,
     receiver: Annotated[
-        list[str] | None, typer.Option(help="Name; may be repeated. Default: all.")
+        list[str] | None, typer.Option(help="Receiver; may be repeated. Default: all.")
     ] = None,
     aim: Annotated[
-        str | None, typer.Option(help="East,north,up, m. Default: own aims, else the receiver.")
+        str | None,
+        typer.Option(
+            help="Aim point east,north,up, m. Default: each heliostat's own aim, or the receiver."
+        ),
     ] = None,
     site: Annotated[
-        str | None, typer.Option(help="LATITUDE,LONGITUDE,HEIGHT of a field without a place.")
+        str | None, typer.Option(help="LATITUDE,LONGITUDE,HEIGHT of a field without a location.")
     ] = None,
-    dni: Annotated[float, typer.Option(min=0, max=2000, help="W/m².")] = 900.0,
+    dni: Annotated[
+        float, typer.Option(min=0, max=2000, help="Direct normal irradiance, W/m².")
+    ] = 900.0,
     shape: Annotated[
         str,
         typer.Option(
-            "--sun-shape", help="limb, quartic, pillbox, buie:RATIO or gaussian:SIGMA in rad."
+            "--sun-shape",
+            help="Sun shape: limb, quartic, pillbox, buie:RATIO or gaussian:SIGMA in rad.",
         ),
     ] = "limb",
     air: Annotated[
         str,
         typer.Option(
-            help="clear, hazy, mirval, ballestrin-clear, ballestrin-hazy, none, or the visibility "
-            "in km."
+            help="Atmosphere: clear, hazy, mirval, ballestrin-clear, ballestrin-hazy, "
+            "none, or the visibility in km."
         ),
     ] = "clear",
     slope_mrad: Annotated[
         float, typer.Option(min=0, max=50, help="Slope error of the surface per axis, mrad.")
     ] = 1.0,
     error_mrad: Annotated[
-        float, typer.Option(min=0, max=100, help="Expected error of the normals, mrad RMS.")
+        float, typer.Option(min=0, max=100, help="Expected error of the mirror normals, mrad RMS.")
     ] = 1.0,
-    reflectivity: Annotated[float, typer.Option(min=0, max=1, help="Of a clean mirror.")] = 0.9,
+    reflectivity: Annotated[
+        float, typer.Option(min=0, max=1, help="Reflectivity of a clean mirror.")
+    ] = 0.9,
     clean: Annotated[
-        float, typer.Option(min=0, max=1, help="Share of it that soiling leaves.")
+        float, typer.Option(min=0, max=1, help="Fraction of the reflectivity that soiling leaves.")
     ] = 1.0,
     focus: Annotated[
-        str, typer.Option(help="slant, flat, or the focal length of all mirrors, m.")
+        str, typer.Option(help="Focus: slant, flat, or the focal length of all mirrors, m.")
     ] = "slant",
     facets: Annotated[
         str | None, typer.Option(help="Columns and rows of equal facets, such as 5x7.")
@@ -95,8 +106,8 @@ def flux(
     canting: Annotated[
         str,
         typer.Option(
-            help="Of these facets: slant, a focal length in m, or the time at which they are "
-            "canted off axis."
+            help="Canting of these facets: slant, a focal length in m, or the time for "
+            "which they are canted off-axis."
         ),
     ] = "slant",
     cells: Annotated[
@@ -107,25 +118,30 @@ def flux(
         typer.Option(help="Obstacle: EAST,NORTH,RADIUS,TOP in m; may be repeated."),
     ] = None,
     rays: Annotated[
-        float, typer.Option(min=0, max=1e9, help="Trace this many rays as a second opinion.")
+        float, typer.Option(min=0, max=1e9, help="Trace this many rays as an independent check.")
     ] = 0.0,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Of the rays.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the rays.")] = 0,
     by: Annotated[
         Literal["cosine", "shading", "blocking", "lit", "mirror", "air", "intercept", "total"],
-        typer.Option(help="Efficiency that colours the field in the picture."),
+        typer.Option(help="Efficiency shown by colour in the picture."),
     ] = "total",
     csv: Annotated[
-        Path | None, typer.Option("--csv", help="File for the heliostats, or for the table.")
+        Path | None,
+        typer.Option("--csv", help="File for the heliostat table, or for the table over time."),
     ] = None,
     cells_csv: Annotated[
-        Path | None, typer.Option("--map", help="File for the cells, CSV.")
+        Path | None, typer.Option("--map", help="File for the flux map, CSV.")
     ] = None,
-    netcdf: Annotated[Path | None, typer.Option(help="File for both, NetCDF.")] = None,
+    netcdf: Annotated[
+        Path | None, typer.Option(help="File for heliostats and flux map, NetCDF.")
+    ] = None,
     sam: Annotated[Path | None, typer.Option(help="File for SAM, with --year.")] = None,
     solartherm: Annotated[
         Path | None, typer.Option(help="File for SolarTherm (.motab), with --year.")
     ] = None,
-    picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="File for the picture, .png, .svg or .pdf.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Show the flux on the receivers and the efficiencies of the field and of each heliostat."""

@@ -33,21 +33,21 @@ _OFTEN = 20
 
 def image(
     paths: Annotated[
-        list[str], typer.Argument(help="Photographs or folders; with --live one source.")
+        list[str], typer.Argument(help="Photographs or folders; with --live a single source.")
     ],
     plant: Annotated[
         Path, typer.Option(help="Plant file or folder, or PAINT's tower-measurements.json.")
     ],
-    target: Annotated[str, typer.Option(help="Target that the beam was sent to.")] = "",
+    target: Annotated[str, typer.Option(help="Target to which the beam was sent.")] = "",
     crop: Annotated[
         bool, typer.Option("--crop", help="Each picture shows exactly one target.")
     ] = False,
     camera: Annotated[str, typer.Option(help="Camera that took them.")] = "",
     empty: Annotated[
-        Path | None, typer.Option(help="Photograph of the same camera without the beam.")
+        Path | None, typer.Option(help="Photograph by the same camera without the beam.")
     ] = None,
     memory: Annotated[
-        Path | None, typer.Option(help="Folder of empty-target models, learnt with --live.")
+        Path | None, typer.Option(help="Folder of empty-target models, updated with --live.")
     ] = None,
     annotated: Annotated[Path | None, typer.Option(help="Folder for annotated pictures.")] = Path(
         "out/image"
@@ -59,11 +59,13 @@ def image(
         Path | None, typer.Option(help="Write the sightings to this CSV or Parquet table.")
     ] = None,
     log: Annotated[
-        Path | None, typer.Option(help="CSV: file or id, heliostat, motor positions, time.")
+        Path | None, typer.Option(help="CSV log: file or id, heliostat, motor positions, time.")
     ] = None,
-    heliostat: Annotated[str, typer.Option(help="Heliostat of the beam, without a log.")] = "",
+    heliostat: Annotated[
+        str, typer.Option(help="Heliostat that sends the beam, if there is no log.")
+    ] = "",
     processes: Annotated[
-        int, typer.Option(min=0, max=1024, help="Processes on this machine; 0: one per core.")
+        int, typer.Option(min=0, max=1024, help="Processes on this computer; 0: one per core.")
     ] = 0,
     scheduler: shared.SchedulerOption = None,
     live: Annotated[
@@ -75,7 +77,7 @@ def image(
         typer.Option(min=1, max=1_000_000_000, help="With --live: stop after this many frames."),
     ] = None,
     burst: Annotated[
-        int, typer.Option(min=1, max=1000, help="With --live: frames to average.")
+        int, typer.Option(min=1, max=1000, help="With --live: number of frames to average.")
     ] = 1,
     archive: Annotated[
         Path | None, typer.Option("--keep", help="With --live: folder for frames and results.")

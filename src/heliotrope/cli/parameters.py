@@ -18,7 +18,9 @@ def parameters(
         list[str],
         typer.Argument(help="NAME=VALUE: Guo's in °, the others in mrad; lengths in m."),
     ],
-    source: Annotated[Names, typer.Option("--from", help="Whose names the values have.")] = "guo",
+    source: Annotated[
+        Names, typer.Option("--from", help="Whose parameter names the values use.")
+    ] = "guo",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Convert error parameters of an azimuth-elevation heliostat."""

@@ -33,21 +33,22 @@ SHOWN = 20
 def plan(
     field: Annotated[Path, typer.Argument(metavar="PLANT", help="Plant file or PAINT folder.")],
     heliostat: Annotated[
-        list[str] | None, typer.Option(help="Name; may be repeated. Default: all.")
+        list[str] | None, typer.Option(help="Heliostat; may be repeated. Default: all.")
     ] = None,
     begin: Annotated[
         str, typer.Option("--from", help="ISO 8601 with a time zone, or now.")
     ] = "now",
     end: Annotated[str | None, typer.Option("--to", help="ISO 8601 with a time zone.")] = None,
     days: Annotated[
-        float | None, typer.Option(min=0.01, max=3660, help="Instead of --to; default 7.")
+        float | None,
+        typer.Option(min=0.01, max=3660, help="Length in days instead of --to; default 7."),
     ] = None,
     count: Annotated[
         int | None,
         typer.Option(
             min=1,
             max=100_000,
-            help="Measurements of each heliostat (default 10), or of the campaign (no limit).",
+            help="Measurements per heliostat (default 10), or in the campaign (no limit).",
         ),
     ] = None,
     target: Annotated[
@@ -64,20 +65,22 @@ def plan(
     ] = None,
     campaign: Annotated[
         bool,
-        typer.Option("--campaign", help="Schedule the field, one beam on a target at a time."),
+        typer.Option(
+            "--campaign", help="Schedule the whole field, with one beam on a target at a time."
+        ),
     ] = False,
-    every: Annotated[str, typer.Option(help="Step of the times considered.")] = "30m",
+    every: Annotated[str, typer.Option(help="Step between the times considered.")] = "30m",
     sigma_mrad: Annotated[
         float,
         typer.Option(
             min=0.001,
             max=1000,
-            help="Standard deviation of a measured beam in each direction, mrad.",
+            help="Standard deviation of a measured beam per direction, mrad.",
         ),
     ] = 0.5,
-    settle: Annotated[str, typer.Option(help="Time to come to rest on the target.")] = "5s",
+    settle: Annotated[str, typer.Option(help="Time for the beam to settle on the target.")] = "5s",
     exposure: Annotated[str, typer.Option(help="Exposure time of the camera.")] = "2s",
-    clear: Annotated[str, typer.Option(help="Time to leave the target.")] = "5s",
+    clear: Annotated[str, typer.Option(help="Time for the beam to leave the target.")] = "5s",
     by_slot: Annotated[
         bool,
         typer.Option("--by-slot", help="Campaign: plan slot by slot instead of day by day."),
@@ -87,13 +90,15 @@ def plan(
         typer.Option(
             min=0,
             max=1,
-            help="Campaign: least share by which a measurement lowers the squared error of its "
-            "heliostat.",
+            help="Campaign: minimum fraction by which a measurement must reduce the "
+            "squared error of its heliostat.",
         ),
     ] = 0.05,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the table.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="File for the picture, .png, .svg or .pdf.")
+    ] = None,
 ) -> None:
     """Plan the measurements that reveal most: times, targets, and the beam error to expect."""
     from heliotrope.calibration.plan.campaign import Timing

@@ -14,26 +14,32 @@ from heliotrope.cli._common import print_json, print_table
 def simulate(
     seed: Annotated[
         int,
-        typer.Option(min=0, max=2**63 - 1, help="Seed of everything random; the first of --runs."),
+        typer.Option(
+            min=0, max=2**63 - 1, help="Seed of all random numbers; the first one for --runs."
+        ),
     ] = 0,
     hours: Annotated[
         float | None,
         typer.Option(
             min=0.001,
             max=8760,
-            help="Simulated time of each run; by default 0.1, for a day 14 minutes.",
+            help="Simulated time per run; default 0.1, for a day 14 minutes.",
         ),
     ] = None,
-    heliostats: Annotated[int, typer.Option(min=1, max=32, help="Number on the bus, 1 to 32.")] = 4,
+    heliostats: Annotated[
+        int, typer.Option(min=1, max=32, help="Number of heliostats on the bus, 1 to 32.")
+    ] = 4,
     pause: Annotated[
-        float, typer.Option(min=0.01, max=1e6, help="Mean time between two faults, s.")
+        float, typer.Option(min=0.01, max=1e6, help="Mean time between faults, s.")
     ] = 12.0,
     only: Annotated[
         list[str] | None, typer.Option(help="Only faults of this kind; may be repeated.")
     ] = None,
     world: Annotated[
         list[str] | None,
-        typer.Option(help="Add a harder world; may be repeated. any: each run draws its own."),
+        typer.Option(
+            help="Add a harder environment; may be repeated. any: each run draws its own."
+        ),
     ] = None,
     runs: Annotated[
         int, typer.Option(min=1, max=1_000_000, help="Number of runs, with consecutive seeds.")
@@ -41,17 +47,20 @@ def simulate(
     processes: Annotated[int, typer.Option(min=1, max=1024, help="Runs in parallel.")] = 1,
     minutes: Annotated[
         float | None,
-        typer.Option(min=0.001, max=1e6, help="Time after which no further run begins."),
+        typer.Option(min=0.001, max=1e6, help="Time after which no further run is started."),
     ] = None,
     progress: Annotated[
-        Path | None, typer.Option(help="File that records finished runs; continue from it.")
+        Path | None, typer.Option(help="File that records finished runs, from which to continue.")
     ] = None,
     results: Annotated[
         Path | None,
         typer.Option(help="JSON file for the result: commit, worlds, seeds, checks, breaks."),
     ] = None,
     shrink: Annotated[
-        bool, typer.Option(help="Reduce the faults of a failed run to those that still break it.")
+        bool,
+        typer.Option(
+            help="Reduce the faults of a failed run to those that still reproduce the failure."
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

@@ -9,19 +9,19 @@ from heliotrope.cli._common import day_of, parse_duration, parse_time, print_jso
 
 def sun(
     latitude: Annotated[
-        float, typer.Option(min=-90, max=90, help="Degrees, north positive.")
+        float, typer.Option(min=-90, max=90, help="Latitude, degrees, north positive.")
     ] = -33.93,
     longitude: Annotated[
-        float, typer.Option(min=-180, max=180, help="Degrees, east positive.")
+        float, typer.Option(min=-180, max=180, help="Longitude, degrees, east positive.")
     ] = 18.87,
     height: Annotated[
-        float, typer.Option(min=-500, max=9000, help="Metres above the ellipsoid.")
+        float, typer.Option(min=-500, max=9000, help="Height above the ellipsoid, m.")
     ] = 120.0,
     time: Annotated[str, typer.Option(help="ISO 8601 with a zone, or now.")] = "now",
     pressure: Annotated[
         float | None,
         typer.Option(
-            min=300, max=1200, help="Air pressure at the site, hPa; default from the height."
+            min=300, max=1200, help="Air pressure at the site, hPa; default: from the height."
         ),
     ] = None,
     temperature: Annotated[
@@ -33,7 +33,9 @@ def sun(
     ] = None,
     algorithm: Annotated[
         Literal["spa", "grena2008"],
-        typer.Option(help="spa; grena2008: Malan's choice, a cross-check for 2003 to 2022."),
+        typer.Option(
+            help="spa; grena2008: the algorithm that Malan used, a cross-check for 2003 to 2022."
+        ),
     ] = "spa",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

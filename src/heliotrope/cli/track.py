@@ -34,7 +34,7 @@ HeliostatOption = Annotated[str, typer.Option(help="Name of the heliostat.")]
 AimOption = Annotated[
     str | None,
     typer.Option(
-        help="Aim east,north,up in metres; default the heliostat's own, or the first target."
+        help="Aim east,north,up in metres; default: the heliostat's own, or the first target."
     ),
 ]
 TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of this target.")]
@@ -54,17 +54,17 @@ def track(
     target: TargetOption = None,
     time: Annotated[
         str | None,
-        typer.Option(help="ISO 8601 with a zone, or now; default the file's <Sun>, or now."),
+        typer.Option(help="ISO 8601 with a zone, or now; default: the file's <Sun>, or now."),
     ] = None,
     sun: Annotated[
-        str | None, typer.Option(help="Vector to the sun east,north,up, instead of that at TIME.")
+        str | None, typer.Option(help="Sun vector east,north,up, instead of the one at TIME.")
     ] = None,
     every: Annotated[
         str | None, typer.Option(help="Track the whole day of TIME at this interval: 30s, 10min.")
     ] = None,
     site: Annotated[
         str | None,
-        typer.Option(help="LATITUDE,LONGITUDE,HEIGHT (degrees, m) of a file that gives no place."),
+        typer.Option(help="LATITUDE,LONGITUDE,HEIGHT (degrees, m) for a file without a location."),
     ] = None,
     over_the_top: Annotated[
         bool,
@@ -80,11 +80,11 @@ def track(
     local: Annotated[
         bool,
         typer.Option(
-            help="The aim is fixed to the mirror: a point of the heliostat's frame at zero angles."
+            help="The aim is fixed to the mirror: a point in the heliostat frame at zero angles."
         ),
     ] = False,
     trace: Annotated[
-        bool, typer.Option(help="Print each iteration of both branches: angles and miss.")
+        bool, typer.Option(help="Print each iteration on both branches: angles and miss distance.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

@@ -23,23 +23,28 @@ def twin(
         typer.Argument(help="Plant file or folder; default: 10,000 heliostats, 313 clusters."),
     ] = None,
     folder: Annotated[
-        Path, typer.Option(help="New folder for plant file, links file, keys and sensors.")
+        Path, typer.Option(help="Folder to create for plant file, links file, keys and sensors.")
     ] = Path("twin"),
     heliostats: Annotated[
         int | None,
-        typer.Option(min=1, max=1_000_000, help="Number in the default plant, instead of 10,000."),
+        typer.Option(
+            min=1,
+            max=1_000_000,
+            help="Number of heliostats in the default plant, instead of 10,000.",
+        ),
     ] = None,
     prototype: Annotated[
         bool, typer.Option("--prototype", help="Malan's prototype: 18 heliostats.")
     ] = False,
     seed: Annotated[
-        int, typer.Option(min=0, max=2**63 - 1, help="Seed of how the mirrors really stand.")
+        int, typer.Option(min=0, max=2**63 - 1, help="Seed of the true installation errors.")
     ] = 0,
     start: Annotated[
         str,
         typer.Option(
-            help="Its time at the start: a day (its morning at the site), ISO 8601 with a zone, "
-            '"morning" (of today), or "now": it follows the clock of this machine.'
+            help="Simulated time at the start: a day (its morning at the site), ISO 8601 "
+            'with a zone, "morning" (of today), or "now", which follows the clock of '
+            "this computer."
         ),
     ] = "now",
     speed: Annotated[
@@ -47,20 +52,23 @@ def twin(
     ] = 1.0,
     boards: Annotated[
         bool,
-        typer.Option("--boards", help="Each heliostat is a firmware-true board; for small plants."),
+        typer.Option(
+            "--boards",
+            help="Simulate each heliostat by a board with the real firmware; for small plants.",
+        ),
     ] = False,
     pty: Annotated[
         bool,
-        typer.Option("--pty", help="The bus of each cluster's boards is a pseudo-terminal."),
+        typer.Option("--pty", help="Attach the boards of each cluster to a pseudo-terminal."),
     ] = False,
     up: Annotated[
-        bool, typer.Option("--up", help="The heliostats track at the start, as on a day of work.")
+        bool, typer.Option("--up", help="Start with the heliostats tracking, as on a working day.")
     ] = False,
     plant: Annotated[
-        str, typer.Option(help="Host and port at which the plant will listen to clusters.")
+        str, typer.Option(help="Host and port on which the plant listens for clusters.")
     ] = "127.0.0.1:4840",
     serve: Annotated[
-        str, typer.Option(help="Host and port for photographs; port 0: a free one.")
+        str, typer.Option(help="Host and port for photographs; port 0: any free port.")
     ] = "127.0.0.1:0",
     child: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:

@@ -29,8 +29,8 @@ def view(
     heliostat: HeliostatOption,
     aim: AimOption = None,
     target: TargetOption = None,
-    time: Annotated[str, typer.Option(help="A moment of the day, ISO 8601 with a zone.")] = "now",
-    every: Annotated[str, typer.Option(help="Time between two poses: 5min, 30s.")] = "10min",
+    time: Annotated[str, typer.Option(help="A time of day, ISO 8601 with a zone.")] = "now",
+    every: Annotated[str, typer.Option(help="Time between poses: 5min, 30s.")] = "10min",
 ) -> None:
     """Write a day of a heliostat as an animated 3D view."""
     import numpy as np

@@ -1,14 +1,15 @@
-"""The cluster controller: the program that masters one bus with up to 32 heliostats.
+"""The cluster controller: the program that is the master of one bus with up to 32 heliostats.
 
-`Cluster` is the controller, made of a `ClusterConfig`, a bus, a link to the plant, a clock and a
-`TimeKeeper`. `SystemTime` is the time of this computer with the kernel's bound of its error;
-`Gpsd` shows the state of a satellite receiver. `Kept` holds what outlasts a restart: epoch and
+`Cluster` is the controller. It is built from a `ClusterConfig`, a bus, a link to the plant, a clock
+and a `TimeKeeper`. `SystemTime` is the time of this computer with the kernel's bound on its error;
+`Gpsd` reports the state of a satellite receiver. `Kept` stores what survives a restart: epoch and
 editions. `Turns` shares a bus between tasks.
 
-Modules that need the extra ``control`` are imported by name: ``config_file`` (`read_cluster`),
-``serial_bus`` (`SerialBus`) and ``program`` (a cluster made from its file, `LocalCluster`).
+Modules that need the extra ``control`` must be imported by name: ``config_file`` (`read_cluster`),
+``serial_bus`` (`SerialBus`) and ``program`` (a cluster built from its file, `LocalCluster`).
 
-Begin with ``config_file.read_cluster`` and ``controller``. The cluster knows nothing of the plant.
+Begin with ``config_file.read_cluster`` and ``controller``. The cluster code is independent of the
+plant code.
 """
 
 from heliotrope.cluster.config import MOST_MEMBERS, ClusterConfig, Member, spread_phase

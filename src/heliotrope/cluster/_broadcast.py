@@ -1,9 +1,9 @@
 """The broadcasts at the start of each second: SESSION, TIME and SUN.
 
-SESSION goes first: a local controller that has just started accepts nothing before it; one with a
-key of the bus is sent its own (`_bus_keys`). SUN is sent only while the plant's lease (and the
-autonomy it grants) lasts, the time is sound, and no row of the safety table demands DEFOCUS or
-STOW. Without SUN each local controller defocuses by itself.
+SESSION is sent first, because a local controller that has just started accepts nothing before it; a
+local controller with a bus key is sent its own SESSION (`_bus_keys`). SUN is sent only while the
+plant's lease (and the autonomy that it grants) is valid, the time is reliable, and no row of the
+safety table requires DEFOCUS or STOW. Without SUN each local controller defocuses by itself.
 """
 
 from heliotrope.cluster._bus_keys import BusKeys

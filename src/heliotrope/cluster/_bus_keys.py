@@ -1,13 +1,13 @@
-"""The key of the bus: local controllers meet the cluster in a signed session, and are given keys.
+"""The bus key: local controllers join the cluster in a signed session, and receive keys.
 
 A local controller shows in its STATUS whether it has a key, and whether it wants a session signed
-over a number that it has drawn (`lcu.signing`). The cluster asks for that number and for the
-fingerprints of its keys, and sends the session (`meet`). Each second it also gives one local
-controller the key that it lacks, or ends an old one (`supply`): encrypted under the key of that
-local controller, and only while its mirror stands.
+over a number that it has drawn (`lcu.signing`). The cluster requests that number and the
+fingerprints of its keys, and sends the session (`meet`). Each second it also sends one local
+controller a key that it lacks, or retires an old one (`supply`): encrypted under the key of that
+local controller, and only while its heliostat is at rest.
 
-While a key is replaced, the cluster signs with the old one until every local controller that
-answers has the new one. So no order of events costs a lease.
+During a key change, the cluster signs with the old key until every local controller that responds
+has the new one. No order of events therefore costs a lease.
 """
 
 import struct

@@ -1,7 +1,7 @@
-"""The frames of the bus, kept for a question of the plant: for a bounded time and number.
+"""Frames on the bus, recorded at the plant's request: for a limited time and number.
 
-`RecordedBus` stands between the cluster and its port. It adds no wait and writes no file: while a
-person records, each frame costs one entry in a list; otherwise nothing.
+`RecordedBus` sits between the cluster and its port. It adds no delay and writes no file: during a
+recording, each frame costs one list entry; otherwise nothing.
 """
 
 import struct

@@ -1,8 +1,8 @@
-"""Discovery of local controllers by serial number, halving ranges where answers collide.
+"""Discovery of local controllers by serial number, halving ranges when replies collide.
 
-All controllers with a serial number in a range answer in slots drawn at random. Where two answer at
-once, the bytes are damaged, and each half of the range is asked separately. A range is done after
-two clean questions in a row without a new answer.
+All controllers with a serial number in a range reply in randomly chosen slots. If two reply at
+once, the bytes are damaged, and each half of the range is polled separately. A range is finished
+after two consecutive clean polls without a new reply.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
 """DEFOCUS and STOW: broadcast three times, then confirmed by each heliostat.
 
-They come from anyone or from the safety table. Nothing else goes on the bus before them. A
-heliostat that has not acknowledged is named, and asked again each second until it has. The first
-is the cluster's own: a DEFOCUS of whatever is on the bus, which nobody needs to acknowledge.
+They come from anyone or from the safety table, and take precedence over all other bus traffic. A
+heliostat that has not acknowledged is named, and polled again every second until it has. The first
+order is the cluster's own at start-up: a DEFOCUS of everything on the bus, which needs no
+acknowledgement.
 """
 
 from collections import deque

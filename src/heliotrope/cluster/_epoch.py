@@ -1,4 +1,4 @@
-"""The epoch of a cluster: a new one makes all earlier frames void."""
+"""The epoch of a cluster: a new epoch invalidates all earlier frames."""
 
 from collections import Counter
 

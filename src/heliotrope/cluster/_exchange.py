@@ -1,4 +1,4 @@
-"""Questions and commands over the bus, counted for each local controller; one at a time."""
+"""Queries and commands on the bus, counted for each local controller; one at a time."""
 
 import asyncio
 import hashlib

@@ -1,7 +1,7 @@
-"""Goals of commands: the state that a command asks for, and whether it has been reached.
+"""Goals of commands: the state that a command requests, and whether it has been reached.
 
-A command is acknowledged when the local controller has taken it, and done when STATUS shows the
-state that it asks for. A command without a goal here is done when it is acknowledged.
+A command is acknowledged when the local controller has accepted it, and done when STATUS shows the
+requested state. A command without a goal here is done when it is acknowledged.
 """
 
 import functools

@@ -1,11 +1,11 @@
-"""The cluster's view of its local controllers, and a quick reading of answers.
+"""The cluster's view of its local controllers, and fast parsing of replies.
 
-Each is asked once or twice a second, so the frames of the questions are made once, and an answer
-of the right size is read with one call of ``struct``. Anything else goes through `wire.Reader`,
-which decides; the quick reading accepts nothing that `wire.Reader` would refuse. An answer carries
-the sequence of its question, and consecutive questions to a node have different ones: an answer
-that comes late (by many seconds, from a serial server in the network) is not mistaken for the
-answer to a later question.
+Each local controller is polled once or twice per second, so the query frames are created once, and
+a reply of the expected size is parsed with one call of ``struct``. Anything else goes through
+`wire.Reader`, which decides; the fast parser accepts nothing that `wire.Reader` would reject. A
+reply carries the sequence number of its query, and consecutive queries to a node have different
+numbers, so a reply that arrives late (by many seconds, from a network serial server) is not
+mistaken for the reply to a later query.
 """
 
 import math

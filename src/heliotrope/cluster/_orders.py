@@ -1,10 +1,10 @@
-"""Commands and parameters on their way to the heliostats: sent, retried, judged, reported.
+"""Commands and parameters on their way to the heliostats: sent, retried, checked, reported.
 
-A command that is not answered is sent again as the same frame, which acts once, and in the next
-second as a new one, until it expires. If the answer to an earlier frame was lost, "duplicate" or
-"not in this state" may mean that the command was taken: then the state decides. A command that must
-not act twice (JOG) is not sent as a new frame; the goals of the step counts show whether it was
-taken.
+A command without a reply is sent again as the same frame, which takes effect only once, and in the
+next second as a new frame, until it expires. If the reply to an earlier frame was lost, "duplicate"
+or "not in this state" may mean that the command was accepted; the reported state then decides. A
+command that must not take effect twice (JOG) is not sent as a new frame; the step-count goals show
+whether it was accepted.
 """
 
 import re

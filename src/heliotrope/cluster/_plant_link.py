@@ -1,4 +1,4 @@
-"""The cluster's end of the link to the plant: takes messages, sends reports and the status."""
+"""The cluster's end of the link to the plant: receives messages, sends reports and the status."""
 
 import contextlib
 from collections.abc import Callable

@@ -1,7 +1,7 @@
-"""Polling: each heliostat reports its state once a second, in the order of addresses.
+"""Polling: each heliostat reports its state once per second, in the order of addresses.
 
-Commands are sent in between. Answers are checked, faults and silence are reported, and the
-goals of commands are judged.
+Commands are sent in between. Replies are checked, faults and silence are reported, and the goals of
+commands are evaluated.
 """
 
 import asyncio

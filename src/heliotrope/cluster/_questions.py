@@ -1,4 +1,4 @@
-"""Questions of the plant: checksums, stored items, diagnoses, counts, discovery, frames."""
+"""Queries from the plant: checksums, stored items, diagnoses, statistics, discovery, frames."""
 
 from collections import deque
 from collections.abc import Callable

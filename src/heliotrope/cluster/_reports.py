@@ -1,4 +1,4 @@
-"""Reports to the plant: stages of commands, alarms, answers and the status; bounded, in order."""
+"""Reports to the plant: command stages, alarms, replies and the status; bounded, in order."""
 
 import asyncio
 from collections import deque

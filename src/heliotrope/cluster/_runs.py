@@ -1,15 +1,15 @@
-"""The run of a plant that a cluster belongs to: one at a time, by the name in its leases.
+"""The plant run that a cluster belongs to: one at a time, identified by the name in its leases.
 
-Two plants with the same keys (a backup started on a second machine) reach a cluster in turns. It
-belongs to the run whose lease it took, until that lease has ended. Another run that asks meanwhile
-gets nothing, and must wait for `PATIENCE` more: where two plants take a line from each other, each
-of them falls silent for seconds. If the lease is renewed after that, two plants are alive: the
-other run is blocked until its plant is restarted, which gives it a new name. So a plant that froze
-or lost its line for a while does not hand the field to an unknown one; somebody must want
-it.
+Two plants with the same keys (for example a backup started on a second computer) reach a cluster
+alternately. The cluster belongs to the run whose lease it accepted, until that lease has expired.
+Another run that sends leases in the meantime gets no response, and must wait `PATIENCE` longer,
+because when two plants compete for a line, each of them is silent for seconds at a time. If the
+lease is renewed after that, two plants are alive, and the other run is blocked until its plant is
+restarted, which gives it a new name. A plant that froze or lost its line for a while therefore does
+not hand the field over to an unknown plant; an operator has to decide this.
 
-A plant of an older version gives no name. Its leases count as those of one run without a name,
-which has to wait like any other, and is never blocked: no restart could give it another name.
+A plant with an older version sends no name. Its leases count as those of one unnamed run, which has
+to wait like any other but is never blocked, because no restart could give it another name.
 """
 
 import math

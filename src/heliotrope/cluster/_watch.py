@@ -1,4 +1,4 @@
-"""The watch of a cluster: its rows of the safety table, and the plant's lease."""
+"""Monitoring in a cluster: its rows of the safety table, and the plant's lease."""
 
 import math
 from collections.abc import Callable

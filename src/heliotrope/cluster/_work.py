@@ -1,4 +1,4 @@
-"""Work for the bus: emergencies first, then commands and parameters, then questions."""
+"""Work for the bus: emergencies first, then commands and parameters, then queries."""
 
 from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._epoch import Epoch

@@ -1,4 +1,4 @@
-"""Configuration of a cluster controller: site, heliostats, limits. Read by `config_file`."""
+"""Configuration of a cluster controller: site, heliostats, limits; read by `config_file`."""
 
 import math
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from heliotrope.links.common_settings import CommonSettings
 from heliotrope.safety import CONDITIONS, Limits, Watcher, limited, watched_by
 from heliotrope.sun import Site
 
-#: The number of unit loads that RS485 carries.
+#: Maximum number of unit loads on RS485.
 MOST_MEMBERS = 32
 
 
@@ -20,19 +20,18 @@ class Member:
     Parameters
     ----------
     name
-        As the plant knows it.
+        Name as known to the plant.
     address
-        On the bus, 1 to 65534.
+        Bus address, 1 to 65534.
     serial
-        Serial number of its local controller, for finding it and giving it an address; None:
-        not known.
+        Serial number of its local controller, for discovery and address assignment; None: unknown.
     key
-        Key of its local controller, for stored items; b"": nothing can be stored.
+        Key of its local controller, needed to store items; b"": nothing can be stored.
 
     Raises
     ------
     InputError
-        An empty name, or a number out of range.
+        If a name is empty, or a number is out of range.
     """
 
     name: str
@@ -60,32 +59,32 @@ class ClusterConfig:
     Parameters
     ----------
     name
-        As the plant knows it.
+        Name as known to the plant.
     site
-        Place and air, for the sun.
+        Location and atmosphere, for the sun vector.
     heliostats
-        1 to 32; polled in the order of their addresses, reported in this order.
+        1 to 32 heliostats; polled in the order of their addresses, reported in this order.
     answer
-        Time limit from the end of a question to the whole answer, in s.
+        Timeout from the end of a query to the complete reply, in s.
     stored_answer
-        The same where flash is written before the answer, in s.
+        The same if flash is written before the reply, in s.
     steps_every
         Interval at which the step counts of each heliostat are requested, in s.
     silence
-        Time without an answer after which a heliostat is reported, in s.
+        Time without a reply after which a heliostat is reported, in s.
     longest_autonomy
-        Longest autonomy that the plant may grant, in s. Above 0 only where a hard-wired emergency
-        line reaches this cluster.
+        Maximum autonomy that the plant may grant, in s. Set it above 0 only if a hard-wired
+        emergency line reaches this cluster.
     limits
-        Numbers of the safety table that this plant sets for the rows that clusters watch.
+        Limits of the safety table that this plant sets for the rows that clusters evaluate.
     phase
-        Delay of each second after that of GPS, in s, 0 to below 1. Where one process runs
+        Delay of each second relative to the GPS second, in s, 0 to below 1. If one process runs
         many clusters, see `spread_phase`.
 
     Raises
     ------
     InputError
-        A value that no cluster can have.
+        If a value is invalid for a cluster.
     """
 
     name: str
@@ -147,24 +146,24 @@ class ClusterConfig:
 
 
 def spread_phase(index: int, count: int) -> float:
-    """Return the phase of one of many clusters in a process, so that their seconds don't collide.
+    """Return the phase of one of many clusters in a process, so that their seconds do not collide.
 
     Parameters
     ----------
     index
-        Which cluster, 0 to ``count`` - 1.
+        Index of the cluster, 0 to ``count`` - 1.
     count
         Number of clusters.
 
     Returns
     -------
     float
-        In s, 0 to below 1; neighbours are as far apart as possible.
+        In s, 0 to below 1; consecutive clusters are as far apart as possible.
 
     Raises
     ------
     InputError
-        An index outside the range.
+        If the index is out of range.
     """
     if not 0 <= index < count:
         raise InputError(f"phase: cluster {index} of {count}; give 0 to {count - 1}")

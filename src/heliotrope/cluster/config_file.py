@@ -1,4 +1,4 @@
-"""The cluster file (TOML), from which a cluster controller starts; its keys are in another file."""
+"""The cluster file (TOML) with which a cluster controller starts; its keys are in another file."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,15 +1,16 @@
 """The cluster controller: master of one bus with up to 32 heliostats.
 
-Every second it broadcasts session, time and sun (`_broadcast`), asks each local controller for its
-state in the order of addresses (`_polling`), carries out the plant's orders meanwhile (`_work`:
-`_emergencies`, then `_orders`, then `_questions`), and reports to the plant (`_plant_link`). One
-task alone uses the bus, so frames go out in the order of their numbers; a second listens to the
-plant; a third talks to it and may wait for it.
+Every second it broadcasts session, time and sun vector (`_broadcast`), polls each local controller
+in the order of addresses (`_polling`), in between carries out the plant's orders (`_work`:
+`_emergencies`, then `_orders`, then `_questions`), and reports to the plant (`_plant_link`). Only
+one task uses the bus, so frames are sent in the order of their numbers; a second task receives from
+the plant; a third sends to the plant and may wait for it.
 
-The field is safe when left alone: the sun is sent only while the plant's lease (and the autonomy
-it grants) lasts, the time is sound, and no row of the safety table demands otherwise (`_watch`).
-Without the sun every local controller defocuses by itself. At a start the cluster broadcasts
-DEFOCUS, since it does not know what is up; then it waits for a lease, and for a command.
+The field is safe when left alone: the sun vector is sent only while the plant's lease (and the
+autonomy that it grants) is valid, the time is reliable, and no row of the safety table requires
+otherwise (`_watch`). Without the sun vector every local controller defocuses by itself. At start-up
+the cluster broadcasts DEFOCUS, because it does not know which heliostats are tracking; then it
+waits for a lease, and for a command.
 
 ::
 
@@ -62,17 +63,18 @@ class Cluster:
     config
         Site, heliostats and limits.
     bus, link
-        To the heliostats, and to the plant; run by the owner.
+        Bus to the heliostats, and link to the plant; the owner runs both.
     clock
-        Its monotonic time measures all limits.
+        Clock whose monotonic time measures all limits.
     time
-        Source of GPS and UTC; run by the owner.
+        Source of GPS time and UTC; the owner runs it.
     kept
-        Epoch and editions; None: nothing outlasts this object.
+        Epoch and editions; None: nothing survives this object.
     line
-        Returns whether current flows in the hard-wired emergency line; None: there is no line.
+        Function that returns whether current flows in the hard-wired emergency line; None: there is
+        no line.
     bus_keys
-        Keys that sign the frames of the bus; None: they are not signed.
+        Keys that sign the frames on the bus; None: frames are not signed.
 
     Attributes
     ----------
@@ -153,11 +155,11 @@ class Cluster:
 
     @property
     def lease_left(self) -> float:
-        """Remaining time of the plant's lease, s; below 0: no plant leads it."""
+        """Remaining time of the plant's lease, s; below 0: no plant controls the cluster."""
         return self._watch.lease_left(self._clock.monotonic())
 
     async def run(self) -> None:
-        """Run until closed; then defocus, and end.
+        """Run until closed; then defocus, and return.
 
         Raises
         ------
@@ -182,7 +184,7 @@ class Cluster:
             self._ended.set()
 
     async def close(self) -> None:
-        """Defocus, and end ``run``; returns when that is done."""
+        """Defocus, and stop ``run``; returns when that is done."""
         self._closing.set()
         self._wake.set()
         if self._running:
@@ -243,7 +245,7 @@ class Cluster:
         return begin + 1.0 - max(-_STEER, min(_STEER, ahead))
 
     def take_alarm(self, alarm: Alarm) -> None:
-        """Report an alarm of the program around the cluster, raised or over."""
+        """Report an alarm of the surrounding program, raised or cleared."""
         (self._reports.alarm if alarm.active else self._reports.clear)(alarm)
 
     def line(self) -> str:

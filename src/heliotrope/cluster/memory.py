@@ -1,11 +1,11 @@
-"""State of a cluster that outlasts a restart: its epoch, and the editions it has used.
+"""Cluster state that survives a restart: its epoch, and the editions it has used.
 
-Both only rise. The file is written beside the old one and renamed, so that a power cut leaves
-the old file or the new one. Editions are reserved in blocks, before they are needed: the edition on
-disk is never below one that was used.
+Both only increase. The file is written beside the old one and renamed, so that a power failure
+leaves either the old file or the new one. Editions are reserved in blocks, before they are needed,
+so that the edition on disk is never below one that was used.
 
-Nothing waits for the disk but what must not be used before it is on it: a new epoch, and an edition
-beyond those reserved.
+Only two things wait for the disk, because they must not be used before they are stored: a new
+epoch, and an edition beyond those reserved.
 """
 
 import json
@@ -29,16 +29,16 @@ class Kept:
     Parameters
     ----------
     path
-        The file; None: nothing is stored, for simulation.
+        Path of the file; None: nothing is stored, for simulation.
     epoch, edition
         Last values used, if there is no file.
     disk
-        Writes the file once the cluster runs; None: at once.
+        Disk that writes the file once the cluster runs; None: written at once.
 
     Attributes
     ----------
     epoch
-        Of this run.
+        Those of this run.
 
     Raises
     ------
@@ -75,7 +75,7 @@ class Kept:
         return epoch
 
     def begin(self, at_least: int, then: Callable[[int, Exception | None], None]) -> None:
-        """Store an epoch as in `start`; call ``then`` with it and None, or an error, when done."""
+        """Store an epoch as in `start`; when done, call ``then`` with it and None, or an error."""
         epoch = self._above(at_least)
 
         def stored(error: Exception | None) -> None:
@@ -86,12 +86,12 @@ class Kept:
         self._disk.do(partial(self._write, epoch, 0), stored)
 
     def next_edition(self, above: int = 0) -> int | None:
-        """Return an edition that was never used, above another one; None: it is being stored.
+        """Return a never-used edition above a given one; None: it is being stored.
 
         Raises
         ------
         OSError
-            If it could not be stored; it is then not used either, and tried again.
+            If it could not be stored; it is then not used either, and storing is retried.
         """
         edition = max(self._edition, above) + 1
         if edition + _AHEAD > self._reserved and not self._reserving:
@@ -105,7 +105,7 @@ class Kept:
         return edition
 
     def close(self) -> None:
-        """End the disk, which may still write for a moment."""
+        """Close the disk, which may still write for a moment."""
         self._disk.close()
 
     def _above(self, at_least: int) -> int:

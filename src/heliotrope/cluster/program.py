@@ -1,7 +1,7 @@
-"""A cluster made from its cluster file: sources of time, emergency line, and a run in a process.
+"""A cluster built from its cluster file: time sources, emergency line, and run in a process.
 
-`heliotrope cluster` runs one in a process of its own. Where the bus is connected to the plant's
-machine, the plant runs the same program with a link in memory instead of a network
+`heliotrope cluster` runs a cluster in its own process. If the bus is attached to the plant's
+computer, the plant runs the same program with an in-memory link instead of a network
 (`LocalCluster`).
 """
 

@@ -1,15 +1,15 @@
 """The bus of a cluster: RS485 through serialx, with this side as its only master.
 
-One transaction at a time: wait until the bus has been quiet for a gap, send, read the answer.
-The caller's codec decides what an answer is (`complete`); here it is bytes. Urgent frames
-(defocus, stow) go next, before all that wait. A frame whose turn comes after its expiry is
-dropped.
+One transaction at a time: wait until the bus has been quiet for a gap, send, read the reply. The
+caller's codec decides what a reply is (`complete`); in this module a reply is bytes. Urgent frames
+(defocus, stow) are sent next, before all waiting frames. A frame whose turn comes after its expiry
+is dropped.
 
-The adapter switches its driver by itself. Some adapters hear their own frames: with ``echo`` the
-frame is removed from the received bytes, and an altered echo (two spoke at once) spoils
+The adapter switches its driver automatically. Some adapters receive their own frames: with ``echo``
+the frame is removed from the received bytes, and an altered echo (two senders at once) invalidates
 its transaction. Unrequested bytes are discarded before each frame.
 
-Ports: a device ("/dev/ttyUSB0"), or a serial server in the network ("socket://10.0.0.7:4001").
+Ports: a device ("/dev/ttyUSB0"), or a network serial server ("socket://10.0.0.7:4001").
 """
 
 import asyncio

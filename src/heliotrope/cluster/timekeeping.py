@@ -1,11 +1,12 @@
-"""The time of a cluster, with a bound of its error and its source.
+"""The time of a cluster, with a bound on its error and its source.
 
-The sun moves 73 µrad in a second: a mirror that follows the sun of a wrong time misses by as much.
-A cluster therefore always uses a `Time`, which is an interval (`Time.error`).
+The sun moves 73 µrad per second, and a heliostat that tracks with a wrong time is off by as much. A
+cluster therefore always uses a `Time`, which is an interval (`Time.error`).
 
 The computer's clock is disciplined by chrony (or another NTP program), from a satellite receiver
-with a pulse, from time servers, or from both. The kernel carries the bound of the clock's error:
-chrony renews it, and between renewals it grows by 0.5 ms a second. `SystemTime` uses that bound.
+with a pulse output, from time servers, or from both. The kernel maintains the bound on the clock
+error: chrony renews it, and between renewals it grows by 0.5 ms per second. `SystemTime` uses that
+bound.
 
 A `Time` is for information only. Leases, deadlines and expiries rest on `Clock.monotonic` alone, so
 a jump, forward or back, extends nothing; `Steadiness` detects a jump by comparison with the
@@ -55,17 +56,17 @@ class Time:
     utc_s
         POSIX seconds.
     gps_s
-        Seconds of the GPS scale since 6 January 1980, which has no leap seconds.
+        Seconds of the GPS time scale since 6 January 1980, which has no leap seconds.
     error
-        Bound of the error of both, s; infinite: unknown.
+        Bound on the error of both, s; infinite: unknown.
     quality
         "gps": a disciplined clock, confirmed by a receiver with a fix; "system": a disciplined
-        clock; "holdover": not disciplined for a while, so its bound grows; "none": unusable.
+        clock; "holdover": not disciplined for some time, so its bound grows; "none": unusable.
     jumped
-        The clock was set, forward or back, within the last seconds: intervals between times
-        before and after are meaningless.
+        Whether the clock was set, forward or back, within the last seconds, so that intervals
+        between times before and after are meaningless.
     note
-        What is wrong, in one line for the operator; empty if nothing is.
+        What is wrong, in one line for the operator; empty if nothing is wrong.
     """
 
     utc_s: float
@@ -77,15 +78,15 @@ class Time:
 
     @property
     def usable(self) -> bool:
-        """Whether it may be sent: it is known within 1 s."""
+        """Whether it may be sent, that is, it is known within 1 s."""
         return self.quality != "none" and self.error < LARGEST_ERROR
 
 
 class TimeKeeper(Protocol):
     """A cluster's source of time.
 
-    ``run`` belongs in a TaskGroup of the owner (or use `link.running`); it ends when the keeper
-    is closed. ``time`` may be called at any instant, before ``run`` and after ``close`` too.
+    Run ``run`` in a TaskGroup of the owner (or use `link.running`); it returns when the keeper is
+    closed. ``time`` may be called at any time, also before ``run`` and after ``close``.
     """
 
     def time(self) -> Time:
@@ -152,16 +153,16 @@ class Steadiness:
 
 
 def kernel_bound() -> float:
-    """Return the kernel's bound of its clock's error in s, infinite if the clock is undisciplined.
+    """Return the kernel's bound on its clock error in s, infinite if the clock is undisciplined.
 
-    chronyd (with ``rtcsync``, as packaged) and ntpd state the bound, the root distance to their
-    source, whenever they correct the clock. Between corrections the kernel adds 0.5 ms a second.
-    systemd-timesyncd states 0 in place of the root distance: use chronyd.
+    chronyd (with ``rtcsync``, as packaged) and ntpd report the bound, the root distance to their
+    source, whenever they correct the clock. Between corrections the kernel adds 0.5 ms per second.
+    systemd-timesyncd reports 0 instead of the root distance, so use chronyd.
 
     Raises
     ------
     InputError
-        On a system that does not offer the bound.
+        If the system does not provide the bound.
     """
     ask = getattr(ctypes.CDLL(None, use_errno=True), "adjtimex", None)
     timex = (ctypes.c_long * 128)()  # zeros ask and change nothing; larger than any struct timex
@@ -208,23 +209,23 @@ class SystemTime:
     Parameters
     ----------
     clock
-        Its ``utc`` is the time, its ``monotonic`` the reference for jumps.
+        Clock whose ``utc`` is the time, and whose ``monotonic`` is the reference for jumps.
     error
-        Bound of the clock's error that the operator vouches for, s; used without ``bound``.
+        Bound on the clock error that the operator guarantees, s; used without ``bound``.
     settle
-        How long a jump is reported, s.
+        Time for which a jump is reported, s.
     tolerance
-        A step up to this is not a jump, s.
+        Largest step that does not count as a jump, s.
     bound
-        Returns the bound of the clock's error in s, infinite if it is undisciplined:
-        `kernel_bound`. None: ``error`` holds always.
+        Function that returns the bound on the clock error in s, infinite if undisciplined:
+        `kernel_bound`. None: ``error`` always applies.
     gpsd
-        A receiver that must not contradict the clock; run and closed with this object.
+        A receiver that must agree with the clock; run and closed with this object.
 
     Raises
     ------
     InputError
-        An error, tolerance or duration that is not above 0.
+        If an error, tolerance or duration is not above 0.
     """
 
     def __init__(
@@ -248,7 +249,7 @@ class SystemTime:
 
     @property
     def jumps(self) -> int:
-        """Number of times the clock was set since this object was made."""
+        """Number of times the clock was set since this object was created."""
         return self._steadiness.jumps
 
     def time(self) -> Time:
@@ -284,7 +285,7 @@ class SystemTime:
         return error, "system" if ahead is None else "gps", problem
 
     async def run(self) -> None:
-        """Look at the clock each second, so that no jump there and back is missed for long."""
+        """Check the clock every second, so that a jump there and back does not go unnoticed."""
         if self._gpsd is None:
             await self._look()
             return

@@ -1,4 +1,4 @@
-"""Turns of tasks on a bus."""
+"""Access of tasks to a bus, in turn."""
 
 import asyncio
 import contextlib

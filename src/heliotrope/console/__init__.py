@@ -1,8 +1,9 @@
-"""The operator's console: a page, an HTTP API and a live stream over one plant at work.
+"""The operator console: a page, an HTTP API and a live stream for one running plant.
 
-`Client` is a thin client of the API for scripts; it needs the base installation only. The server
-needs the extra ``console``: `console.app.create` makes the application, and
-`console.serve.ConsoleServer` runs it; `console.settings.ConsoleSettings` holds address and limits.
+`Client` is a thin client of the API for scripts; it needs only the base installation. The server
+needs the extra ``console``: `console.app.create` creates the application, and
+`console.serve.ConsoleServer` runs it; `console.settings.ConsoleSettings` contains address and
+limits.
 """
 
 from heliotrope.console.client import Client

@@ -1,10 +1,10 @@
-"""Recent failed sign-ins: of a name at an address, of a name, and from an address.
+"""Recent failed sign-ins: per name and address, per name, and per address.
 
-Each of the three delays the next attempt, the longer the more failures there were. Only the first
-ends guessing (`AN_HOUR` attempts): the other two merely slow it, since whoever guesses could
-otherwise keep a person, or everybody at one address, out. A name that is guessed from ever new
-addresses is so slowed to some fourteen attempts an hour from all of them together. A name that has
-signed in from an address is not delayed there by what others do.
+Each of the three counts delays the next attempt, for longer as failures accumulate. Only the first
+blocks guessing (`AN_HOUR` attempts); the other two merely slow it down, because an attacker could
+otherwise lock out a person, or everyone at one address. Guessing one name from ever new addresses
+is thus limited to some fourteen attempts an hour in total. A name that has signed in from an
+address before is not delayed there by the failures of others.
 """
 
 from collections import Counter, OrderedDict, deque

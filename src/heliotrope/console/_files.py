@@ -1,4 +1,4 @@
-"""The page's files, read once and answered from memory: no thread, and no compressing for each."""
+"""The page's files, read once and served from memory, without a thread or compression each."""
 
 import gzip
 import hashlib
@@ -17,6 +17,7 @@ SMALL = 1024
 _KINDS = {
     ".css": "text/css",
     ".js": "text/javascript",
+    ".json": "application/json",
     ".svg": "image/svg+xml",
 }
 #: Address and file of each page but the sign-in's.
@@ -31,7 +32,12 @@ PAGES = {
 #: What stands in the HTML for the folder of the files.
 _FOLDER = "/console/static/"
 
-_READ = {file.name: file.read_bytes() for file in (*sorted(STATIC.iterdir()), _CLICKING)}
+#: By the address in the folder: `live.js`, `languages/de.json`.
+_READ = {
+    file.relative_to(STATIC).as_posix(): file.read_bytes()
+    for file in sorted(STATIC.rglob("*"))
+    if file.is_file()
+} | {_CLICKING.name: _CLICKING.read_bytes()}
 _TAG = hashlib.sha256(b"".join(_READ.values())).hexdigest()[:12]
 #: Folder of the page's files. The version in its name lets a browser keep them for good.
 KEPT = f"/console/{_TAG}"
@@ -55,7 +61,7 @@ class Files:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._answers = {path: _answer(path.rpartition("/")[2]) for path in self.paths}
+        self._answers = {path: _answer(path.removeprefix(f"{KEPT}/")) for path in self.paths}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer from memory, or pass the request on."""

@@ -1,7 +1,7 @@
-"""Passwords that are guessed first: common ones and their variations, runs, and the own name.
+"""Passwords that are guessed first: common ones and their variations, sequences, and the own name.
 
-NIST SP 800-63B, section 3.1.1.2, asks for such a list. A longer one is of little use here: a
-password has ten characters or more, and guessing is slowed down (see `_attempts`).
+NIST SP 800-63B, section 3.1.1.2, requires such a list. A longer list is of little use here, because
+a password has ten characters or more, and guessing is slowed down (see `_attempts`).
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""Limits on repeated lines of the log: whatever strangers send must not fill it."""
+"""Limits on repeated log lines, so that requests from strangers cannot fill the log."""
 
 import logging
 import time

@@ -1,4 +1,4 @@
-"""The word that protects a session's changes, and comparison of secrets in constant time."""
+"""The token that protects changes within a session, and constant-time comparison of secrets."""
 
 import hashlib
 import hmac

@@ -1,7 +1,8 @@
-"""The HTTP API, version 1: a route for each call of the plant's table, and the live stream.
+"""The HTTP API, version 1: a route for each call in the plant's table, and the live stream.
 
-Every order is given as the caller, with the role that the store has for them now, through the one
-command authority; an accepted command has its record in the audit before it is sent.
+Every order is given in the caller's name, with the caller's current role according to the store,
+through the single command authority; an accepted command is recorded in the audit before it is
+sent.
 """
 
 import asyncio

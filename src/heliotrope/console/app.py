@@ -1,6 +1,6 @@
-"""The application: API, live stream and page over one plant at work in its own process.
+"""The application: API, live stream and page for one running plant, in its own process.
 
-`create` makes it; `console.serve` runs it.
+`create` creates it; `console.serve` runs it.
 """
 
 import asyncio

@@ -1,8 +1,8 @@
 """Authentication: sessions by cookie, tokens by header, roles, and protection against forgery.
 
 A browser has a session: scripts cannot read its cookie (HttpOnly), other sites cannot send it
-(SameSite=Strict), and every change also needs the session's own word in a header, which a page from
-elsewhere cannot read. Programs have a token (``Authorization: Bearer``).
+(SameSite=Strict), and every change also needs the session's own token in a header, which a page
+from another origin cannot read. Programs have a token (``Authorization: Bearer``).
 """
 
 import asyncio

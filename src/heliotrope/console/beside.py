@@ -1,4 +1,4 @@
-"""The two processes of a console beside the plant: page and API, and the way for EMERGENCY."""
+"""The two console processes beside the plant: page and API, and the path for EMERGENCY."""
 
 import asyncio
 import socket

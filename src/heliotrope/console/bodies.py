@@ -1,4 +1,4 @@
-"""Bodies of requests: largest size, and the shape of JSON checked before it is parsed."""
+"""Request bodies: maximum size, and JSON structure checked before parsing."""
 
 import asyncio
 import contextlib

@@ -1,8 +1,8 @@
-"""People whom a trusted proxy has signed in, for example by OpenID Connect.
+"""Users whom a trusted proxy has signed in, for example through OpenID Connect.
 
-The proxy names the person and their groups in headers, and proves itself by a shared secret in
-another one. Each header is believed only from an address of `ConsoleSettings.proxies`. Accounts are
-made and get their role from the groups at each sign-in; they have no password.
+The proxy names the user and their groups in headers, and authenticates itself by a shared secret in
+another header. These headers are accepted only from an address in `ConsoleSettings.proxies`.
+Accounts are created and get their role from the groups at each sign-in; they have no password.
 """
 
 import hmac

@@ -18,11 +18,11 @@ class Client:
     Parameters
     ----------
     token
-        Token of the API; "" for routes that need none.
+        API token; "" for routes that need none.
     url
         Address of the console.
     timeout
-        Time limit of each request, s.
+        Timeout of each request, s.
     """
 
     def __init__(self, token: str = "", url: str = HERE, timeout: float = 30.0) -> None:
@@ -49,22 +49,22 @@ class Client:
         self._http.close()
 
     def ask(self, method: str, path: str, body: Any = None) -> Any:
-        """Send a request to a path below ``/api/v1/``; return the answer.
+        """Send a request to a path below ``/api/v1/``; return the reply.
 
         Raises
         ------
         RemoteError
-            If the console refuses it, or cannot be reached.
+            If the console refuses the request, or cannot be reached.
         """
         answer = self._request(method, path, body)
         return None if answer.status_code == 204 else answer.json()
 
     def get(self, path: str) -> Any:
-        """Return the answer of a path."""
+        """Return the reply for a path."""
         return self.ask("GET", path)
 
     def picture(self, path: str) -> bytes:
-        """Return the JPEG of a path; see `ask`."""
+        """Return the JPEG for a path; see `ask`."""
         return self._request("GET", path, None).content
 
     def _request(self, method: str, path: str, body: Any) -> httpx.Response:
@@ -86,12 +86,12 @@ class Client:
         return self.ask("POST", "commands", order)
 
     def sign_in(self, name: str, password: str, code: str = "") -> None:
-        """Sign in; later requests are made as this person.
+        """Sign in; later requests are made as this user.
 
         Raises
         ------
         RemoteError
-            If name, password or code is wrong; with status 428 if a code is needed.
+            If name, password or code is wrong; with status 428 if a code is required.
         """
         self._http.cookies.clear()
         who = self.ask("POST", "session", {"name": name, "password": password, "code": code})
@@ -103,7 +103,7 @@ class Client:
         Raises
         ------
         RemoteError
-            If the old one is wrong, or the new one is not accepted.
+            If the old password is wrong, or the new one is not accepted.
         """
         self.ask("PUT", "session/password", {"old": old, "new": new})
 
@@ -113,7 +113,7 @@ class Client:
         Raises
         ------
         RemoteError
-            If the console ends it, or cannot be reached.
+            If the console closes the stream, or cannot be reached.
         """
         from websockets.asyncio.client import connect
         from websockets.exceptions import WebSocketException

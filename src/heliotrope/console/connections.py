@@ -1,9 +1,9 @@
-"""The connections of the console: counted, timed, and closed in favour of known callers.
+"""Console connections: counted, timed, and closed to make room for known callers.
 
-`Listener` accepts the connections of one address; `Doors` is the application in front of its own,
-which notes how far each connection's request is. A connection that has never completed a
-request of a known caller is a stranger's. Strangers have few places and short deadlines, and lose
-the longest-held place to the next connection, so they shut nobody out.
+`Listener` accepts the connections at one address; `Doors` is an application wrapper that notes the
+progress of each connection's request. A connection that has never completed a request from a known
+caller belongs to a stranger. Strangers have few places and short deadlines, and their longest-held
+connection is closed for the next one, so they cannot lock anyone out.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""How often callers may send requests: strangers by address, known callers by person."""
+"""Limits on the request rate: strangers by address, known callers by user."""
 
 import math
 import time

@@ -1,7 +1,7 @@
 """Checks before every request, and before any of its body is read.
 
-Known host names only, a known route, a caller with the role that it needs, a body of the size and
-shape that it accepts; then safe headers on every answer.
+Only known host names, a known route, a caller with the required role, and a body of the accepted
+size and structure pass; safe headers are added to every response.
 """
 
 import contextlib

@@ -1,8 +1,8 @@
-"""Turns for the work that passwords cost: a few at a time, and few that wait.
+"""Queue for password hashing, which is costly: a few at a time, and few that wait.
 
-People who sign in where they have signed in before come first, and have places that strangers
-cannot take: guesses from ever new addresses and names keep none of them out. Whoever has left loses
-their place without a check.
+Users who sign in from where they have signed in before take precedence, and have places that
+strangers cannot take, so guesses with ever new addresses and names cannot lock them out. A client
+that has disconnected loses its place without a check.
 """
 
 import asyncio

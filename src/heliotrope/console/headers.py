@@ -1,4 +1,4 @@
-"""What the headers of a request say: to whom it goes, where it comes from, and whose it is."""
+"""What the request headers say: destination, origin, and client."""
 
 import ipaddress
 from urllib.parse import SplitResult, urlsplit

@@ -1,7 +1,7 @@
-"""The listening sockets of a console: opened once, kept while its processes are started again.
+"""The listening sockets of a console: opened once, and kept while its processes restart.
 
-The plant's process holds them and passes them on, so that connections wait while a process starts,
-and no other program can take a port meanwhile.
+The plant's process holds the sockets and passes them on, so that connections wait while a process
+starts, and no other program can take a port in the meantime.
 """
 
 import socket

@@ -1,9 +1,9 @@
-"""The live stream: one message a second, made once for all viewers.
+"""The live stream: one message per second, created once for all viewers.
 
-A new viewer gets the whole field, then only rows that changed; `stream` holds the messages' form.
+A new viewer gets the whole field, then only rows that changed; `stream` defines the message format.
 
-A slow viewer misses messages, and then gets the whole field again: nothing is queued. A person has
-a few places, and the last ones are for those who may command.
+A slow viewer misses messages, and then gets the whole field again, because nothing is queued. Each
+user has a few places, and the last places are reserved for users who may command.
 """
 
 import asyncio

@@ -1,9 +1,9 @@
-"""Models of the HTTP API: made from the plant's views, and of requests about people.
+"""Models of the HTTP API: derived from the plant's views, and for requests about accounts.
 
-Those of orders stand in `plant.interface.orders`: the plant checks them again.
+The models for orders are in `plant.interface.orders`, because the plant checks them again.
 
-The views of the plant are frozen dataclasses of plain values and arrays. Their models have the same
-names and fields, so each has one description. Unknown numbers (NaN, infinite) are null.
+The plant's views are frozen dataclasses of plain values and arrays. Their models have the same
+names and fields, so each has only one description. Unknown numbers (NaN, infinite) are null.
 """
 
 import dataclasses

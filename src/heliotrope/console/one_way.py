@@ -1,8 +1,8 @@
-"""Sockets whose other end only listens: what it may send is counted in bytes.
+"""Sockets whose other end only listens, with a byte limit on what it may send.
 
-A viewer of the live stream answers the server's pings and closes the socket; both take a few bytes.
-Whatever else it sends (messages, parts of one that never ends, pings whose answers it does not
-read) would be kept in memory, so a connection that sends more is closed.
+A viewer of the live stream replies to the server's pings and closes the socket; both take only a
+few bytes. Anything else that it sends (messages, parts of an endless message, pings whose replies
+it does not read) would be kept in memory, so a connection that sends more is closed.
 """
 
 import time

@@ -1,4 +1,4 @@
-"""The people of the console: the store's accounts, and the first of them."""
+"""The console's users: the accounts in the store, and the first account."""
 
 from heliotrope.console import _secrets
 from heliotrope.plant.orders.authority import Person, Role

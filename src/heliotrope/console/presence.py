@@ -1,8 +1,8 @@
-"""Whether the person of a session is still there: the lock of a page that was left open.
+"""Whether the user of a session is still present: locks a page that was left open.
 
-A page that has ordered nothing for a while goes on showing the field, but its next order needs the
-person's password again. EMERGENCY, DEFOCUS and STOW never do. What a page sends by itself does not
-count: it renews the command authority every few seconds.
+A page that has given no orders for a while continues to show the field, but its next order requires
+the user's password again. EMERGENCY, DEFOCUS and STOW never do. Automatic requests of a page do not
+count, because it renews the command authority every few seconds.
 """
 
 from collections import OrderedDict

@@ -1,8 +1,8 @@
-"""A process of the console: started by the plant's, watched by it, and ended with it.
+"""A console process: started and monitored by the plant's process, and ended with it.
 
 It reads one line of JSON from standard input: the folder of the plant's sockets, the key, the
 settings, and the descriptor of its listening socket. When standard input ends, the plant has ended,
-and so does the process.
+and so does this process.
 """
 
 import asyncio

@@ -1,7 +1,7 @@
-"""The plant as a console sees it: calls over the local interface to the plant's process.
+"""The plant as seen by a console: calls over the local interface to the plant's process.
 
-Errors come back as the classes that the plant raised. EMERGENCY, DEFOCUS and STOW have a standing
-connection of their own.
+Errors are raised as the same classes as in the plant. EMERGENCY, DEFOCUS and STOW have their own
+persistent connection.
 """
 
 import asyncio

@@ -1,9 +1,9 @@
-"""Whose sessions and tokens are valid: one picture of all of them, read from the store as needed.
+"""Whose sessions and tokens are valid: a snapshot of all of them, read from the store as needed.
 
-Whoever is in it is known at once, also by a process that has never met them. A secret that is not
-in it waits for the next reading, which all such requests share: neither the store nor anybody who
-is known is the slower for what strangers send. While the store does not answer, the last picture
-says who may order an EMERGENCY.
+A caller in the snapshot is recognised at once, also by a process that has never served them. An
+unknown secret waits for the next read, which all such requests share, so requests from strangers
+slow down neither the store nor known callers. If the store does not respond, the last snapshot
+determines who may order an EMERGENCY.
 """
 
 import asyncio

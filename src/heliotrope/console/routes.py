@@ -1,4 +1,4 @@
-"""The routes of the console with the role and the size of body that each accepts.
+"""The routes of the console, with the role and the body size that each accepts.
 
 The guard looks a request up here before any of its body is read.
 """

@@ -1,4 +1,4 @@
-"""Run the console over a plant in its own process."""
+"""Runs the console for a plant, in its own process."""
 
 import socket
 

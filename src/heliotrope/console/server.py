@@ -1,4 +1,4 @@
-"""One listener served by uvicorn, its connections counted and timed, its certificate renewed."""
+"""One listener served by uvicorn: connections counted and timed, certificate renewed."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""Signing in: a name and a password, checked no faster than guessing may go."""
+"""Sign-in with a name and a password, checked no faster than guessing may proceed."""
 
 import asyncio
 import math

@@ -34,7 +34,7 @@ ROW = np.dtype(
 
 
 class RemoteError(HeliotropeError):
-    """The refusal of a request by the console; ``status`` is 0 if it cannot be reached."""
+    """The console refused a request; ``status`` is 0 if the console cannot be reached."""
 
     def __init__(self, text: str, status: int = 0) -> None:
         super().__init__(text)
@@ -71,7 +71,7 @@ def read_message(data: bytes) -> LiveMessage:
     Raises
     ------
     RemoteError
-        If the bytes are not one.
+        If the bytes are not a message.
     """
     if len(data) < 8 or data[:4] != MARK:
         raise RemoteError(f"live stream: {len(data)} bytes that do not begin with {MARK.decode()}")

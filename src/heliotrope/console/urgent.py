@@ -1,9 +1,9 @@
-"""EMERGENCY by a way of its own: a second listener, in a process of its own, that serves only that.
+"""A separate path for EMERGENCY: a second listener, in its own process, that serves only that.
 
-The page sends its order by the ordinary way and by this one at the same time. Both carry the same
-word, so the plant gives the order once. This process needs little of the house, holds nothing but
-the roster of those who may call, and asks the plant by the socket for emergencies alone: whatever
-holds the console up, or ends it, does not reach it.
+The page sends its order over the ordinary path and over this one at the same time. Both carry the
+same identifier, so the plant gives the order only once. This process depends on little else, holds
+only the roster of those who may call, and calls the plant through the socket for emergencies alone,
+so whatever blocks or ends the console does not affect it.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The process of the way for EMERGENCY alone, started by `heliotrope run`; see `urgent`.
+"""The process for the EMERGENCY path alone, started by `heliotrope run`; see `urgent`.
 
 ``python -m heliotrope.console.urgent_process``
 """

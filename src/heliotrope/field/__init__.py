@@ -1,8 +1,8 @@
-"""Many heliostats, the tower with its targets and receiver, and the cameras that look at them.
+"""Many heliostats, the tower with its targets and receiver, and the cameras that observe them.
 
-`Plant` holds everything: the site, `Heliostats` in groups of one kind of mechanism, `Target`s,
-`Receiver`s, `Camera`s and keep-out volumes. `formats` reads and writes plants; `layouts` makes new
-ones; `example_plant` has 18 heliostats, `prototype` is Malan's.
+`Plant` holds everything: the site, `Heliostats` in groups with one kind of mechanism each,
+`Target`s, `Receiver`s, `Camera`s and keep-out volumes. `formats` reads and writes plants, and
+`layouts` generates new ones; `example_plant` has 18 heliostats, and `prototype` is Malan's plant.
 """
 
 from heliotrope.field.approval import (

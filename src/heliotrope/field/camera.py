@@ -1,13 +1,13 @@
-"""The camera model: a pinhole with a distorting lens, posed in ENU.
+"""The camera model: a pinhole camera with lens distortion and a pose in ENU.
 
 One convention serves target cameras and drones. Camera axes are x right, y down, z forward.
-``R_enu_camera`` turns them into ENU, so its columns are the camera's axes and
+``R_enu_camera`` rotates them into ENU, so its columns are the camera axes and
 
     point = position + R_enu_camera @ local
 
-A point ``local`` is seen at the normalised place ``(x/z, y/z)``, which the lens distorts (Brown
-and Conrady: k1, k2, p1, p2, k3), and ``matrix`` maps to pixels. The centre of the first pixel is
-(0, 0). OpenCV inverts the distortion; it is imported at the first use.
+A point ``local`` appears at the normalised coordinates ``(x/z, y/z)``, which the lens distorts
+(Brown and Conrady: k1, k2, p1, p2, k3) and ``matrix`` maps to pixels. The centre of the first pixel
+is (0, 0). OpenCV inverts the distortion; it is imported on first use.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ class Pinhole(Protocol):
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that looks at targets.
+    """A camera that observes targets.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Camera:
     targets
         Names of the targets in view; empty means any.
     source
-        Source of frames: a folder, a video, an address or a device.
+        Source of frames: a folder, a video, a network address or a device.
     deviation
         RMS residual of the calibration, px; 0 if it was never calibrated.
     """

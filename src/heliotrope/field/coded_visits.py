@@ -1,7 +1,7 @@
-"""Settings of coded visits: several heliostats measured at once, told apart by their movements.
+"""Settings of coded visits: several heliostats measured at once, identified by their movements.
 
-They belong to a plant: its targets and its receiver, its mirrors, its drives. Each number stands
-once, here, with its unit in the plant file, its limits and its meaning.
+They belong to a plant, because they depend on its targets, receiver, heliostats and drives. Each
+number is defined once, in this module, with its unit in the plant file, its limits and its meaning.
 """
 
 import math
@@ -137,14 +137,14 @@ class JointSettings(CodedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ReceiverSettings(CodedSettings):
-    """Settings of receiver visits: heliostats measured where they shine; see `CodedSettings`.
+    """Settings of receiver visits: heliostats measured as they track it; see `CodedSettings`.
 
     Attributes
     ----------
     camera
-        Name of the camera that sees the whole receiver; its position is known.
+        Name of the camera that sees the whole receiver; the position of the camera must be known.
     receiver
-        Name of the receiver, which is planar.
+        Name of the receiver, which must be planar.
     """
 
     kind: ClassVar[str] = "receiver visits"

@@ -1,4 +1,4 @@
-"""A heliostat, or a plant, through one day."""
+"""The tracking of a heliostat, or of a plant, through one day."""
 
 from dataclasses import dataclass
 from datetime import date, timedelta
@@ -85,7 +85,7 @@ def track_day(
     min_elevation: float = 0.0,
     over_the_top: bool = False,
 ) -> TrackedDay:
-    """Return the poses that follow the sun through a day, as one path (see `track_path`).
+    """Return the poses that track the sun through a day, as one path (see `track_path`).
 
     Parameters
     ----------
@@ -95,20 +95,20 @@ def track_day(
         Date of local mean solar time.
     aim
         Name of a target of the plant, a target or receiver, or points (m), (3,) or (N, 3). By
-        default the heliostat's own aim, or the plant's first target.
+        default the heliostat's own aim, or the first target of the plant.
     site
-        Place, if only mechanisms are given.
+        Site, if only mechanisms are passed.
     every, min_elevation
-        Step, and lowest apparent elevation of the sun, rad; see `heliotrope.sun.daylight`.
+        Time step, and lowest apparent elevation of the sun, rad; see `heliotrope.sun.daylight`.
     over_the_top
-        Whether the mirror may go over the top wherever that saves slews or motion.
+        Whether a heliostat may go over the top wherever that saves slews or motion.
 
     Raises
     ------
     InputError
         If there is no site or no aim, or the sun does not rise that day.
     UnknownNameError
-        If there is no such target.
+        If the target does not exist.
     """
     known = isinstance(heliostat, Heliostat | Plant)
     place = site or (heliostat.site if isinstance(heliostat, Heliostat | Plant) else None)

@@ -1,8 +1,8 @@
-"""An example plant of 18 heliostats, ours: finer gears and larger mirrors than the prototype.
+"""Our own example plant of 18 heliostats, with finer gears and larger mirrors than the prototype.
 
-Six groups of three heliostats of 2.2 m², south of a tower at Stellenbosch with a target 13 m up.
-One of them is where Malan calibrated his (30.8 m south, 19.2 m east, its pivot 1.2 m up).
-His own machine is `stellenbosch.prototype`.
+Six groups of three heliostats of 2.2 m², south of a tower at Stellenbosch with a target 13 m above
+ground. One of them stands where Malan calibrated his heliostat (30.8 m south, 19.2 m east, pivot
+height 1.2 m). Malan's own plant is `stellenbosch.prototype`.
 """
 
 import numpy as np
@@ -79,10 +79,10 @@ def azimuth_elevation(position: FloatArray) -> Mechanism:
 
 
 def roughly_installed(nominal: Mechanism, seed: int = 0, scale: float = 1.0) -> Mechanism:
-    """Return mechanisms with the errors of a quick installation, for simulations.
+    """Return mechanisms with the errors of a rough installation, for simulations.
 
-    Standard deviations: tilts 10 mrad, encoder zeros 5 mrad, non-orthogonality and
-    canting 2 mrad, position 20 mm; ``scale`` multiplies them.
+    Standard deviations: tilts 10 mrad, encoder offsets 5 mrad, non-orthogonality and canting 2
+    mrad, position 20 mm; ``scale`` multiplies all of them.
     """
     rng = np.random.default_rng(seed)
     sizes = {

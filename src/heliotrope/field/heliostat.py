@@ -1,4 +1,4 @@
-"""One heliostat of a plant: what `Plant` gives for a name."""
+"""One heliostat of a plant, as returned by ``plant[name]``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from heliotrope.values import Card, Value
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Heliostat(Value, Framed):
-    """One heliostat, as ``plant["P6A"]`` gives it; `track` takes it like a plant of one.
+    """One heliostat, as returned by ``plant["P6A"]``; `track` accepts it like a plant of one.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class Heliostat(Value, Framed):
     group
         Name of its group in the plant.
     site
-        The plant's reference point: the origin of ENU.
+        Reference point of the plant: the origin of ENU.
     targets
         The plant's targets.
     """
@@ -69,32 +69,33 @@ class Heliostat(Value, Framed):
         return self.calibrated.deviations
 
     def with_calibration(self, calibration: Calibrated) -> "Heliostat":
-        """Return the heliostat with a calibration in place of its own deviations.
+        """Return the heliostat with its own deviations replaced by those of a calibration.
 
-        Of a calibration of many heliostats it takes the row of its name.
+        From a calibration of many heliostats it takes the entry with its name.
 
         Raises
         ------
         InputError
-            If it is no calibration, or one of many heliostats without names.
+            If it is not a calibration, or covers several heliostats without names.
         UnknownNameError
-            If it does not name this heliostat, or the mechanism lacks one of its parameters.
+            If the calibration does not include this heliostat, or the mechanism lacks one of its
+            parameters.
         """
         return replace(self, heliostats=self.heliostats.with_calibration(calibration))
 
     @property
     def armature(self) -> Armature:
-        """Of the calibrated mechanism, batch shape ()."""
+        """Armature of the calibrated mechanism, batch shape ()."""
         return self.calibrated.armature
 
     @property
     def drives(self) -> Drive:
-        """Of the calibrated mechanism, batch shape (D,)."""
+        """Drives of the calibrated mechanism, batch shape (D,)."""
         return self.calibrated.drives
 
     @property
     def attachment(self) -> FloatArray:
-        """Of the calibrated mechanism, (4, 4); see `Mechanism.attachment`."""
+        """Attachment of the calibrated mechanism, (4, 4); see `Mechanism.attachment`."""
         return self.calibrated.attachment
 
     @property
@@ -114,15 +115,15 @@ class Heliostat(Value, Framed):
 
     @property
     def aim(self) -> FloatArray | None:
-        """Aim point in operation, ENU metres, (3,); None where the plant gives none."""
+        """Aim point in operation, ENU metres, (3,); None if the plant does not specify one."""
         return self.heliostats.own_aim(0)
 
     @property
     def cluster(self) -> str:
-        """Name of its cluster; empty without one."""
+        """Name of its cluster; empty if it has none."""
         return self.heliostats.cluster[0] if self.heliostats.cluster else ""
 
     @property
     def machine(self) -> Machine | None:
-        """Motor limits and resting places; None where the plant file gives none."""
+        """Motor limits and rest positions; None if the plant file does not specify them."""
         return self.heliostats.machines[0] if self.heliostats.machines else None

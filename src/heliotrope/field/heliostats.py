@@ -1,4 +1,4 @@
-"""Heliostats of one kind, as arrays."""
+"""Heliostats of one kind, stored as arrays."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -21,15 +21,15 @@ from heliotrope.values import Card, Value, amount, card_of_arrays, dots, span
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Facets(Value):
-    """F facets of each of N heliostats, in the mirror's frame (x right, y up, z out of it).
+    """F facets of each of N heliostats, in the mirror frame (x right, y up, z outwards).
 
     Attributes
     ----------
     center
-        Centres of the facets from the mirror's vertex, m, (N, F, 3).
+        Centres of the facets relative to the mirror vertex, m, (N, F, 3).
     half_width, half_height
-        Vectors from a facet's centre to the middle of its right and its upper edge, m,
-        (N, F, 3); their cross product is the facet's normal.
+        Vectors from the centre of a facet to the midpoints of its right and its upper edge, m, (N,
+        F, 3); their cross product is along the facet normal.
     """
 
     center: FloatArray
@@ -54,7 +54,7 @@ class Heliostats(Value, Framed):
     names
         Unique.
     mechanism
-        Nominal mechanisms, batch shape (N,), in ENU metres about the plant's reference point.
+        Nominal mechanisms, batch shape (N,), in ENU metres about the reference point of the plant.
     width, height
         Size of the mirror, m, (N,).
     facets
@@ -63,11 +63,12 @@ class Heliostats(Value, Framed):
         Calibrated deviations from the nominal mechanism, by parameter name, in rad, m or 1,
         each (N,).
     aim
-        Aim points in operation, ENU metres, (N, 3); NaN where not given.
+        Aim points in operation, ENU metres, (N, 3); NaN if not specified.
     cluster
-        Name of each heliostat's cluster; empty without one.
+        Name of each heliostat's cluster; empty if it has none.
     machines
-        Motor limits and resting places of each, or () where the plant file gives none.
+        Motor limits and rest positions of each heliostat, or () if the plant file does not specify
+        them.
     """
 
     names: tuple[str, ...]
@@ -130,7 +131,7 @@ class Heliostats(Value, Framed):
         return self.labelled()
 
     def labelled(self) -> Labelled:
-        """Return the arrays with their axes, as a frame of one heliostat takes them too."""
+        """Return the arrays with their axes, as a frame of one heliostat uses them too."""
         row = ("heliostat",)
         variables = {
             "position": Variable((*row, "axis"), self.position, "m"),
@@ -182,11 +183,11 @@ class Heliostats(Value, Framed):
 
     @property
     def attachment(self) -> FloatArray:
-        """Of the calibrated mechanisms, (N, 4, 4); see `Mechanism.attachment`."""
+        """Attachments of the calibrated mechanisms, (N, 4, 4); see `Mechanism.attachment`."""
         return self.calibrated.attachment
 
     def own_aim(self, row: int) -> FloatArray | None:
-        """Return the aim point of a row, ENU metres, (3,); None where none is given."""
+        """Return the aim point of the heliostat at an index, ENU metres, (3,); None if not set."""
         if self.aim is None or not np.isfinite(self.aim[row]).all():
             return None
         return np.asarray(self.aim[row])
@@ -196,7 +197,7 @@ class Heliostats(Value, Framed):
         return {name: i for i, name in enumerate(self.names)}
 
     def index(self, name: str) -> int:
-        """Return the row of heliostat ``name``.
+        """Return the index of heliostat ``name``.
 
         Raises
         ------
@@ -209,7 +210,7 @@ class Heliostats(Value, Framed):
             raise UnknownNameError("heliostat", name, self.names) from None
 
     def take(self, rows: npt.ArrayLike) -> "Heliostats":
-        """Return the heliostats at ``rows`` (indices or a mask), in that order."""
+        """Return the heliostats at indices ``rows`` (or a mask), in that order."""
         index = np.asarray(rows)
         if index.dtype == bool:
             index = np.flatnonzero(index)
@@ -240,22 +241,23 @@ class Heliostats(Value, Framed):
         return replace(self, parameters={n: as_float(v) for n, v in parameters.items()})
 
     def with_calibration(self, calibration: Calibrated) -> "Heliostats":
-        """Return the heliostats with a calibration in place of their own deviations.
+        """Return the heliostats with their own deviations replaced by those of a calibration.
 
-        Heliostats that it does not name keep theirs. A calibration without names must be one for
-        all of them, or hold one row for each.
+        Heliostats that the calibration does not include keep their deviations. A calibration
+        without names must be one for all heliostats, or contain one entry per heliostat.
 
         Raises
         ------
         InputError
-            If it is no calibration, or has neither names nor as many rows.
+            If it is not a calibration, or has neither names nor the right number of entries.
         UnknownNameError
-            If it names none of these heliostats, or they lack one of its parameters.
+            If the calibration includes none of these heliostats, or they lack one of its
+            parameters.
         """
         return self.with_rows(calibration, rows_in(calibration, self.names))
 
     def with_rows(self, calibration: Calibrated, rows: npt.NDArray[np.intp]) -> "Heliostats":
-        """Return the heliostats with given rows of a calibration, (N,); −1 keeps their own."""
+        """Return the heliostats with given entries of a calibration, (N,); −1 keeps their own."""
         fitted, merged = calibration.parameters, {}
         for name in dict.fromkeys((*self.parameters, *fitted)):
             own = self.parameters.get(name, np.zeros(len(self)))

@@ -1,4 +1,4 @@
-"""The picture of a field: all of it, and some mirrors near the tower to scale."""
+"""Plot of a field: an overview, and some heliostats near the tower to scale."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The middle of a generated field: targets with marks, their cameras, receivers."""
+"""The centre of a generated field: targets with marks, their cameras, receivers."""
 
 import numpy as np
 

@@ -1,14 +1,14 @@
-"""Generated fields: positions of heliostats, and whole plants around them.
+"""Generated fields: heliostat positions, and whole plants around them.
 
-Four patterns: rings whose mirrors stand before the gaps of the ring in front (radial staggered),
-rows in two fields north and south of the tower, and from Malan his twin field (figure 3.2) and his
-triangles of six on arcs (figure 5.5). A mirror turns in any direction about its pivot, so two
-mirrors stand further apart than a diagonal and a clearance; every generator keeps this distance,
-and `nearest_gap` checks it.
+Four patterns: radial staggered (rings whose heliostats face the gaps of the ring in front), rows in
+two fields north and south of the tower, and from Malan his twin field (figure 3.2) and his
+triangles of six on arcs (figure 5.5). A mirror may face in any direction about its pivot, so two
+heliostats must be further apart than a mirror diagonal plus a clearance; every generator keeps this
+distance, and `nearest_gap` checks it.
 
-Malan's thesis gives the size of his plant: 5 MWe, 10,000 heliostats of 5 m² on 100,000 m² of
-ground, a cluster controller for every 32 of them. Site, tower, receiver, targets and gears are
-ours.
+Malan's thesis states the size of his plant: 5 MWe, 10,000 heliostats of 5 m² on 100,000 m² of
+ground, and one cluster controller per 32 heliostats. Site, tower, receiver, targets and gears are
+our own.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Marks on a target: a camera finds the target by them."""
+"""Marks on a target, by which a camera locates the target."""
 
 from dataclasses import dataclass
 
@@ -29,16 +29,16 @@ class Mark:
     kind
         One of `KINDS`.
     point
-        ENU metres, (3,), of the point of the drawing given in `KINDS`.
+        ENU metres, (3,), of the reference point of the drawing defined in `KINDS`.
     size
-        Length of an L's arm, of a T's bar and stem, side or diameter, m.
+        Arm length of an L, bar and stem length of a T, side or diameter, m.
     stroke
-        Width of the strokes of a corner or a tee, m.
+        Stroke width of a corner or a tee, m.
     turn
         Rotation of the drawing, counterclockwise as seen from the front, rad.
     code
-        For a tag, OpenCV dictionary and number, "4X4_50:7" or "APRILTAG_36h11:7"; for a
-        picture, its file beside the plant file.
+        For a tag, OpenCV dictionary and number, "4X4_50:7" or "APRILTAG_36h11:7"; for a picture,
+        the name of its file beside the plant file.
     """
 
     name: str

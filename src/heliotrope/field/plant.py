@@ -43,29 +43,29 @@ class Plant(Value, Framed):
     site
         Reference point: the origin of ENU.
     groups
-        Heliostats of one kind of mechanism each, by group name; names of heliostats are
-        unique over all groups.
+        Heliostats by group name, with one kind of mechanism per group; heliostat names are unique
+        over all groups.
     targets, receivers
         Surfaces that beams are sent to.
     notes
-        Remarks of the reader, by subject.
+        Notes of the reader, by subject.
     cameras
         Cameras that look at the targets.
     keep_outs
         Volumes that no beam may enter.
     eyes
-        Points from which people may look into standby beams, ENU, m, (3,), by name.
+        Points from which people may see standby beams, ENU, m, (3,), by name.
     joint_visits
-        Settings of visits of several heliostats to one target at once; None: each is calibrated
-        alone.
+        Settings of joint visits, in which several heliostats are measured on one target at once;
+        None: each is calibrated alone.
     receiver_visits
-        How heliostats are measured on the receiver; None: they are not.
+        Settings of receiver visits; None: heliostats are not measured on the receiver.
     timetable
-        Calibrations at times of day and at intervals, as people want them.
+        Calibrations that operators have scheduled, at times of day and at intervals.
     safety
-        Numbers of the safety table that this plant sets; see `safety.limits`.
+        Entries of the safety table that this plant overrides; see `safety.limits`.
     approval
-        Which changes by a person need a second one.
+        Changes by an operator or engineer that need a second approval.
     """
 
     name: str
@@ -177,7 +177,7 @@ class Plant(Value, Framed):
         }
 
     def find(self, name: str) -> tuple[Heliostats, int]:
-        """Return the group and the row of heliostat ``name``.
+        """Return the group of heliostat ``name`` and its index in the group.
 
         Raises
         ------
@@ -215,7 +215,7 @@ class Plant(Value, Framed):
         Raises
         ------
         InputError
-            If the plant has heliostats of several kinds; take its groups one by one then.
+            If the plant has heliostats of several kinds; use its groups one by one instead.
         """
         return join_mechanisms([g.mechanism for g in self.groups.values()])
 
@@ -230,17 +230,18 @@ class Plant(Value, Framed):
         return self.calibrated.deviations
 
     def with_calibration(self, calibration: Calibrated) -> "Plant":
-        """Return the plant with a calibration in place of its heliostats' own deviations.
+        """Return the plant with its heliostats' own deviations replaced by those of a calibration.
 
-        Heliostats that it does not name keep theirs. A calibration without names must hold one
-        row for each heliostat, in the order of ``names``.
+        Heliostats that the calibration does not include keep their deviations. A calibration
+        without names must contain one entry per heliostat, in the order of ``names``.
 
         Raises
         ------
         InputError
-            If it is no calibration, or has neither names nor as many rows.
+            If it is not a calibration, or has neither names nor the right number of entries.
         UnknownNameError
-            If it names none of the heliostats, or a kind lacks one of its parameters.
+            If the calibration includes none of the heliostats, or a kind of mechanism lacks one of
+            its parameters.
         """
         rows, groups, start = rows_in(calibration, self.names), {}, 0
         for name, group in self.groups.items():
@@ -250,14 +251,14 @@ class Plant(Value, Framed):
         return self.with_groups(groups)
 
     def machine(self, name: str) -> Machine:
-        """Return motor limits and resting places of one heliostat.
+        """Return the motor limits and rest positions of one heliostat.
 
         Raises
         ------
         InputError
-            The heliostat's group has none.
+            If the heliostat's group has none.
         UnknownNameError
-            There is no heliostat of that name.
+            If there is no heliostat of that name.
         """
         heliostats, row = self.find(name)
         if not heliostats.machines:
@@ -298,7 +299,7 @@ class Plant(Value, Framed):
         Raises
         ------
         InputError
-            If some heliostats have one drive and others two; take the groups one by one then.
+            If some heliostats have one drive and others two; use the groups one by one instead.
         """
         tables = [g.calibrated.drives.table for g in self.groups.values()]
         if len({table.shape[-2] for table in tables}) > 1:
@@ -310,16 +311,16 @@ class Plant(Value, Framed):
 
     @cached_property
     def attachment(self) -> FloatArray:
-        """Of all calibrated heliostats, (N, 4, 4); see `Mechanism.attachment`."""
+        """Attachments of all calibrated heliostats, (N, 4, 4); see `Mechanism.attachment`."""
         frames = [g.attachment for g in self.groups.values()]
         return np.concatenate(frames or [np.empty((0, 4, 4))])
 
     def with_notes(self, notes: Mapping[str, str]) -> "Plant":
-        """Return the plant with further remarks."""
+        """Return the plant with additional notes."""
         return replace(self, notes={**self.notes, **notes})
 
     def with_groups(self, groups: Mapping[str, Heliostats]) -> "Plant":
-        """Return the plant with other heliostats."""
+        """Return the plant with its heliostats replaced."""
         return replace(self, groups=dict(groups))
 
 

@@ -1,15 +1,16 @@
 """Malan's prototype: the eighteen heliostats on the roof laboratory at Stellenbosch.
 
-From the thesis: three triangular structures of six heliostats, one cluster each (5.2, 5.3);
-mirrors of 0.3 m by 0.3 m; 200-step motors in eighths of a step behind a worm of 30:1, which makes
-48,000 steps a turn, 0.13 mrad each (5.1.2); two targets of 2 m by 2 m on a lattice tower of 18 m
-in the north-west, about 40 m from the upper one to the middle of the heliostats (6.1), the lower
-one 13 m up (4.3); the heliostat of 6.3, 30.8 m south and 19.2 m east of the tower with its pivot
-1.2 m up; and stow, the mirror upright and facing north (6.5). Beams go to the upper target, which
-serves as the receiver, or to the lower one for calibration.
+From the thesis: three triangular structures of six heliostats, one cluster each (5.2, 5.3); mirrors
+of 0.3 m by 0.3 m; 200-step motors with eighth steps behind a 30:1 worm gear, which gives 48,000
+steps per revolution, 0.13 mrad each (5.1.2); two targets of 2 m by 2 m on an 18 m lattice tower in
+the north-west, about 40 m from the upper target to the middle of the heliostats (6.1), with the
+lower target 13 m above ground (4.3); the heliostat of 6.3, 30.8 m south and 19.2 m east of the
+tower with its pivot 1.2 m above ground; and stow, with the mirror upright and facing north (6.5).
+Beams go to the upper target, which serves as the receiver, or to the lower target for calibration.
 
-The thesis does not give the size of a structure, the place of the other heliostats, the bearing of
-the targets, the motors' rate, the camera's place or the latitude: these are ours.
+The thesis does not state the size of a structure, the positions of the other heliostats, the
+bearing of the targets, the motor speed, the camera position or the latitude; these are our own
+assumptions.
 """
 
 from dataclasses import replace

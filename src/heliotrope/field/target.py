@@ -25,14 +25,14 @@ class Target(Value):
     name
         Unique in the plant.
     corners
-        Upper left, upper right, lower right, lower left as seen from the front (from
-        where the beams come), ENU metres, (4, 3).
+        Upper left, upper right, lower right, lower left as seen from the front (the side that the
+        beams come from), ENU metres, (4, 3).
     center
         Aim point of the heliostats, ENU metres, (3,).
     markers
-        Further known points by name, ENU metres.
+        Additional known points by name, ENU metres.
     marks
-        Marks painted on it; cameras find it by them.
+        Marks painted on the target, by which cameras locate it.
     """
 
     name: str
@@ -105,32 +105,33 @@ class Target(Value):
 
     @cached_property
     def normal(self) -> FloatArray:
-        """Unit normal out of the front, (3,)."""
+        """Unit normal on the front side, (3,)."""
         return normalize(np.cross(self._across, self._up))
 
     @property
     def upside_down(self) -> bool:
-        """Whether its upper edge is the lower one."""
+        """Whether the edge that is named upper is the lower one."""
         return bool(self._up[2] < 0.0)
 
     @cached_property
     def axes(self) -> FloatArray:
-        """Unit axes in the plane, to the right as seen from the front, and up, (2, 3)."""
+        """Unit axes in the plane: to the right as seen from the front, and up, (2, 3)."""
         right = normalize(self._across)
         return np.stack([right, np.cross(self.normal, right)])
 
     def plane_coordinates(self, points: npt.ArrayLike) -> FloatArray:
-        """Return metres to the right of and above the center, (..., 2), of ENU points (..., 3)."""
+        """Return metres to the right of and above the centre, (..., 2), for ENU points (..., 3)."""
         return (as_vectors(points, "points") - self.center) @ self.axes.T
 
     def point(self, plane: npt.ArrayLike) -> FloatArray:
-        """Return ENU points (..., 3) from metres right of and above the center (..., 2)."""
+        """Return ENU points (..., 3) from metres to the right of and above the centre (..., 2)."""
         return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
 
     def holds(self, points: npt.ArrayLike, off: float = _DEPTH) -> npt.NDArray[np.bool_]:
-        """Return the mask of points (..., 3), ENU, on the target; NaN is not on it.
+        """Return the mask of ENU points (..., 3) that are on the target; NaN is not on it.
 
-        They are within its border, and at most ``off`` m in front of or behind it.
+        A point is on the target if it is within the border and at most ``off`` m in front of or
+        behind the surface.
         """
         array = np.asarray(points, dtype=np.float64)
         away = array - self.center
@@ -140,7 +141,7 @@ class Target(Value):
         return np.asarray(inside.all(axis=-1) & (np.abs(away @ self.normal) <= off))
 
     def intersect(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> FloatArray:
-        """Return where rays (..., 3) meet the target's plane, ENU; NaN where they miss it."""
+        """Return where rays (..., 3) meet the target plane, ENU; NaN where they miss it."""
         o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
         towards = np.asarray(d @ self.normal)
         gap = np.asarray((self.center - o) @ self.normal)
@@ -163,7 +164,7 @@ class Receiver(Value):
     center
         ENU metres, (3,).
     normal
-        Unit normal out of the aperture, (3,).
+        Unit normal of the aperture, pointing outwards, (3,).
     width, height
         Size of the aperture, m; diameter and height of an external cylinder.
     corners
@@ -205,18 +206,18 @@ class Receiver(Value):
         object.__setattr__(self, "normal", normal)
 
     def point(self, right: float, up: float) -> FloatArray:
-        """Return a point of the surface, ENU m, (3,), by its place on the unrolled surface.
+        """Return a point on the surface, ENU m, (3,), from its position on the unrolled surface.
 
         Parameters
         ----------
         right, up
             Lengths along the surface from its middle as seen from outside, m. The middle of a full
-            cylinder is where its normal points, or north.
+            cylinder is in the direction of its normal or, without a normal, north.
 
         Raises
         ------
         InputError
-            If it is not on the surface.
+            If the position is not on the surface.
         """
         turns = {"convex_cylinder": self.opening_angle, "external_cylinder": 2.0 * np.pi}
         turn, radius = turns.get(self.kind, 0.0), self.radius or 0.5 * self.width
@@ -244,12 +245,12 @@ class Receiver(Value):
 
     @cached_property
     def face(self) -> Target:
-        """The aperture of a planar receiver as a surface that a camera sees.
+        """The aperture of a planar receiver, as a surface that a camera can see.
 
         Raises
         ------
         InputError
-            A receiver of another kind.
+            If the receiver is of another kind.
         """
         if self.kind != "planar":
             raise InputError(

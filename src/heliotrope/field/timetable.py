@@ -1,8 +1,8 @@
-"""The timetable of calibrations: which heliostats people want on a target, and when.
+"""The calibration timetable: which heliostats operators want calibrated on a target, and when.
 
-It is Malan's calibration schedule (5.6.1): the operator chooses heliostats and times, and the
-commands follow from that. The schedule of automatic control, which chooses by expected gain, goes
-on beside it.
+This is Malan's calibration schedule (5.6.1): the operator chooses heliostats and times, and the
+commands follow from that choice. The schedule of automatic control, which chooses by expected gain,
+runs alongside.
 """
 
 import math
@@ -28,28 +28,29 @@ RULES = ("first", "never")
 
 @dataclass(frozen=True)
 class TimetableEntry:
-    """Heliostats that are calibrated at times of day, at intervals, or both; or a rule for them.
+    """Heliostats to calibrate at times of day, at intervals, or both; or a rule for them.
 
     Attributes
     ----------
     name
-        Unique in its timetable.
+        Name of the entry, unique in its timetable.
     heliostats
         Names, in the order in which they are calibrated.
     target
-        Name; "": any that is free.
+        Name of the target; "": any free target.
     at
-        Times of day with their zone, as "08:30Z" or "10:30+02:00".
+        Times of day with their time zone, as "08:30Z" or "10:30+02:00".
     every
         Interval, s, counted from midnight UTC; None: only ``at``.
     rule
-        "" for times; "first": automatic control takes them before others whenever a visit is worth
-        it; "never": it takes none of them, only persons do. A rule has neither times nor a target.
+        "" for entries with times; "first": automatic control visits them before others whenever a
+        visit is worthwhile; "never": automatic control does not visit them, only operators do. A
+        rule has neither times nor a target.
 
     Raises
     ------
     InputError
-        If it has no heliostat or no time, or a time or the interval cannot be.
+        If it has no heliostat or no time, or a time or the interval is invalid.
     """
 
     name: str
@@ -85,7 +86,7 @@ class TimetableEntry:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> "TimetableEntry":
-        """Return the entry of a document with the keys of the plant file."""
+        """Return the entry from a document with the keys of the plant file."""
         return cls(
             document["name"],
             tuple(document["heliostats"]),
@@ -97,7 +98,7 @@ class TimetableEntry:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The entry with the keys of the plant file; what is not set is left out."""
+        """The entry with the keys of the plant file; values that are not set are left out."""
         rest: dict[str, Any] = {"target": self.target, "at": list(self.at), "every_s": self.every}
         rest["rule"] = self.rule
         settings = {key: value for key, value in rest.items() if value}
@@ -105,17 +106,17 @@ class TimetableEntry:
 
     @cached_property
     def seconds(self) -> FloatArray:
-        """When it is due on each day, s after midnight UTC, ascending, (K,)."""
+        """Times at which the entry is due on each day, s after midnight UTC, ascending, (K,)."""
         often = np.arange(0.0, DAY, self.every) if self.every is not None else np.zeros(0)
         named = [_second_of_day(self.name, text) for text in self.at]
         return np.unique(np.concatenate([often, named]))
 
     def due(self, since: float, until: float) -> bool:
-        """Return whether it was due after ``since`` and up to ``until``, POSIX s."""
+        """Return whether the entry was due after ``since`` and up to ``until``, POSIX s."""
         return not self.rule and self.next(since) <= until
 
     def next(self, after: float) -> float:
-        """Return when it is due first after a time, POSIX s; NaN for a rule."""
+        """Return when the entry is next due after a given time, POSIX s; NaN for a rule."""
         if self.rule:
             return math.nan
         day = math.floor(after / DAY) * DAY

@@ -12,7 +12,7 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball: name, centre (ENU, m, (3,)) and radius (m)."""
+    """A sphere: name, centre (ENU, m, (3,)) and radius (m)."""
 
     name: str
     center: npt.ArrayLike
@@ -54,7 +54,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A cylinder between two points of its axis, such as a tower or an approach corridor.
+    """A cylinder, such as a tower or an approach corridor, with a given axis.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Prism:
     name
         Name shown to operators.
     corners
-        Polygon, in order, either way round, east and north, m, (K, 2), K ≥ 3.
+        Polygon corners in order, clockwise or counterclockwise, east and north, m, (K, 2), K ≥ 3.
     bottom, top
         Heights, m.
     """
@@ -143,7 +143,7 @@ _ROUND = 24
 
 
 def outline(volume: Volume) -> FloatArray:
-    """Return the polygon of a volume on a map: corners in order, east and north, m, (K, 2)."""
+    """Return the outline of a volume on a map: polygon corners, east and north, m, (K, 2)."""
     turn = np.linspace(0.0, 2.0 * np.pi, _ROUND, endpoint=False)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     match volume:

@@ -1,14 +1,14 @@
-"""Reading and writing files safely, with errors that name the file and the place in it.
+"""Safe reading and writing of files, with errors that name the file and the place in it.
 
-- `limits`: size, depth, count and expansion that no file may exceed, for all readers.
-- `kinds`: what a file is that another program, or another command, reads.
-- `text`: whole text files and binary files; written whole or not at all.
-- `json`, `xml`: documents whose values know their place in the file.
-- `documents`: TOML files of our own formats, checked against pydantic models. Its names stay
-  there, because pydantic is slow to load.
+- `limits`: size, depth, count and expansion limits for all readers.
+- `kinds`: recognises files that another program, or another command, reads.
+- `text`: complete text and binary files; written completely or not at all.
+- `json`, `xml`: documents whose values know their position in the file.
+- `documents`: TOML files of our own formats, checked against pydantic models. Its names stay there,
+  because pydantic is slow to load.
 - `disk`: work that waits for a disk, outside an event loop.
-- `archives`: members of a ZIP and arrays of NumPy, measured before they are expanded.
-- `cells`: the one reader of tables (CSV in the fashions of spreadsheets, Parquet), cell by cell.
+- `archives`: ZIP members and NumPy arrays, whose size is checked before they are expanded.
+- `cells`: the only table reader (CSV in common spreadsheet variants, Parquet), cell by cell.
 - `times`: times in ISO 8601.
 
 Begin with `read_text` and `write_text`.

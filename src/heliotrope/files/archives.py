@@ -1,4 +1,4 @@
-"""Archives in ZIP format (.npz, .kmz), whose members are measured before they are expanded."""
+"""Archives in ZIP format (.npz, .kmz), whose members are checked before they are expanded."""
 
 import io
 import math

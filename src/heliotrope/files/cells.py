@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-#: A column as it was read: texts, or what Parquet holds.
+#: A column as it was read: texts, or the values from Parquet.
 Cells: TypeAlias = list[Any] | FloatArray
 
 #: Separators of cells, the likelier one first.
@@ -80,12 +80,12 @@ class Rows:
 
     @property
     def good(self) -> npt.NDArray[np.intp]:
-        """Indices of the rows without a fault."""
+        """Indices of the rows without an error."""
         return np.array([i for i in range(len(self)) if i not in self.reasons], dtype=np.intp)
 
     @property
     def left_out(self) -> list[str]:
-        """One line for each row that cannot be used, in the order of the rows."""
+        """One message for each row that cannot be used, in the order of the rows."""
         lines = []
         for i, (column, reason) in sorted(self.reasons.items()):
             parts = [f"{self.path.name}: {self.places[i]}", self._heliostat(i)]
@@ -96,7 +96,7 @@ class Rows:
 
     @property
     def problems(self) -> list[FormatError]:
-        """The errors of the rows that cannot be used, where a table is used whole or not at all."""
+        """The errors of the unusable rows, for tables that are used completely or not at all."""
         errors = []
         for i, (column, reason) in sorted(self.reasons.items()):
             name = self._heliostat(i)
@@ -126,14 +126,14 @@ class Rows:
         return Rows(self.path, places, columns, self.header, names, reasons)
 
     def rename(self, known: Iterable[str]) -> None:
-        """Give columns that differ from a known name in case or blanks only that name."""
+        """Rename columns that differ from a known name only in case or blanks."""
         by_form = {alike(name): name for name in known}
         names = [by_form.get(alike(name), name) for name in self.columns]
         if len(set(names)) == len(names):
             self.columns = dict(zip(names, self.columns.values(), strict=True))
 
     def need(self, names: Sequence[str]) -> None:
-        """Raise FormatError if one of the columns is not there."""
+        """Raise FormatError if one of the columns is missing."""
         for name in names:
             if name not in self.columns:
                 present = ", ".join(list(self.columns)[:12]) or "none"
@@ -148,7 +148,7 @@ class Rows:
         self.reasons.setdefault(int(i), (column, reason))
 
     def texts(self, column: str) -> list[str]:
-        """Return the cells as texts, "" where empty or where there is no such column."""
+        """Return the cells as texts, "" if empty or if there is no such column."""
         if column not in self.columns:
             return [""] * len(self)
         return ["" if _empty(cell) else str(cell) for cell in self.columns[column]]
@@ -158,16 +158,16 @@ class Rows:
         return np.array([not _empty(cell) for cell in self.columns[column]], dtype=np.bool_)
 
     def numbers(self, column: str, what: str, empty: float | None = None) -> FloatArray:
-        """Return the finite numbers of a column; other cells leave their rows out.
+        """Return the finite numbers in a column; rows with other cells are left out.
 
         Parameters
         ----------
         column
             Name of an existing column.
         what
-            Value to give instead, with its unit, for the message.
+            Value to use instead, with its unit, for the message.
         empty
-            Value of an empty cell; None refuses it.
+            Value for an empty cell; None rejects it.
         """
         cells = self.columns[column]
         values = _numbers(cells)
@@ -182,15 +182,15 @@ class Rows:
         return values
 
     def within(self, column: str, values: FloatArray, low: float, high: float, unit: str) -> None:
-        """Leave out the rows whose value lies outside ``low`` to ``high``, in ``unit``."""
+        """Leave out the rows whose value is outside ``low`` to ``high``, in ``unit``."""
         outside = ~((values >= low) & (values <= high)) & np.isfinite(values)
         limits = f" is outside {low:g} to {high:g} {unit}; is it in another unit?"
         self.check(column, outside, values, limits)
 
     def names(self, column: str, what: str) -> tuple[str, ...]:
-        """Return the names of a column; empty ones, and those of another row, are refused.
+        """Return the names in a column; empty names, and duplicates, are rejected.
 
-        Names are the same if only case, blanks or the form of Unicode differ: see `alike`.
+        Names that differ only in case, blanks or Unicode form are the same: see `alike`.
         """
         names = self.texts(column)
         first: dict[str, int] = {}
@@ -211,7 +211,7 @@ class Rows:
             self.refuse(i, column, f"{values[i]:.10g}{reason}")
 
     def flags(self, column: str, advice: str = "give one") -> npt.NDArray[np.bool_]:
-        """Return booleans; cells that are neither true nor false leave their rows out."""
+        """Return booleans; rows with cells that are neither true nor false are left out."""
         flags = np.zeros(len(self), dtype=np.bool_)
         for i, cell in enumerate(self.columns[column]):
             known = str(cell).strip().casefold()
@@ -222,7 +222,7 @@ class Rows:
         return flags
 
     def times(self, column: str, optional: bool) -> FloatArray:
-        """Return unix seconds; NaN where the cell is empty and ``optional`` holds."""
+        """Return Unix seconds; NaN if the cell is empty and ``optional`` is true."""
         seconds = np.full(len(self), np.nan)
         for i, cell in enumerate(self.columns[column]):
             if _empty(cell):
@@ -240,10 +240,10 @@ class Rows:
 def read_cells(
     path: Path, what: str, *, separators: str = SEPARATORS, record_end: str = ""
 ) -> tuple[list[str], list[list[str]]]:
-    """Return place ("line 12") and cells of each row of a text table: the one reader of tables.
+    """Return place ("line 12") and cells of each row of a text table; all tables are read here.
 
-    The text is UTF-8, UTF-16 with a byte-order mark, or Windows-1252, as spreadsheets write it.
-    Blanks around cells, and empty rows, are left out.
+    The text is UTF-8, UTF-16 with a byte-order mark, or Windows-1252, as written by spreadsheets.
+    Blanks around cells, and empty rows, are ignored.
 
     Parameters
     ----------
@@ -252,15 +252,15 @@ def read_cells(
     what
         Kind of table, as an error names it.
     separators
-        Characters that may separate cells. A line ``sep=;`` before the table, as Excel writes it,
-        names another; else the first row decides.
+        Characters that may separate cells. A line ``sep=;`` before the table, as written by Excel,
+        specifies another separator; otherwise the first row decides.
     record_end
-        A character that may end a row instead of a line end, where cells are separated by another.
+        A character that may end a row instead of a line end, if cells are separated by another one.
 
     Raises
     ------
     FormatError
-        If it cannot be read, or is beyond the limits of `heliotrope.files.limits`.
+        If it cannot be read, or exceeds the limits of `heliotrope.files.limits`.
     """
     text = unicodedata.normalize("NFC", read_text(path, what, spreadsheet=True))
     if other := instead(text[:4096].encode(), what, "table"):
@@ -315,14 +315,14 @@ def _separator(line: str, separators: str) -> str:
 
 
 def read_rows(path: Path, what: str, known: Iterable[str] = ()) -> Rows:
-    """Return the rows of a table with a header; lines of another length than it are bad rows.
+    """Return the rows of a table with a header; lines of another length are bad rows.
 
     Parameters
     ----------
     path, what
         As for `read_cells`, with its errors.
     known
-        Names of columns in which case and blanks do not count.
+        Names of columns that are matched ignoring case and blanks.
 
     Raises
     ------
@@ -340,12 +340,12 @@ def rows_under(
     table: list[list[str]],
     known: Iterable[str] = (),
 ) -> Rows:
-    """Return rows from the place and the cells of a header, and those of the rows below it.
+    """Return rows from the place and cells of a header, and those of the rows below the header.
 
     Raises
     ------
     FormatError
-        If a column has no name, or one of another.
+        If a column has no name, or the name of another column.
     """
     place, names = header[0], [_tidy(cell) for cell in header[1]]
     while names and not names[-1]:
@@ -375,7 +375,7 @@ def read_parquet(path: Path, what: str) -> Rows:
     Raises
     ------
     FormatError
-        If it cannot be read, has nested columns, or is beyond the limits of
+        If it cannot be read, has nested columns, or exceeds the limits of
         `heliotrope.files.limits`.
     """
     import pyarrow as pa
@@ -428,7 +428,7 @@ def _cells_of(column: "pa.ChunkedArray[Any]") -> Cells:
 
 
 def rows_of(names: Sequence[str]) -> dict[str, int]:
-    """Return the row of each heliostat by name.
+    """Return the index of each heliostat by name.
 
     Raises
     ------
@@ -443,7 +443,7 @@ def rows_of(names: Sequence[str]) -> dict[str, int]:
 
 
 def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArray[np.intp]:
-    """Return the row of each heliostat named in the table; unknown names are left out."""
+    """Return the index of each heliostat named in the table; unknown names are left out."""
     index = rows_of(names)
     rows.heliostat = rows.texts(column)
     indices = np.array([index.get(n, index.get(n.strip(), -1)) for n in rows.heliostat], np.intp)
@@ -462,7 +462,7 @@ def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArra
 
 
 def alike(name: str) -> str:
-    """Return a name without what people do not see: case, blanks and the form of Unicode."""
+    """Return a name normalised in case, blanks and Unicode form."""
     return "".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 

@@ -1,8 +1,8 @@
 """Work that waits for a disk, done outside the loop that renews leases and sends emergencies.
 
-A `Disk` does pieces of work in the order of their arrival, and reports their outcome to the loop.
-`DiskThread` does them in a thread of its own; `AtOnce` does them where they are given, as virtual
-time needs it.
+A `Disk` executes jobs in the order of their arrival, and reports their outcome to the event loop.
+`DiskThread` executes them in its own thread; `AtOnce` executes them immediately, as virtual time
+requires.
 """
 
 import asyncio

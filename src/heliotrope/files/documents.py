@@ -1,4 +1,4 @@
-"""TOML files of our own formats, checked against pydantic models with errors in plain words."""
+"""TOML files in our own formats, checked against pydantic models, with plain-language errors."""
 
 import tomllib
 from collections.abc import Iterable, Sequence

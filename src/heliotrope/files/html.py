@@ -1,4 +1,4 @@
-"""HTML pages that are one file: templates with escaping on, one style, pictures in the page."""
+"""Self-contained HTML pages: templates with escaping, one style, embedded pictures."""
 
 import base64
 import io

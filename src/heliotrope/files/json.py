@@ -12,7 +12,7 @@ from heliotrope.files.text import read_text
 
 
 class JsonNode:
-    """A value in a JSON document that knows its place there.
+    """A value in a JSON document that knows its position.
 
     Parameters
     ----------
@@ -21,18 +21,18 @@ class JsonNode:
     value
         Its value.
     where
-        Path of keys that leads to it, "" at the root.
+        Path of keys that leads to the value, "" at the root.
     """
 
     def __init__(self, path: Path, value: Any, where: str = "") -> None:
         self.path, self.value, self.where = path, value, where
 
     def fail(self, problem: str) -> FormatError:
-        """Return an error about this place."""
+        """Return an error that refers to this place."""
         return FormatError(self.path, problem, self.where)
 
     def has(self, key: str) -> bool:
-        """Return whether this is an object with such a key."""
+        """Return whether this is an object with the given key."""
         return isinstance(self.value, dict) and key in self.value
 
     def __getitem__(self, key: str) -> "JsonNode":
@@ -45,7 +45,7 @@ class JsonNode:
         return JsonNode(self.path, self.value[key], f"{self.where}.{key}" if self.where else key)
 
     def any_of(self, *keys: str) -> "JsonNode":
-        """Return the value of the first key that is there (formats have changed names)."""
+        """Return the value of the first key that exists (formats have renamed keys)."""
         for key in keys:
             if self.has(key):
                 return self[key]
@@ -103,7 +103,7 @@ def read_json(path: str | Path, what: str) -> JsonNode:
     Raises
     ------
     FormatError
-        If it is not a readable text file of a plausible size, not JSON, or beyond the limits of
+        If it is not a readable text file of a plausible size, is not JSON, or exceeds the limits of
         `heliotrope.files.limits`.
     """
     text = read_text(path, what)

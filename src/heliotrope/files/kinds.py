@@ -1,4 +1,4 @@
-"""What a file is by its name and first bytes, and which command reads it."""
+"""Recognises files by name and first bytes, and names the command that reads them."""
 
 import re
 from pathlib import Path

@@ -1,8 +1,8 @@
-"""Limits of files that come from anywhere, and the checks that need no parser.
+"""Limits for files from any origin, and the checks that need no parser.
 
-Every reader checks size, count, depth and expansion before it spends memory on a file. At these
-limits no reader takes more than 1.5 GB or a minute; a file beyond one gets one line that names
-the file, the value, the limit and what to do.
+Every reader checks size, count, depth and expansion before it uses memory for a file. Within these
+limits no reader takes more than 1.5 GB or a minute; for a file beyond a limit one line states the
+file, the value, the limit and what to do.
 """
 
 import os
@@ -63,17 +63,17 @@ def check_file(
     path
         The file.
     what
-        Kind of file expected, as an error names it ("a HelioK file").
+        Expected kind of file, as an error names it ("a HelioK file").
     binary
-        Accept files that do not begin like text.
+        Whether to accept files that do not begin like text.
     limit
-        Largest size, bytes.
+        Maximum size, bytes.
 
     Raises
     ------
     FormatError
         If it does not exist, is a folder, a device or a pipe, cannot be read, is empty, belongs to
-        another program, is larger than the limit or does not begin like text.
+        another program, exceeds the size limit or does not begin like text.
     """
     file = Path(path)
     try:

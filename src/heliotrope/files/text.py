@@ -1,4 +1,4 @@
-"""Whole files, read with one-line refusals and written whole or not at all."""
+"""Complete files, read with one-line errors and written completely or not at all."""
 
 import errno
 import os
@@ -26,12 +26,13 @@ def read_text(
     path, what, limit
         As for `check_file`.
     spreadsheet
-        Read also what spreadsheets export: UTF-16 with a byte-order mark, and Windows-1252.
+        Whether to also read what spreadsheets export: UTF-16 with a byte-order mark, and
+        Windows-1252.
 
     Raises
     ------
     FormatError
-        As `check_file`, or if it is not in one of these encodings.
+        As for `check_file`, or if it is in none of these encodings.
     """
     file = check_file(path, what, limit=limit)
     content = read_bytes(file, limit)
@@ -59,12 +60,12 @@ def _decoded(content: bytes, spreadsheet: bool) -> str:
 
 
 def read_bytes(path: str | Path, limit: int = SIZE_LIMIT) -> bytes:
-    """Return the content of a file that has no more than ``limit`` bytes, now and in the end.
+    """Return the content of a file that does not exceed ``limit`` bytes, even while it is read.
 
     Raises
     ------
     FormatError
-        If it has more.
+        If it exceeds the limit.
     OSError
         If it cannot be read.
     """
@@ -75,19 +76,19 @@ def read_bytes(path: str | Path, limit: int = SIZE_LIMIT) -> bytes:
 
 
 def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file so that it is there whole or not at all.
+    """Write a file completely or not at all.
 
     Parameters
     ----------
     path
-        The file; an existing one is replaced in one step.
+        The file; an existing file is replaced atomically.
     write
-        Called with the stream; writes the content to it.
+        Function that is called with the stream and writes the content.
 
     Raises
     ------
     InputError
-        If the folder does not exist or is not writable, or a device or a pipe has that name.
+        If the folder does not exist or is not writable, or the name is that of a device or a pipe.
     """
     file = Path(path)
     if file.exists() and not (file.is_file() or file.is_dir()):
@@ -110,5 +111,5 @@ def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file as UTF-8 so that it is there whole or not at all."""
+    """Write a text file as UTF-8, completely or not at all."""
     write_file(path, lambda stream: stream.write(text.encode()))

@@ -1,4 +1,4 @@
-"""Times in ISO 8601: texts to moments and back."""
+"""Times in ISO 8601: conversion of texts to times, and back."""
 
 import math
 import re
@@ -16,9 +16,10 @@ _SECOND_60 = re.compile(r"(.*[T ]\d\d:?\d\d:?)60(.*)", re.ASCII | re.DOTALL)
 
 
 def moment(text: str) -> datetime:
-    """Return the time of an ISO 8601 text, without a zone where the text has none.
+    """Return the time in an ISO 8601 text, without a zone if the text has none.
 
-    A leap second (23:59:60 UTC on the last day of a month) is the second after it, as in Unix time.
+    A leap second (23:59:60 UTC on the last day of a month) is treated as the following second, as
+    in Unix time.
 
     Raises
     ------
@@ -36,7 +37,7 @@ def moment(text: str) -> datetime:
 
 
 def parse_time(text: str) -> float:
-    """Return unix seconds of an ISO 8601 text, the nearest double to all its digits.
+    """Return the Unix seconds of an ISO 8601 text, the nearest double to all its digits.
 
     Raises
     ------
@@ -61,12 +62,12 @@ def parse_time(text: str) -> float:
 
 
 def format_time(seconds: float) -> str:
-    """Return unix seconds as ISO 8601 in UTC, with the digits that give the same double again.
+    """Return Unix seconds as ISO 8601 in UTC, with enough digits to restore the same double.
 
     Raises
     ------
     InputError
-        If they are infinite or lie outside the years 1 to 9999.
+        If they are infinite or outside the years 1 to 9999.
     """
     if math.isnan(seconds):
         return ""

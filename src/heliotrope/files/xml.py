@@ -27,7 +27,7 @@ class XmlElement:
     children
         Child elements, in order; comments and text are not kept.
     line
-        Line of the file; ignored in comparisons.
+        Line in the file; ignored in comparisons.
     """
 
     tag: str
@@ -36,7 +36,7 @@ class XmlElement:
     line: int = field(default=0, compare=False)
 
     def get(self, name: str) -> str | None:
-        """Return the value of an attribute, or None if there is none of that name."""
+        """Return the value of an attribute, or None if it does not exist."""
         return dict(self.attributes).get(name)
 
     def elements(self, *tags: str) -> Iterator["XmlElement"]:
@@ -68,13 +68,13 @@ def read_xml(path: str | Path, what: str) -> Document:
     path
         The file.
     what
-        Kind of file expected, as an error names it.
+        Expected kind of file, as an error names it.
 
     Raises
     ------
     FormatError
-        If the file cannot be read, is not well-formed XML, has a document type (which could
-        define entities; none are needed) or is beyond the limits of `heliotrope.files.limits`.
+        If the file cannot be read, is not well-formed XML, has a document type (which could define
+        entities; none are needed) or exceeds the limits of `heliotrope.files.limits`.
     """
     file = check_file(path, what)
     content = read_bytes(file)

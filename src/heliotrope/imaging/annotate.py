@@ -1,4 +1,4 @@
-"""Draw the result of reading a photograph into it."""
+"""Draws the evaluation of a photograph into the picture."""
 
 import numpy as np
 
@@ -16,13 +16,13 @@ _NINETY = 2.146
 
 
 def annotate(photograph: Photograph) -> Image:
-    """Return the photograph with marks, outlines, spots, centroids and remarks.
+    """Return the photograph with marks, outlines, spots, centroids and notes drawn into it.
 
     Returns
     -------
-    Blue, green, red, (H, W, 3) of uint8; larger photographs are reduced. A spot is drawn as the
-    border of its pixels, its centroid, the one-sigma ellipse of its light, and, filled, the 90 %
-    ellipse of the centroid's error.
+    Blue, green, red, (H, W, 3) of uint8; larger photographs are scaled down. A spot is drawn as the
+    outline of its pixels, its centroid, the one-sigma ellipse of its light and, filled, the 90 %
+    ellipse of the centroid error.
     """
     sheet = _Sheet(photograph)
     for face in photograph.faces:

@@ -1,4 +1,4 @@
-"""Read many photographs, in parallel or one by one, and turn them into sightings."""
+"""Evaluates many photographs, in parallel or one by one, and turns them into sightings."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
@@ -53,26 +53,26 @@ BEAM_SIGMA = 1e-4
 
 @dataclass(frozen=True)
 class Job:
-    """How the photographs of a campaign are read.
+    """How the photographs of a campaign are evaluated.
 
     Attributes
     ----------
     targets
         Targets that may be in view.
     origin
-        Latitude, longitude (degrees) and height (m) of ENU's origin.
+        Latitude, longitude (degrees) and height (m) of the ENU origin.
     camera
         The camera, as far as it is known.
     settings
-        How to read.
+        Evaluation settings.
     crop
-        Each picture shows exactly one target: that of its log entry, or ``target``.
+        Whether each picture shows exactly one target: that of its log entry, or ``target``.
     target
-        Target whose reading counts where the log names none; "" takes any that is good.
+        Target whose reading counts if the log names none; "" accepts any valid reading.
     annotated
         Folder for annotated pictures, or None.
     without
-        A frame of the camera without beams.
+        A frame from the camera without beams.
     """
 
     targets: tuple[Target, ...]
@@ -86,7 +86,7 @@ class Job:
 
     @property
     def trust(self) -> str:
-        """A line on what no frame can show: whether it is turned or mirrored. Empty if it can."""
+        """What no frame can reveal, in one line: whether it is rotated or mirrored; else empty."""
         if self.crop:
             cause = "a crop shows one target without its surroundings"
         elif self.camera is not None and self.camera.position is not None:
@@ -113,9 +113,10 @@ class Outcome:
     document
         Everything found, ready for JSON; empty if the file could not be read.
     problem
-        Why it could not be read; empty if it was.
+        Why the file could not be read; empty if it was.
     point, covariance
-        Place of the spot that counts, ENU, (3,) and (3, 3); None if no spot can be trusted.
+        Position of the spot that counts and its covariance, ENU, (3,) and (3, 3); None if no spot
+        can be trusted.
     target
         Target of that spot.
     refusal
@@ -125,9 +126,9 @@ class Outcome:
     annotated
         The annotated picture, if one was written.
     views
-        How the faces lie in the frame, for the next frame.
+        How the faces lie in the frame, as a start for the next frame.
     faces
-        The faces found, from which models of empty targets learn.
+        The faces found, from which models of empty targets are updated.
     """
 
     path: Path
@@ -345,20 +346,21 @@ def process_many(
     client: "Client | None" = None,
     progress: Progress | None = None,
 ) -> list[Outcome]:
-    """Read many files, and return their results in the same order.
+    """Evaluate many files, and return their results in the same order.
 
     Parameters
     ----------
     paths, entries
         Files, and their entries in the log.
     job
-        How to read them.
+        How to evaluate them.
     processes
-        Number of processes on this machine; a few photographs are always read in this process.
+        Number of processes on this computer; a few photographs are always evaluated in this
+        process.
     client
-        Client of a dask scheduler, used instead of processes.
+        Client of a dask scheduler, used instead of local processes.
     progress
-        Called with the numbers of finished and of all photographs.
+        Called with the numbers of photographs (done, total).
     """
     tasks = list(zip(paths, entries, strict=True))
     outcomes: list[Outcome | None] = [None] * len(tasks)
@@ -441,7 +443,7 @@ def to_sightings(
     mechanism: Mechanism | None = None,
     now: float | None = None,
 ) -> tuple[Sightings | None, list[str]]:
-    """Return the plausible sightings of photographs, and a line for each photograph left out.
+    """Return the plausible sightings from photographs, and a message for each one left out.
 
     Parameters
     ----------
@@ -450,16 +452,16 @@ def to_sightings(
     names
         Names of the heliostats, in the plant's order.
     site
-        For the sun's direction, where the log does not give it.
+        Site for the sun's direction, where the log does not specify it.
     sigma
-        Standard deviation of a beam in addition to that of its centroid, rad.
+        Standard deviation of a beam excluding that of its centroid, rad.
     mechanism, now
-        Mechanisms of the heliostats named, and the computer's clock, for what cannot have
-        happened: see `heliotrope.calibration.plausibility.judge`.
+        Mechanisms of the named heliostats, and the computer's clock, to detect impossible
+        sightings: see `heliotrope.calibration.plausibility.judge`.
 
     Returns
     -------
-    None instead of sightings if there are none.
+    The sightings are None if no photograph yields one.
     """
     rows: list[tuple[int, FloatArray, FloatArray, Outcome, float, float]] = []
     left_out: list[str] = []
@@ -503,29 +505,29 @@ def sighting_of(
     sun: npt.ArrayLike | None = None,
     sigma: float = BEAM_SIGMA,
 ) -> Sightings:
-    """Return the sighting that one photograph gives, with its time and the sun at that time.
+    """Return the sighting from one photograph, with its time and the sun vector at that time.
 
     Parameters
     ----------
     photograph
-        A photograph that is already read.
+        A photograph that has been evaluated.
     heliostat, counts
-        Name of the heliostat of the beam, and its motor counts, (D,).
+        Name of the heliostat that sends the beam, and its motor counts, (D,).
     site
-        For the sun's direction.
+        Site, for the sun's direction.
     target
-        Target that the beam was sent to; may be empty where exactly one has a spot.
+        Target to which the beam was sent; may be empty if exactly one target has a spot.
     time
-        See `heliotrope.sun.Times`; by default that of the frame.
+        See `heliotrope.sun.Times`; by default the time of the frame.
     sun
-        Direction to the apparent sun, ENU, (3,); by default that of the time.
+        Direction to the apparent sun, ENU, (3,); by default that at the time of the frame.
     sigma
-        Standard deviation of a beam in addition to that of its centroid, rad.
+        Standard deviation of a beam excluding that of its centroid, rad.
 
     Raises
     ------
     InputError
-        If no spot can be trusted, or neither time nor sun is known.
+        If no spot can be trusted, or neither the time nor the sun vector is known.
     """
     frame = photograph.frame
     name = frame.name or "photograph"

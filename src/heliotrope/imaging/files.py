@@ -1,12 +1,11 @@
-"""Image files: read whole or refused in one line, dated, and written whole or not at all.
+"""Image files: read completely or rejected in one line, dated, and written all or nothing.
 
-Pillow opens every file, checks that it is complete and decodes it. It has no 16-bit colour, so
-OpenCV decodes such files, after Pillow has checked them.
+Pillow opens every file, checks that it is complete and decodes it. Pillow has no 16-bit colour, so
+OpenCV decodes such files once Pillow has checked them.
 
-The orientation that a file asks for (EXIF, TIFF) is *not* applied: a camera's calibration belongs
-to the rows and columns of its sensor, however the camera was held. Alpha is dropped; a file that
-is transparent everywhere is refused. Colour
-profiles and gamma are not applied.
+The orientation stored in a file (EXIF, TIFF) is *not* applied, because a camera's calibration
+refers to the rows and columns of its sensor, however the camera was held. Alpha is dropped; a file
+that is transparent everywhere is rejected. Colour profiles and gamma are not applied.
 """
 
 import io
@@ -108,37 +107,37 @@ class _Container:
 def read_image(
     path: str | Path, *, limit: int = LIMIT, zone: tzinfo | None = None, mtime: bool = False
 ) -> Frame:
-    """Return the image of a file, and when it was taken if the file says so.
+    """Return the image in a file, and when it was taken if the file says so.
 
     Parameters
     ----------
     path
         A PNG, JPEG, TIFF (8 or 16 bit), BMP or WebP; its suffix does not matter.
     limit
-        Greatest number of pixels; checked in the header, before anything is decoded.
+        Maximum number of pixels; checked in the header, before anything is decoded.
     zone
-        Time zone for times in EXIF and in file names that state none; without it such times
-        are ignored.
+        Time zone for times in EXIF and in file names that have none; without it such times are
+        ignored.
     mtime
-        Use the file's modification time if there is no better one; its deviation is
-        unknown (NaN).
+        Whether to fall back on the file's modification time; its standard deviation is unknown
+        (NaN).
 
     Returns
     -------
     Frame
-        uint8, or uint16 if the file has 16 bits; grey (H, W) or blue-green-red (H, W, 3). Its
-        time is the first of these that is present: EXIF DateTimeOriginal with its offset; PNG's
-        "Creation Time"; a time in the file's name (2023-05-13T15-53-57Z, 20230513_155357Z);
-        PNG's tIME, which by definition is the time of the last change; None. A time counts as
-        rounded to its last digit: whole seconds have a standard deviation of 1/√12 s. Exposure
+        uint8, or uint16 if the file has 16 bits; grey (H, W) or blue-green-red (H, W, 3). Its time
+        is the first of these that is present: EXIF DateTimeOriginal with its offset; PNG's
+        "Creation Time"; a time in the file name (2023-05-13T15-53-57Z, 20230513_155357Z); PNG's
+        tIME, which by definition is the time of the last change; otherwise None. A time is taken as
+        rounded to its last digit, so whole seconds have a standard deviation of 1/√12 s. Exposure
         and gain (ISO/100) come from EXIF.
 
     Raises
     ------
     FormatError
-        If there is no such image; if it is damaged, truncated, too large, too small or
-        transparent everywhere; or if it cannot be kept as it is: CMYK, float, several pages,
-        animated.
+        If there is no such image; if it is damaged, truncated, too large, too small or transparent
+        everywhere; or if it cannot be kept unchanged, as with CMYK, float, several pages or
+        animation.
     """
     file = Path(path)
     data, changed = _content(file, limit)
@@ -163,23 +162,24 @@ def read_image(
 def find_images(
     folder: str | Path, recursive: bool = False, suffixes: tuple[str, ...] = IMAGE_SUFFIXES
 ) -> list[Path]:
-    """Return the image files of a folder by their suffix, 2.png before 10.png.
+    """Return the image files in a folder, selected by suffix; 2.png comes before 10.png.
 
-    Hidden files are left out: other programs use them for files they are still writing.
+    Hidden files are left out, because other programs use them for files that are still being
+    written.
 
     Parameters
     ----------
     folder
         The folder.
     recursive
-        Whether to search the folders in it too.
+        Whether to search subfolders too.
     suffixes
-        In lower case.
+        Suffixes in lower case.
 
     Raises
     ------
     InputError
-        If there is no such folder or it cannot be read.
+        If the folder does not exist or cannot be read.
     """
     place = Path(folder)
     try:
@@ -589,24 +589,23 @@ def _own_values(text: str) -> dict[str, float]:
 
 
 def write_image(image: Frame | Pixels, path: str | Path, *, quality: int = 95) -> None:
-    """Write a PNG, JPEG or TIFF by its suffix, whole or not at all.
+    """Write a PNG, JPEG or TIFF, chosen by suffix, completely or not at all.
 
     Parameters
     ----------
     image
         A frame, or grey (H, W) or blue-green-red (H, W, 3) pixels, uint8 or uint16.
     path
-        The file; an existing one is replaced in one step. A PNG keeps the frame's time,
-        exposure, gain and count, and `read_image` gives them back; the other formats
-        keep the pixels alone.
+        The file; an existing file is replaced atomically. A PNG stores the frame's time, exposure,
+        gain and count, and `read_image` restores them; the other formats store only the pixels.
     quality
-        Quality of a JPEG, 1 to 100.
+        JPEG quality, 1 to 100.
 
     Raises
     ------
     InputError
-        If the suffix is unknown, if 16 bits should go into a JPEG, or if the file cannot be
-        written.
+        If the suffix is unknown, if a 16-bit image is to be written as JPEG, or if the file cannot
+        be written.
     """
     file = Path(path)
     data = encode_image(image, file.suffix.lower(), quality, str(file))

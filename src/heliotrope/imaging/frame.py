@@ -1,4 +1,4 @@
-"""A frame: the pixels of a photograph, its time and the time's uncertainty."""
+"""A frame: the pixels of a photograph, with the time and its uncertainty."""
 
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -36,15 +36,15 @@ class Frame:
     pixels
         Grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16.
     name
-        Path of a file, or a source and a number.
+        Path of a file, or a source and a frame number.
     time
-        Middle of the exposure, with a zone; None if unknown.
+        Middle of the exposure, with a time zone; None if unknown.
     time_deviation
         Standard deviation of the time, s; NaN if unknown.
     exposure
-        s; NaN if unknown.
+        Exposure time, s; NaN if unknown.
     gain
-        Relative, of the sensor; NaN if unknown.
+        Relative sensor gain; NaN if unknown.
     count
         Number of frames averaged.
     """
@@ -75,17 +75,17 @@ class Frame:
 
     @property
     def full_scale(self) -> float:
-        """Greatest possible value of a pixel."""
+        """Largest possible pixel value."""
         return float(np.iinfo(self.pixels.dtype).max)
 
     @cached_property
     def clipped(self) -> npt.NDArray[np.uint8]:
         """How much each pixel is clipped, 0 to 255, (H, W).
 
-        The share of its brightness that is of channels at their white, squared: clipping moves a
-        centroid by that share, and so widens its variance by the square. White is the full scale,
-        or the plateau below it at which a channel ends: video levels end at 235, and a sensor of
-        12 bits at 4095 of 65535.
+        This is the squared fraction of the brightness that comes from channels at their white
+        level, because clipping shifts a centroid in proportion to that fraction, and so increases
+        its variance with the square. The white level is full scale, or the plateau below it at
+        which a channel saturates: video levels end at 235, and a 12-bit sensor at 4095 of 65535.
         """
         import cv2
 
@@ -98,12 +98,12 @@ class Frame:
         return _SQUARED[out]
 
     def linear(self, gamma: float) -> "Frame":
-        """Return a 16-bit frame whose pixels are proportional to light; itself if gamma is 1.
+        """Return a 16-bit frame with pixels proportional to light; itself if gamma is 1.
 
         Parameters
         ----------
         gamma
-            The frame's pixels are light to the power 1/gamma.
+            The pixel values are light to the power 1/gamma.
 
         Raises
         ------
@@ -120,7 +120,7 @@ class Frame:
 
     @cached_property
     def grey(self) -> Image:
-        """Brightness (H, W) in the frame's own type: the weights of Rec. 601."""
+        """Brightness (H, W) in the frame's own type, with the weights of Rec. 601."""
         import cv2
 
         if self.pixels.ndim == 2:

@@ -1,7 +1,7 @@
-"""Lenses: calibrate a lens by pictures of a chessboard.
+"""Lens calibration from pictures of a chessboard.
 
-A deviation in pixels is two-dimensional: the root of the mean squared length of residuals. A
-``sigma`` is that of one coordinate.
+A deviation in pixels is two-dimensional, the root mean square length of the residuals. A ``sigma``
+is that of one coordinate.
 """
 
 from collections.abc import Sequence
@@ -63,12 +63,12 @@ class Lens:
     size, matrix, distortion, deviation
         See `Camera`.
     sigma, model
-        Standard deviations of both focal lengths, the principal point (px) and the five terms
-        of distortion, (9,); 0 for terms outside the model (`MODELS`).
+        Standard deviations of both focal lengths, the principal point (px) and the five distortion
+        coefficients, (9,); 0 for terms outside the model (`MODELS`).
     boards, coverage
-        All pictures, in their order; share of the frame that boards cover.
+        All pictures, in their order; fraction of the frame that the boards cover.
     notes
-        Remarks, in sentences.
+        Notes, in sentences.
     """
 
     size: tuple[int, int]
@@ -128,13 +128,13 @@ def calibrate_chessboard(
     square: float,
     names: Sequence[str] = (),
 ) -> Lens:
-    """Return the lens that took pictures of a flat chessboard.
+    """Calibrate a lens from pictures of a flat chessboard.
 
     Parameters
     ----------
     images
-        Grey (H, W), uint8 or uint16, all of one size; with the board at different tilts of
-        20° to 45°, in all parts of the frame.
+        Grey (H, W), uint8 or uint16, all of one size; with the board tilted by 20° to 45° in
+        different directions, in all parts of the frame.
     pattern
         Columns and rows of inner corners.
     square
@@ -145,8 +145,8 @@ def calibrate_chessboard(
     Raises
     ------
     InputError
-        If the pattern is found in fewer than three pictures, or the pictures do not
-        determine the focal length.
+        If the pattern is found in fewer than three pictures, or the pictures do not determine the
+        focal length.
     """
     columns, rows = (int(n) for n in pattern)
     if min(columns, rows) < 3 or max(columns, rows) > 200:

@@ -1,4 +1,4 @@
-"""Facts about a photograph besides its pixels: heliostat, motors, target, time or sun."""
+"""Facts about a photograph besides its pixels: heliostat, motors, target, time or sun vector."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,17 +27,17 @@ class Entry:
     Attributes
     ----------
     heliostat
-        Heliostat of the beam; empty if unknown.
+        Heliostat that sends the beam; empty if unknown.
     counts
         Motor counts, (D,); None if unknown.
     target
-        Target that the beam was sent to; empty if unknown.
+        Target to which the beam was sent; empty if unknown.
     time
-        Time with its zone; None if unknown.
+        Time with its time zone; None if unknown.
     sun
         Unit vector to the apparent sun, ENU, (3,); None if unknown.
     empty
-        Photograph of the camera without the beam, of the same minute, or None.
+        Photograph by the same camera without the beam, from the same minute, or None.
     """
 
     heliostat: str = ""
@@ -51,8 +51,8 @@ class Entry:
 class Log:
     """Entries by file name or number.
 
-    A row belongs to a photograph if its ``file`` is the photograph's name, or its ``id`` is the
-    beginning of that name up to the first hyphen, underscore or dot.
+    An entry belongs to a photograph if its ``file`` is the photograph's name, or its ``id`` is the
+    part of that name before the first hyphen, underscore or dot.
     """
 
     def __init__(self, entries: Mapping[str, Entry]) -> None:
@@ -82,18 +82,18 @@ def _number(path: Path) -> str:
 
 
 def read_log(path: str | Path) -> Log:
-    """Return the log of a CSV table.
+    """Return the log from a CSV table.
 
     Parameters
     ----------
     path
         A table with the columns `COLUMNS`, such as Jülich's ``measurements.csv``. ``empty`` is
-        relative to the log's folder.
+        relative to the folder of the log.
 
     Raises
     ------
     FormatError
-        If it cannot be read, lacks a required value, or has two rows for a photograph.
+        If it cannot be read, lacks a required value, or has two entries for one photograph.
     """
     rows = read_rows(Path(path), "a log of photographs (CSV)", COLUMNS)
     rows.need(["heliostat", *_MOTORS])

@@ -1,4 +1,4 @@
-"""Models of a plant's empty targets, updated from photograph to photograph."""
+"""Models of a plant's empty targets, updated with each photograph."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -10,7 +10,7 @@ from heliotrope.imaging.spots.background import EmptyTarget
 
 
 class Memory:
-    """Models of empty targets, one for each face.
+    """Models of empty targets, one per face.
 
     Parameters
     ----------
@@ -40,10 +40,10 @@ class Memory:
         return self._models
 
     def learn(self, faces: Iterable[LookedAt]) -> None:
-        """Learn from faces, except where beams are.
+        """Update the models from faces, except where beams are.
 
-        Nothing is learnt from a face that is mostly in beams or shadows, or that has another grid
-        than before.
+        A face that is mostly covered by beams or shadows, or has a different grid than before, is
+        skipped.
         """
         for face in faces:
             picture = face.picture
@@ -56,12 +56,12 @@ class Memory:
 
     @classmethod
     def load(cls, folder: str | Path) -> "Memory":
-        """Return the memory stored in a folder; an empty one if there is no such folder.
+        """Load the memory from a folder; it is empty if the folder does not exist.
 
         Raises
         ------
         FormatError
-            If a file in it is not a model.
+            If a file in the folder is not a model.
         InputError
             If the path is not a folder.
         """
@@ -71,12 +71,12 @@ class Memory:
         return cls(EmptyTarget.load(file) for file in sorted(place.glob("*.npz")))
 
     def save(self, folder: str | Path) -> None:
-        """Write each model to the folder, whole or not at all.
+        """Write each model to the folder, completely or not at all.
 
         Raises
         ------
         InputError
-            If it cannot be written.
+            If a model cannot be written.
         """
         place = Path(folder)
         try:

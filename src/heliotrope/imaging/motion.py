@@ -1,17 +1,17 @@
-"""Motion between frames: whether a beam moved across the scene, where, and how significantly.
+"""Motion between frames: whether and where a beam moved, and how significant the motion is.
 
-Two frames of a fixed camera differ by more than a beam: noise, exposure, clouds, wind at the mast.
-Each of these is modelled and removed before a difference counts:
+Two frames from a fixed camera differ not only by a beam but also by noise, exposure, clouds, and
+wind on the mast. Each of these effects is modelled and removed before a difference counts:
 
 1. Frames are reduced to at most 400 × 300 px, which also averages noise.
 2. Gain (with a slope across the frame) and offset are fitted robustly to cell means.
-3. A shift of the camera is measured by least squares in 8 × 6 tiles (Lucas and Kanade 1981),
-   starting from phase correlation if it is large. It is accepted only if tiles all over the frame
-   agree: a beam alone in the dark must not pass for a shaken camera.
-4. The difference is examined at three scales. Its deviation is measured for each level of
-   brightness (photon noise) and per gradient (residuals of a shift at edges). The lesser value of
-   the two frames counts, so that a beam does not raise the noise at its new place.
-5. The threshold follows from the number of independent places and the rate of false alarms.
+3. A camera shift is measured by least squares in 8 × 6 tiles (Lucas and Kanade 1981), starting from
+   phase correlation if it is large. It is accepted only if tiles all over the frame agree, because
+   a single beam in the dark must not be mistaken for a shaken camera.
+4. The difference is examined at three scales. Its standard deviation is measured for each level of
+   brightness (photon noise) and per gradient (residuals of a shift at edges). The smaller value of
+   the two frames counts, so that a beam does not raise the noise at its new position.
+5. The threshold follows from the number of independent positions and the false-alarm rate.
 """
 
 import math
@@ -75,20 +75,19 @@ class FrameMotion:
     moved
         Whether anything changed significantly.
     significance, threshold
-        Greatest difference anywhere, and the value it must exceed, in deviations of the noise.
+        Largest difference anywhere, and the threshold, in standard deviations of the noise.
     area_px
-        Area of all regions, pixels of the frame.
+        Total area of all regions, pixels of the frame.
     appeared_px, vanished_px
-        Centroids of new and of lost light, pixels right and down, or NaN.
+        Centroids of added and of removed light, pixels right and down, or NaN.
     shift_px
-        Shift of the scene to the right and down in the second frame; 0 if no shift was
-        accepted.
+        Shift of the scene to the right and down in the second frame; 0 if no shift was accepted.
     brightness_ratio
-        Brightness of the static scene, second frame over first, in the middle of the frame.
+        Brightness ratio of the static scene, second frame over first, in the middle of the frame.
     regions
-        The most significant first.
+        The most significant region first.
     problem
-        Why the frames cannot be compared, and ``moved`` is false; empty if they can.
+        Why the frames cannot be compared, in which case ``moved`` is false; empty if they can.
     """
 
     moved: bool = False
@@ -105,17 +104,17 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """Thresholds of motion.
+    """Thresholds for motion detection.
 
     Attributes
     ----------
     false_alarms
-        Accepted rate of still pairs of frames reported as moved.
+        Accepted probability that a static pair of frames is reported as moved.
     min_area_px
         Smallest region that counts, pixels of the frame.
     max_shift_px, max_ratio
-        Greatest shift of the camera, pixels of the frame, and greatest change of brightness,
-        up or down, that are corrected; beyond, the frames cannot be compared.
+        Largest camera shift, pixels of the frame, and largest change of brightness, up or down,
+        that are corrected; beyond these, the frames cannot be compared.
     """
 
     false_alarms: float = 1e-3
@@ -153,22 +152,22 @@ def detect_motion(
     mask: npt.ArrayLike | None = None,
     settings: MotionSettings = DEFAULT,
 ) -> FrameMotion:
-    """Return the motion between two frames of a fixed camera.
+    """Detect the motion between two frames from a fixed camera.
 
     Parameters
     ----------
     before, after
         Frames, or pixels (H, W) or (H, W, 3) of uint8 or uint16, of the same size.
     mask
-        Where motion counts, (H, W), true or not 0; None: everywhere. The rest still serves to
-        find shift and brightness.
+        Mask of where motion counts, (H, W), true or not 0; None: everywhere. The rest of the frame
+        is still used to measure shift and brightness.
     settings
         Thresholds.
 
     Raises
     ------
     InputError
-        If the sizes differ, or the mask has another size or covers everything.
+        If the sizes differ, or the mask has a different size or excludes everything.
     """
     first, second = _view(before), _view(after)
     return _compare(first, second, _mask(mask, first), settings)
@@ -177,9 +176,9 @@ def detect_motion(
 def find_shift(before: Frame | Pixels, after: Frame | Pixels) -> _Pair | None:
     """Return the shift of the scene to the right and down in ``after``, pixels.
 
-    None if no shift explains tiles all over the frames: without texture, or for different scenes.
-    Below 1 px it is accurate to about 0.05 px where there is texture. Raises InputError if the
-    sizes differ.
+    None if no shift explains tiles all over the frames, because they lack texture or show different
+    scenes. Below 1 px it is accurate to about 0.05 px where there is texture. Raises InputError if
+    the sizes differ.
     """
     first, second = _view(before), _view(after)
     shift = _register(_expected(first, second)[0], second.image)
@@ -588,11 +587,12 @@ class MotionState(Enum):
 
 
 class MotionDetector:
-    """Compares each frame of a stream with a background of earlier frames.
+    """Compares each frame of a stream with a background from earlier frames.
 
     The background is a running mean. Light that appears and stays counts as moving until it is
-    part of the background, after about ``memory · ln(significance / threshold)`` frames. Frames
-    that cannot be compared are not learnt; after ``memory`` of them in a row it starts again.
+    absorbed into the background, after about ``memory · ln(significance / threshold)`` frames.
+    Frames that cannot be compared do not update the background; after ``memory`` of them in a row
+    the detector restarts.
 
     Parameters
     ----------
@@ -601,7 +601,7 @@ class MotionDetector:
     memory
         Frames after which the weight of a frame falls to 1/e.
     warm_up
-        Frames before the first verdict.
+        Number of frames before the first verdict.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Read a photograph: its targets, their spots in metres with covariance, reasons against them."""
+"""Evaluates a photograph: its targets, their spots in metres with covariance, and any defects."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,9 +35,9 @@ class TargetReading:
     found
         The target in the frame.
     spots
-        Spots on the target: the intended one first, then by power.
+        Spots on the target: the intended spot first, then by power.
     reasons
-        Against the first spot; empty if it is good.
+        Reasons against the first spot; empty if it is valid.
     """
 
     found: FoundTarget
@@ -71,16 +71,16 @@ class LookedAt:
 
 @dataclass(frozen=True)
 class Photograph:
-    """The result of reading a photograph.
+    """The result of evaluating a photograph.
 
     Attributes
     ----------
     frame
         The photograph.
     readings
-        One for each target that was searched for.
+        One per target that was searched for.
     beside
-        Spots on a found face, but on none of its targets.
+        Spots on a face that was found, but on none of its targets.
     faces
         Each face that was found.
     """
@@ -105,34 +105,35 @@ class Photograph:
 
     @property
     def views(self) -> tuple[FaceView, ...]:
-        """How the faces lie in the frame; the next frame is searched there first."""
+        """How the faces lie in the frame; in the next frame the search starts there."""
         return tuple(f.picture.view for f in self.faces if f.picture.view is not None)
 
 
 @dataclass(frozen=True)
 class PhotographSettings:
-    """How photographs are read.
+    """How photographs are evaluated.
 
     Attributes
     ----------
     limits
-        Tolerances of the spot's quality.
+        Tolerances for the spot quality.
     background
-        "frame", "model" (with ``empty``) or "difference" (with an empty frame); "auto"
-        takes the best that is available.
+        "frame", "model" (with ``empty``) or "difference" (with an empty frame); "auto" uses the
+        best available method.
     empty
-        Models of empty faces under any names; a face's targets select its model.
+        Models of empty faces under any names; a face selects its model by its targets.
     expectations
         Expected beams by target.
     pictures
         Pictures of taught marks, by their code.
     gamma
-        Exponent of the camera's response: a pixel is light to the power 1/gamma. 1 is linear, 2.2
-        is close to sRGB. It is undone before anything is measured.
+        Exponent of the camera response: a pixel is light to the power 1/gamma. 1 is linear, 2.2 is
+        close to sRGB. The response is inverted before anything is measured.
     centroid
-        Function that gives place and covariance of the first spot on each target instead of the
-        program's own; see `heliotrope.imaging.spots.BeamPicture`. Where photographs are read in
-        several processes, it stands in a module that these can import.
+        User-defined function that returns the position and covariance of the first spot on each
+        target and replaces the built-in one; see `heliotrope.imaging.spots.BeamPicture`. If
+        photographs are evaluated in several processes, it must be defined in a module that these
+        can import.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -153,22 +154,22 @@ def read_photograph(
     previous: Sequence[FaceView] = (),
     without: Frame | None = None,
 ) -> Photograph:
-    """Find the targets of a photograph and the beams on them.
+    """Find the targets in a photograph and the beams on them.
 
     Parameters
     ----------
     frame
         The photograph.
     targets
-        Targets that may be in it.
+        Targets that may be in view.
     camera
         The camera, as far as it is known.
     settings
-        How to read.
+        Evaluation settings.
     previous
-        Views of an earlier photograph of the same camera, which save the search.
+        Views from an earlier photograph by the same camera, which save the search.
     without
-        A frame of the same camera without the beam.
+        A frame from the same camera without the beam.
     """
     with _one_thread().limit(limits=1, user_api="blas"):
         return _read(frame, targets, camera, settings or PhotographSettings(), previous, without)
@@ -217,11 +218,11 @@ def read_crop(
     Parameters
     ----------
     frame
-        Its corners are those of the target; its size is free.
+        Picture whose corners are those of the target, of any size.
     target
         The target that it shows.
     settings
-        How to read.
+        Evaluation settings.
     """
     chosen = settings or PhotographSettings()
     picture = from_crop(frame.linear(chosen.gamma), target, rim=LEAST_RIM)

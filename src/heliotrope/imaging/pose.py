@@ -1,7 +1,7 @@
-"""Locate a camera by known points, with or without knowing its lens.
+"""Locates a camera from known points, with a known or unknown lens.
 
-A deviation in pixels is two-dimensional: the root of the mean squared length of residuals. A
-``sigma`` is that of one coordinate.
+A deviation in pixels is two-dimensional, the root mean square length of the residuals. A ``sigma``
+is that of one coordinate.
 """
 
 from collections.abc import Sequence
@@ -31,15 +31,15 @@ class CameraFit:
     camera, residuals
         The camera with its pose; observed minus predicted pixels, (N, 2).
     names, covariance
-        Rows `POSE`, then `INNER` if solved; (6, 6) or (10, 10). Turns are about
-        the camera's own axes, rad; the position is in ENU metres.
+        Covariance with the parameters `POSE`, then `INNER` if solved; (6, 6) or (10, 10). Rotations
+        are about the camera's own axes, rad; the position is in ENU metres.
     plane_sigma
-        Predicted standard deviation, per coordinate, of a pixel's place on the plane of the
-        points, between them, m; from the camera alone.
+        Predicted standard deviation, per coordinate, of a pixel's position on the plane of the
+        points, between the points, m; from the camera error alone.
     other
         A second pose that explains the points equally well, or None.
     notes
-        What the points do not determine, and contradictions, in sentences.
+        Parameters that the points do not determine, and contradictions, in sentences.
     """
 
     camera: Camera
@@ -65,28 +65,27 @@ def resection(
 ) -> CameraFit:
     """Return the pose of a camera with a known lens.
 
-    Both poses of a plane (Collins and Bartoli 2014, IPPE) and that of the general problem
-    (SQPnP) are refined by least squares. The covariance contains the noise of the points; the
-    lens counts as exact.
+    Both poses from a plane (Collins and Bartoli 2014, IPPE) and the pose from the general problem
+    (SQPnP) are refined by least squares. The covariance includes the noise of the points; the lens
+    is treated as exact.
 
     Parameters
     ----------
     lens
-        Lens or camera; a camera's pose is not used.
+        Lens or camera; the pose of a camera is not used.
     points
-        ENU metres, (N, 3), four or more, not on one line.
+        ENU metres, (N, 3), four or more, not collinear.
     pixels
         Pixels of the points, (N, 2).
     sigma
-        Standard deviation of a pixel coordinate: one number or (N,); or covariances
-        (N, 2, 2), px².
+        Standard deviation of a pixel coordinate, a scalar or (N,); or covariances (N, 2, 2), px².
     name
-        Name of the camera, if a lens is given.
+        Name of the camera, if a lens is passed.
 
     Raises
     ------
     InputError
-        If the points are too few or on one line, or no pose explains them.
+        If there are too few points or they are collinear, or no pose explains them.
     """
     base = lens.camera(name) if isinstance(lens, Lens) else lens
     problem = _problem(*_observed(points, pixels, sigma), base, free=False)
@@ -100,10 +99,10 @@ def calibrate_marks(
     sigma: float | Sequence[npt.ArrayLike] = 0.3,
     name: str = "camera",
 ) -> CameraFit:
-    """Return a camera from points alone.
+    """Calibrate a camera from points alone.
 
     Solves for pose, focal length (square pixels), principal point and k1. The last three have
-    priors: 3 widths within a factor of 4.5, the frame's centre ± 2 % of the width, 0 ± 0.1.
+    priors: 3 frame widths within a factor of 4.5, the frame centre ± 2 % of the width, and 0 ± 0.1.
     Parameters that the points do not determine keep their priors.
 
     Parameters
@@ -112,9 +111,9 @@ def calibrate_marks(
         Width and height of the frames, px.
     points, pixels
         Points and pixels as for `resection`, for each frame of a camera that does not move between
-        them; four or more points in all. Errors are those of `resection`.
+        frames; four or more points in total. Errors are those of `resection`.
     sigma
-        As for `resection`, or a list with one entry for each frame.
+        As for `resection`, or a list with one entry per frame.
     name
         Name of the camera.
     """

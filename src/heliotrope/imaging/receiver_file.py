@@ -1,4 +1,4 @@
-"""The file of a receiver's reference (`receiver_light`): TOML, with a PNG of the surroundings."""
+"""The file of a receiver light reference (`receiver_light`): TOML, with a surroundings PNG."""
 
 import math
 from pathlib import Path

@@ -1,21 +1,22 @@
-"""The light on a receiver in a camera's frame, as a share of the nominal flux.
+"""The light on a receiver in a camera frame, as a fraction of the nominal flux.
 
-The mean of the receiver's pixels rises with the flux in proportion, if the pixels are proportional
-to light. Daylight adds to it. The surroundings, a ring about the receiver's outline that no beam
-should meet, show how bright the daylight is against that of the reference. With the black level b,
-the mean of the receiver m, and that of each side of the ring s_i (reference: index 0)
+If the pixels are proportional to light, the mean over the receiver's pixels increases in proportion
+to the flux. Daylight adds to it. The surroundings, a ring around the receiver outline that no beam
+should hit, show the daylight relative to that of the reference. With the black level b, the mean m
+over the receiver, and the mean s_i over each side of the ring (reference: index 0)
 
     a = min_i (s_i - b) / (s_i0 - b)
     share = ((m - b) - a (m_0 - b)) / rise
 
-where rise is that of the receiver's mean at nominal flux. The least bright side counts, so that a
-beam beside the receiver, or a cloud behind it, is not taken for daylight on it.
+where rise is the increase of the receiver mean at nominal flux. The side of the ring with the
+smallest ratio counts, so that a beam beside the receiver, or a cloud behind it, is not mistaken for
+daylight on the receiver.
 
-Where frames do not state their exposure, it may have become shorter by as much as a seems to have
-fallen below 1: the share is divided by a.
+If frames do not state their exposure, a value of a below 1 may mean that the exposure has become
+shorter; in that case the fraction is divided by a.
 
-Darkness must be proven, light need not be: whatever may hide light (a cap, a moved camera, clipped
-pixels) leaves the share as a lower bound, with the reason.
+Darkness must be proven, light need not be: anything that may hide light (a lens cap, a moved
+camera, clipped pixels) makes the fraction a lower bound, and the reason is reported.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Settings of a local controller: stored once, checked before they are accepted."""
+"""Settings of a local controller: stored once, validated before they are accepted."""
 
 import struct
 from binascii import crc32

@@ -1,6 +1,6 @@
 """The controller of one heliostat: messages and time in, actions out; no input or output.
 
-Safety rests on three things here: the state table, the sun's lease, and that DEFOCUS and STOW
+Safety rests on three things here: the state table, the sun-vector lease, and that DEFOCUS and STOW
 pass every check. ``wire.Gate`` decides who may command and which frames are new.
 
 Every call returns the same list of actions, valid until the next call:

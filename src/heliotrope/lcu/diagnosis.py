@@ -1,4 +1,4 @@
-"""Diagnosis of movement: whether the mirror's tilt follows when an axis moves a little."""
+"""Motion diagnosis: whether the tilt of the mirror follows when an axis moves a little."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Drives: motor steps to the angle of a joint, and back.
+"""Drives: conversion from motor steps to a joint angle, and back.
 
 The law is that of ``heliotrope.mechanism.drives``:
 θ = bias + (1 + scale) φ + worm_cos cos u + worm_sin sin u + sag cos φ, where φ is linear in

@@ -1,25 +1,26 @@
-"""The journal: the memory of a local controller through a loss of power.
+"""The journal: the memory of a local controller that survives a power failure.
 
 NOR flash holds two kinds of records, each with a counter and a CRC-32, each written once into
 erased flash and not touched again until its block is erased:
 
-*Stored items* lie in two slots of a block each. A new record goes to the slot that does not hold
-the present one, so that one is whole at every instant. Armature, drives and the like are stored as
-the bytes received: single precision cannot change them, and their checksum is the sender's.
+*Stored items* are kept in two slots of one block each. A new record goes to the slot that does not
+hold the present one, so that one slot is valid at every instant. Armature, drives and the like are
+stored as the bytes received, so that single precision cannot change them, and their checksum is the
+sender's.
 
-*Counts* (step counts, aim, state, boots) change often and lie in a ring of the other blocks. A
-record is appended where flash is blank; a full block gives way to the next one, which was erased
-before, so wear is even and there is always room for a last record when the supply fails. The block
-with the newest record is never erased.
+*Counts* (step counts, aim, state, boots) change often and are kept in a ring of the other blocks. A
+record is appended where flash is blank; a full block is followed by the next one, which was erased
+in advance, so wear is even and there is always space for a last record when the supply fails. The
+block with the newest record is never erased.
 
-A cut at any byte of a write or an erasure leaves the old or the new record: a damaged record fails
-its checksum and is passed over (except with probability 2^-32).
+A power failure at any byte of a write or an erasure leaves the old or the new record: a damaged
+record fails its checksum and is skipped (except with probability 2^-32).
 
 **Step counts.** Before the first step away from rest, and whenever the next steps would lead
 farther than ``STRIDE`` from the counts in flash, a record "moving" is written; at rest, a record
-"rest". If the newest one says "moving" after a reset, the true counts are within ``STRIDE`` of it;
-``doubt`` says so until ``zero``, and adds up over further cuts. A brown-out detector that calls
-``brown_out`` prevents that.
+"rest". If the newest record says "moving" after a reset, the true counts are within ``STRIDE`` of
+it; ``doubt`` reports this until ``zero``, and accumulates over further power failures. A brown-out
+detector that calls ``brown_out`` prevents it.
 
 **Marks.** The byte of the state holds marks of the controller beside the state. While one of them,
 ``TURNING``, is there, a record of ``GOALS`` holds the goals of the motion in place of the counts.

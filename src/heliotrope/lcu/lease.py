@@ -1,4 +1,4 @@
-"""The last sun vector, and how long it may be trusted."""
+"""The last sun vector, and how long it may be used."""
 
 from . import ticks
 

@@ -1,8 +1,8 @@
 """Motion: how the actions of the state table move the two axes.
 
-One motion runs at a time; starting another replaces it. Beams leave stow with azimuth first
-and elevation last, go along the ground to the foot of the tower and up to standby, and come
-back the same way.
+One motion runs at a time; starting another replaces it. Leaving stow, the azimuth moves first and
+the elevation last; the beam then travels along the ground to the foot of the tower and up to
+standby, and returns by the same path.
 """
 
 import math

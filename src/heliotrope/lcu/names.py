@@ -1,4 +1,4 @@
-"""Meanings of the state table and of STATUS, for people; a board does not need them."""
+"""Descriptions of the state table and of STATUS, for display; a board does not need them."""
 
 from . import states
 

@@ -1,4 +1,4 @@
-"""A whole local controller except its pins: the program of boards and of the simulator.
+"""A complete local controller except for its pins: the program of boards and of the simulator.
 
 ``Node`` joins the reader of frames, the gate, the controller, the journal and the step timer.
 It has no loop, clock or port of its own: bytes and time come in by calls, bytes go out
@@ -14,16 +14,17 @@ it, make another one on the same flash.
 
 ``now_ms`` is a counter of milliseconds modulo 2^30, like ``time.ticks_ms``; see ``ticks``.
 
-**Answers** carry the sequence of the frame that asked, and go out within the call that brought
-it, except HERE, which waits for a slot drawn at random, ``HERE_SLOTS`` of ``HERE_SLOT_MS`` each.
-No other message answers a question to all.
+**Replies** carry the sequence number of the frame that requested them, and are sent within the call
+that delivered it, except HERE, which waits for a randomly chosen slot, ``HERE_SLOTS`` of
+``HERE_SLOT_MS`` each. No other message replies to a broadcast query.
 
-**Order.** Flash is written before the steps that it records are played, and before an ACK reports
-that something was stored. An emergency stop comes before everything.
+**Order.** Flash is written before the steps that it records are executed, and before an ACK reports
+that something was stored. An emergency stop takes precedence over everything.
 
-**A journal that fails** latches the fault JOURNAL, which holds until the next reset; from then
-on nothing is written and nothing stored. The mirror still goes off the receiver and to stow,
-because that protects more than the step counts; a boot on such flash treats the counts as unknown.
+**A journal that fails** latches the fault JOURNAL, which holds until the next reset; from then on
+nothing is written and nothing is stored. The heliostat still moves its beam off the receiver and
+goes to stow, because that protects more than the step counts do; a boot on such flash treats the
+counts as unknown.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""Search: a spiral of offsets of the beam, until a camera sees it on the target."""
+"""Search: a spiral of beam offsets, until a camera sees the beam on the target."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The sender's side of the wire: frames are numbered, framed and signed. No board has it."""
+"""The sender's side of the bus protocol: numbers, frames and signs. Boards do not contain it."""
 
 import struct
 

@@ -1,9 +1,8 @@
 """States of a local controller, and all its transitions as one table.
 
 A line: state, event, new state, motion that starts (if any). An event that is not in the table is
-refused and changes nothing. A motion that starts replaces any other. ``names`` gives the meanings
-of the events and motions. The table is text: on a microcontroller a tuple for each line would take
-7 kB more.
+refused and changes nothing. A motion that starts replaces any other. ``names`` describes the events
+and motions. The table is text, because on a microcontroller a tuple per line would take 7 kB more.
 """
 
 STATES = (

@@ -1,4 +1,4 @@
-"""Steps: goals of two axes become segments for a hardware timer.
+"""Steps: converts the goals of two axes to segments for a hardware timer.
 
 Time runs in slots of some tens of milliseconds. In each, an axis makes the steps of its
 present speed, which changes by no more than the acceleration allows and never exceeds the speed
@@ -7,8 +7,8 @@ steps per slot times ``SCALE``. A segment is (axis, direction, count, interval i
 hardware makes ``count`` pulses, waiting the interval after each. It plays the segments of an
 axis one after the other; no Python runs per step.
 
-Counts are of segments emitted. An emitted segment is played, except at an emergency stop: then the
-hardware reports how many steps it did not make, and `Stepper.undone` takes them back.
+Counts refer to segments emitted. An emitted segment is executed, except at an emergency stop: then
+the hardware reports how many steps it did not make, and `Stepper.undone` subtracts them.
 """
 
 SCALE = 1024

@@ -1,8 +1,8 @@
-"""Time as a counter that wraps: the arithmetic of MicroPython's ``ticks_ms``, written out.
+"""Time as a wrapping counter: the arithmetic of MicroPython's ``ticks_ms``, written out.
 
-Ticks are integers modulo 2^30. A difference is taken the shorter way round, so it lies in
-[-2^29, 2^29): half the period is 6.2 days in milliseconds, 8.9 minutes in microseconds.
-MicroPython's own ``ticks_diff`` gives the same numbers; CPython has none.
+Ticks are integers modulo 2^30. A difference is taken the shorter way round, so it lies in [-2^29,
+2^29): half the period is 6.2 days in milliseconds, 8.9 minutes in microseconds. MicroPython's own
+``ticks_diff`` returns the same numbers; CPython has no such function.
 """
 
 PERIOD = 1 << 30

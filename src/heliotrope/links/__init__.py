@@ -1,14 +1,14 @@
 """Links between the plant and its clusters: a message arrives fresh or not at all.
 
-`Link` is the protocol of one end; its module ``link`` states the guarantees. `CarriedLink` is the
-one implementation, over a `Carrier`: in the same process (`memory_pair`), TCP (`tcp_link`,
-`TcpServer`) or an MQTT broker (module ``mqtt``, which needs the extra ``control``). `Conversation`
-seals each message in an envelope that proves its age without a common clock.
+`Link` is the protocol of one end of a link; its module ``link`` states the guarantees.
+`CarriedLink` is the only implementation, over a `Carrier`: in the same process (`memory_pair`), TCP
+(`tcp_link`, `TcpServer`) or an MQTT broker (module ``mqtt``, which needs the extra ``control``).
+`Conversation` seals each message in an envelope that bounds its age without a common clock.
 
-`encode` and `decode` turn messages (`Lease`, `Command`, `ClusterStatus`, …) into bytes and back.
-A `TappedLink` shows the messages of any link to a listener.
+`encode` and `decode` convert messages (`Lease`, `Command`, `ClusterStatus`, …) to bytes and back. A
+`TappedLink` passes the messages of any link to a listener.
 
-`Clock` measures every limit; `run_virtual` runs a program in virtual time.
+`Clock` is the time base of every limit; `run_virtual` runs a program in virtual time.
 
 Begin with `Link` and `memory_pair`.
 """

@@ -1,4 +1,4 @@
-"""Strict tables and URLs of links, shared by the files of plants and clusters.
+"""Strict tables and URLs of links, used in both plant and cluster files.
 
 Addresses and limits may be shared and kept under version control; keys may not: see `links.keys`.
 """
@@ -21,7 +21,7 @@ class Table(BaseModel):
 
 
 def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
-    """Return scheme, host, port and prefix of a link's URL.
+    """Return scheme, host, port and prefix of a link URL.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
     Raises
     ------
     FormatError
-        If it is not the URL of a link, or a part is missing.
+        If it is not a link URL, or a part is missing.
     """
     try:
         parts = urlsplit(url)

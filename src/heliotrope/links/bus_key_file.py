@@ -1,8 +1,8 @@
-"""The key of a bus in a file of its own, which its cluster reads (`lcu.signing`).
+"""The bus key, in a separate file that its cluster reads (`lcu.signing`).
 
-``keys`` is a list: the key in hexadecimal text; while it is replaced, the new one and the one
-before; empty where signed frames are given up, so that the cluster takes the key from its local
-controllers.
+``keys`` is a list of keys in hexadecimal text: one key; during a key change, the new key and the
+previous one; or empty if frames are no longer to be signed, in which case the cluster removes the
+key from its local controllers.
 """
 
 import secrets

@@ -1,7 +1,7 @@
-"""Certificates for TLS: of a private authority, or a request to another one.
+"""TLS certificates: issued by a private authority, or requested from another one.
 
-A folder holds the authority (``ca.pem``, ``ca.key``) and what a server needs (``NAME.pem``,
-``NAME.key``). Private keys are never overwritten; a certificate is renewed under its key.
+A folder contains the authority (``ca.pem``, ``ca.key``) and the files of each server (``NAME.pem``,
+``NAME.key``). Private keys are never overwritten; a certificate is renewed with its existing key.
 """
 
 import ipaddress

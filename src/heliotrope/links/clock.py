@@ -1,12 +1,12 @@
 """Clocks (real, manual and virtual), and the GPS scale of seconds, which has no leap seconds.
 
-All code that judges time is given a `Clock`. Decisions (leases, deadlines, expiries) rest on
-`monotonic`; `utc` is for information only. A wait of asyncio may end early or late, so code that
-has waited reads the clock again (`sleep_until`).
+All code that judges time receives a `Clock`. Decisions (leases, deadlines, expiries) rest on
+`monotonic`; `utc` is for information only. An asyncio wait may end early or late, so code that has
+waited reads the clock again (`sleep_until`).
 
-The time of a `VirtualLoop` advances only when nothing is left to do now. It takes ready callbacks
-in a random order drawn from its seed, because no code may depend on the order that asyncio happens
-to keep; the same seed gives the same run.
+The time of a `VirtualLoop` advances only when nothing is left to do at the current time. The loop
+runs ready callbacks in a random order drawn from its seed, because no code may depend on the order
+that asyncio happens to keep; the same seed yields the same run.
 """
 
 import asyncio
@@ -49,28 +49,28 @@ class Clock(Protocol):
     """A source of monotonic time and UTC."""
 
     def monotonic(self) -> float:
-        """Return seconds since some instant; never runs backwards, never jumps."""
+        """Return seconds since an arbitrary instant; never runs backwards, never jumps."""
         ...
 
     def utc(self) -> datetime:
-        """Return the system's UTC; it may be wrong, and may jump."""
+        """Return the system's UTC, which may be wrong and may jump."""
         ...
 
 
 class SystemClock:
-    """The clocks of this machine.
+    """The clocks of this computer.
 
     Notes
     -----
-    On Linux the monotonic time is CLOCK_BOOTTIME, which continues while the machine sleeps.
-    CLOCK_MONOTONIC does not, and would stretch a lease by the length of the sleep.
+    On Linux the monotonic time is CLOCK_BOOTTIME, which continues while the computer sleeps.
+    CLOCK_MONOTONIC does not, and would extend a lease by the duration of the sleep.
     """
 
     def __init__(self) -> None:
         self._clock = getattr(time, "CLOCK_BOOTTIME", None)
 
     def monotonic(self) -> float:
-        """Return seconds since the machine started."""
+        """Return seconds since the computer booted."""
         return time.monotonic() if self._clock is None else time.clock_gettime(self._clock)
 
     def utc(self) -> datetime:
@@ -84,12 +84,13 @@ class VirtualClock:
     Parameters
     ----------
     source
-        Returns the monotonic seconds, such as `time` of a `VirtualLoop`; None: the clock stands
-        still until `advance` is called.
+        Function that returns monotonic seconds, such as `time` of a `VirtualLoop`; None: the clock
+        stops until `advance` is called.
     start
-        UTC when the clock is made.
+        UTC when the clock is created.
     rate
-        Seconds of this clock for each second of the source; not 1 for an oscillator that is off.
+        Seconds of this clock per second of the source; a value other than 1 simulates an inaccurate
+        oscillator.
     """
 
     def __init__(
@@ -123,14 +124,14 @@ class VirtualClock:
         Raises
         ------
         InputError
-            A negative time.
+            If the time is negative.
         """
         if not seconds >= 0.0:
             raise InputError(f"advance of {seconds} s: time only goes forward; use jump")
         self._by_hand += seconds
 
     def jump(self, seconds: float) -> None:
-        """Set UTC forward (or back) without letting time pass, as a person at the keyboard may."""
+        """Set UTC forward (or back) without letting time pass, as an operator may."""
         self._jumped += seconds
 
 
@@ -145,12 +146,12 @@ async def sleep_until(clock: Clock, instant: float) -> None:
 
 
 def leap_seconds(utc: datetime) -> int:
-    """Return GPS minus UTC at a time, in s.
+    """Return GPS minus UTC at a given time, in s.
 
     Raises
     ------
     TimeError
-        A time without a time zone, or before the GPS scale began.
+        If the time has no time zone, or is before the start of the GPS time scale.
     """
     if utc.tzinfo is None:
         raise TimeError(f"{utc} has no time zone; give UTC")
@@ -161,12 +162,12 @@ def leap_seconds(utc: datetime) -> int:
 
 
 def gps_seconds(utc: datetime) -> float:
-    """Return seconds of the GPS scale since 6 January 1980.
+    """Return seconds of the GPS time scale since 6 January 1980.
 
     Parameters
     ----------
     utc
-        After 1980, with a time zone. Exact while the table of leap seconds is valid
+        Time after 1980, with a time zone. Exact while the leap-second table is valid
         (`LEAP_SECONDS_VALID_UNTIL`); later the result may be low by a second or more.
     """
     count = leap_seconds(utc)
@@ -174,10 +175,10 @@ def gps_seconds(utc: datetime) -> float:
 
 
 def utc_of_gps(seconds: float) -> datetime:
-    """Return UTC of GPS seconds: the inverse of `gps_seconds`.
+    """Return UTC for GPS seconds: the inverse of `gps_seconds`.
 
-    A leap second itself (23:59:60), which a datetime cannot represent, gives the last microsecond
-    before it.
+    A leap second itself (23:59:60), which a datetime cannot represent, is returned as the last
+    microsecond before it.
     """
     for since, count in reversed(LEAP_SECONDS):
         begin = (since - GPS_EPOCH).total_seconds() + count
@@ -195,7 +196,7 @@ def gps_week(utc: datetime) -> tuple[int, int]:
 
 
 def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> datetime:
-    """Return UTC of a GPS week whose upper bits may be missing.
+    """Return UTC for a GPS week whose upper bits may be missing.
 
     Parameters
     ----------
@@ -204,12 +205,12 @@ def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> dateti
     time_of_week_ms
         0 to 604,799,999.
     not_before
-        A time known to be past; the result is the first matching week that is not older.
+        A time known to be in the past; the result is the first matching week that is not older.
 
     Raises
     ------
     InputError
-        A negative week, or a time outside the week.
+        If the week is negative, or the time is outside the week.
     """
     if week < 0 or not 0 <= time_of_week_ms < WEEK * 1000:
         raise InputError(
@@ -304,14 +305,14 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     Parameters
     ----------
     seed
-        Seed of the order of ready callbacks; None: first in, first out, as in asyncio.
+        Seed for the order of ready callbacks; None: first in, first out, as in asyncio.
     start
         First value of `time`, in s.
 
     Raises
     ------
     RuntimeError
-        When a socket or a thread is used, or when every task waits and no timer runs.
+        If a socket or a thread is used, or if every task waits and no timer is running.
     """
 
     def __init__(self, seed: int | None = None, start: float = 1000.0) -> None:
@@ -333,10 +334,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return self._no_wait.now
 
     def freeze(self, program: str) -> None:
-        """Stop a program, as a stopped process or a suspended machine does, until `thaw`.
+        """Stop a program, like a stopped process or a suspended computer, until `thaw`.
 
-        Nothing of it runs, while time goes on. Its tasks are those of `context_of`; the loop needs
-        a seed.
+        None of its code runs, while time goes on. Its tasks are those of `context_of`; the loop
+        needs a seed.
         """
         self._ready.held.setdefault(program, [])
 
@@ -345,9 +346,9 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._ready.extend(self._ready.held.pop(program, ()))
 
     def kill(self, program: str) -> None:
-        """End a program that is frozen where it stands; its owner has cancelled its tasks.
+        """End a frozen program at the point where it stopped; its owner has cancelled its tasks.
 
-        What it was kept from doing is not done: no task takes another step, no timer wakes one.
+        Pending work is not done: no task takes another step, and no timer wakes a task.
         """
         for handle in self._ready.held.get(program, ()):
             # Group and tasks of the program must still learn that they end.
@@ -361,7 +362,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
-        """Refuse: a thread runs in real time."""
+        """Refuse, because a thread would run in real time."""
         raise RuntimeError(
             f"virtual time has no threads: {func!r} with {len(args)} arguments cannot be run in "
             f"one (executor {executor!r})"
@@ -383,7 +384,7 @@ def run_virtual(
     seed
         As in `VirtualLoop`.
     start
-        UTC at the beginning.
+        UTC at the start.
     """
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed)) as runner:
         clock = VirtualClock(runner.get_loop().time, start)

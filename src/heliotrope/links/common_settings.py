@@ -1,6 +1,6 @@
-"""Settings that all clusters of a plant share, and their checksum, sent in each status.
+"""Settings that all clusters of a plant share, and the checksum sent in each status.
 
-The plant computes the same checksum from its own settings, and compares.
+The plant computes the same checksum from its own settings, and compares the two.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The one implementation of a link: connects, sends heartbeats, supervises and reconnects."""
+"""The only link implementation: connects, sends heartbeats, supervises and reconnects."""
 
 import asyncio
 import contextlib
@@ -26,9 +26,9 @@ from heliotrope.links.link import (
 
 
 class Carrier(Protocol):
-    """A transport for envelopes; one `CarriedLink` opens and closes it again and again.
+    """A transport for envelopes, which a `CarriedLink` opens and closes repeatedly.
 
-    It raises only `LinkLostError` and OSError (and LinkError while it opens).
+    It raises only `LinkLostError` and OSError (and LinkError while opening).
     """
 
     async def open(self) -> SealKeys:
@@ -48,7 +48,7 @@ class Carrier(Protocol):
         ...
 
     async def close(self) -> None:
-        """Disconnect at once; what has not gone out is discarded."""
+        """Disconnect at once; data not yet sent is discarded."""
         ...
 
 
@@ -58,11 +58,11 @@ class CarriedLink:
     Parameters
     ----------
     name
-        Name of the other end, for people.
+        Name of the other end, for display.
     carrier
-        Used by this link only.
+        Carrier, used by this link only.
     clock
-        Its monotonic time decides everything; expiries are given in it.
+        Clock whose monotonic time decides everything, and in which expiries are expressed.
     settings
         See `LinkSettings`.
     statistics
@@ -70,7 +70,7 @@ class CarriedLink:
     seed
         Seed of the pauses and of the session numbers, for simulation; None: from the system.
     patient
-        The carrier waits for the other end to connect: no time limit, and no pauses.
+        Whether the carrier waits for the other end to connect, without a time limit and pauses.
     """
 
     def __init__(
@@ -110,12 +110,12 @@ class CarriedLink:
 
     @property
     def connected(self) -> bool:
-        """Whether the other end was alive, and heard this end, within the deadline."""
+        """Whether the other end was alive, and received from this end, within the deadline."""
         return self.lasts > 0.0
 
     @property
     def lasts(self) -> float:
-        """Time until the connection ends unless something is heard, s; 0: not connected."""
+        """Time until the connection ends unless something is received, s; 0: not connected."""
         if not self._open:
             return 0.0
         return max(0.0, self._until(-math.inf) - self._clock.monotonic())
@@ -128,17 +128,17 @@ class CarriedLink:
 
     @property
     def behind(self) -> bool:
-        """Whether it is connected, but the other end has not yet shown that it has the new key."""
+        """Whether it is connected but the other end has not yet shown that it has the new key."""
         return self.connected and self._talk.behind
 
     @property
     def closed(self) -> bool:
-        """Whether the link is closed for good."""
+        """Whether the link is closed permanently."""
         return self._closing.is_set()
 
     @property
     def silent_for(self) -> float:
-        """Time since the other end was certainly alive, in s; infinite if it never was."""
+        """Time since the other end was last known to be alive, in s; infinite if never."""
         return self._heart.silent_for
 
     @property
@@ -148,11 +148,11 @@ class CarriedLink:
 
     @property
     def statistics(self) -> Statistics:
-        """Counts since the link was made."""
+        """Counts since the link was created."""
         return self._statistics
 
     async def close(self) -> None:
-        """Close the link for good: waiting messages are dropped, and ``run`` ends."""
+        """Close the link permanently: waiting messages are dropped, and ``run`` returns."""
         self._closing.set()
         self._inbox.close()
         self._up.set()
@@ -164,7 +164,7 @@ class CarriedLink:
         Raises
         ------
         LinkClosedError
-            When the link is closed.
+            If the link is closed.
         """
         return await self._inbox.get()
 
@@ -174,7 +174,7 @@ class CarriedLink:
         Raises
         ------
         LinkClosedError
-            When the link is closed.
+            If the link is closed.
         """
         while not self.connected:
             if self.closed:
@@ -192,18 +192,19 @@ class CarriedLink:
         data
             At most `LinkSettings.largest` bytes.
         expires
-            By the monotonic clock: the message is delivered before that or not at all. Every motion
-            command has one. None: the message does not expire, but is not held either.
+            Time on the monotonic clock by which the message must be delivered; otherwise it is
+            discarded. Every motion command has an expiry. None: the message does not expire, but is
+            not held either.
         hold
-            Wait for a connection until the message expires. Nothing is held unless the caller asks
-            for it, and then only while the caller waits: there is no queue.
+            Whether to wait for a connection until the message expires. A message is held only if
+            the caller requests this, and only while the caller waits; there is no queue.
 
         Raises
         ------
         InputError
-            A message that is too large, is held without an expiry, or expires too far ahead.
+            If a message is too large, is held without an expiry, or expires too far ahead.
         LinkClosedError
-            When the link is closed.
+            If the link is closed.
         """
         self._check(data, expires, hold)
         # After the deadline the connection is gone, so waiting longer is useless.

@@ -1,15 +1,14 @@
-"""Envelopes of a link: order, freshness and authenticity, without any transport.
+"""Envelopes of a link: order, freshness and authenticity, independent of the transport.
 
-A receiver knows the age of a message without a common clock. Every envelope carries the sender's
-monotonic time, the latest of the *receiver's* times that the sender has heard, and how long ago it
-heard that. The envelope was therefore sent after that time of the receiver's own clock, which
-bounds its age, to within the delay of the path, whatever the wall clocks say. Between two such
-proofs the best of them is carried forward with the sender's own times, less the drift that two
-clocks may have.
+A receiver can bound the age of a message without a common clock. Every envelope carries the
+sender's monotonic time, the latest *receiver* time that the sender has received, and how long ago
+it was received. The envelope was therefore sent after that time on the receiver's own clock, which
+bounds its age to within the path delay, whatever the wall clocks say. Between two such bounds the
+best one is carried forward with the sender's own times, minus the maximum drift between two clocks.
 
-Liveness is judged by the same bound: heartbeats that were held up and arrive in a bunch renew
-nothing. A copy, a message of an earlier connection and a reflected message carry the wrong count
-or the wrong session, and are refused.
+Liveness is judged by the same bound, so heartbeats that were delayed and arrive in a burst renew
+nothing. A copy, a message from an earlier connection and a reflected message have the wrong count
+or the wrong session, and are rejected.
 """
 
 import hmac
@@ -53,31 +52,31 @@ class _Peer:
 
 
 class Conversation:
-    """Envelopes in and out, without any transport: order, freshness, authenticity.
+    """Envelopes in and out, independent of the transport: order, freshness, authenticity.
 
     Parameters
     ----------
     clock
-        Only its monotonic time is used. The other end has its own clock.
+        Clock, of which only the monotonic time is used. The other end has its own clock.
     settings
         `LinkSettings.horizon` and `largest` are used here.
     statistics
         Counters to use.
     entropy
-        Returns random bytes, for session numbers.
+        Function that returns random bytes, for session numbers.
 
     Attributes
     ----------
     alive_at
-        A time at which the other end was certainly alive, by our clock.
+        Latest time, by our clock, at which the other end was certainly alive.
     heard_at
-        A time of our clock that the other end has certainly heard.
+        Latest time of our clock that the other end has certainly received.
 
     Notes
     -----
-    The MAC is HMAC-SHA256 truncated to 16 bytes. With an empty key it still detects damage.
-    While a new key takes over from an old one, envelopes under either are accepted.
-    Each connection has a new session, so that nothing from an older one is accepted.
+    The MAC is HMAC-SHA256 truncated to 16 bytes. With an empty key it still detects damage. During
+    a change from an old key to a new one, envelopes under either key are accepted. Each connection
+    has a new session, so that nothing from an older connection is accepted.
     """
 
     def __init__(
@@ -94,7 +93,7 @@ class Conversation:
         self.restart(lambda: (b"",))
 
     def restart(self, keys: SealKeys) -> None:
-        """Begin a new session under some keys; nothing of the old session is accepted any more."""
+        """Begin a new session with given keys; nothing from the old session is accepted."""
         self._keys = keys
         self._proved: bytes | None = None
         self._session = int.from_bytes(self._entropy(8), "little") or 1
@@ -120,9 +119,9 @@ class Conversation:
         return keys[: keys.index(self._proved) + 1] if self._proved in keys else keys
 
     def beats(self) -> list[bytes]:
-        """Return the heartbeats to send: one, or two while a new session asks to be heard.
+        """Return the heartbeats to send: one, or two while a new session requests a response.
 
-        While the other end may not have a newer key, they are sent under both.
+        While the other end may not have a newer key, heartbeats are sent under both keys.
         """
         known = [peer for peer in (self._peer, self._candidate) if peer is not None]
         self._candidate = None
@@ -130,7 +129,7 @@ class Conversation:
         return [self._seal(_BEAT, peer, 0, b"", key) for key in self._sealing() for peer in ends]
 
     def data(self, message: bytes, expires: float | None) -> bytes:
-        """Return the envelope of a message that is sent now.
+        """Return the envelope for a message that is sent now.
 
         Raises
         ------
@@ -169,15 +168,15 @@ class Conversation:
         return False
 
     def feed(self, envelope: bytes) -> tuple[tuple[bytes, float] | None, bool]:
-        """Take an envelope as it arrived.
+        """Process an envelope as it arrived.
 
         Returns
         -------
         arrival
             The message and its expiry by our clock (infinite if it has none); None for a heartbeat
-            and for an envelope that is not to be delivered, which is counted.
+            and for an envelope that must not be delivered, which is counted.
         prompt
-            Whether a heartbeat should be sent at once because the other end waits for it.
+            Whether to send a heartbeat at once because the other end waits for it.
         """
         now = self._clock.monotonic()
         self._statistics.last_received = now

@@ -1,12 +1,12 @@
-"""A satellite receiver as reported by gpsd: position, fix, and a second opinion on the time.
+"""A satellite receiver as reported by gpsd: position, fix, and an independent time check.
 
 gpsd reads the receiver and feeds chrony, which disciplines the computer's clock
 (docs/how-to/time.md). A cluster takes its time from that clock. It listens to gpsd only to show the
-receiver's state and to notice when clock and receiver contradict each other; a plant, as to an
+receiver status and to detect disagreement between clock and receiver; a plant listens to gpsd as an
 independent witness of its time and site.
 
-`GpsdReader` turns bytes of gpsd's JSON protocol into a `SatelliteReceiver` without any input or
-output; `Gpsd` keeps a connection open and feeds one.
+`GpsdReader` converts bytes of gpsd's JSON protocol into a `SatelliteReceiver` without any input or
+output; `Gpsd` keeps a connection open and feeds a reader.
 """
 
 import asyncio

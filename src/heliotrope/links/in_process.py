@@ -1,8 +1,8 @@
-"""Links within one process, with faults drawn from a seed: the default, and the twin's.
+"""Links within one process, with seeded faults: the default, and used by the twin.
 
 The two ends exchange the same envelopes as over a network, so heartbeats, expiry and reconnection
-are the real ones. Messages under way lie in a heap ordered by arrival time, so the order of the
-event loop's callbacks does not change the order of messages.
+behave as in reality. Messages in transit are kept in a heap ordered by arrival time, so the order
+of the event loop's callbacks does not affect the order of messages.
 """
 
 import asyncio
@@ -28,12 +28,12 @@ class Faults:
         Probability, 0 to 1, that an envelope is lost; arrives twice; is overtaken; has one bit
         inverted.
     delay
-        Shortest and longest time under way, in s.
+        Shortest and longest time in transit, in s.
 
     Raises
     ------
     InputError
-        A probability outside 0 to 1, or a negative or reversed delay.
+        If a probability is outside 0 to 1, or a delay is negative or reversed.
     """
 
     loss: float = 0.0
@@ -102,12 +102,12 @@ class _Lane:
 
 
 class MemoryLine:
-    """A line between two ends, and its faults, which may be changed while it is in use.
+    """A line between two ends, with faults that may be changed while it is in use.
 
     Parameters
     ----------
     clock
-        Clock of the line; the ends may have others.
+        Clock of the line; the ends may have other clocks.
     faults
         Faults applied to each envelope.
     seed
@@ -134,16 +134,16 @@ class MemoryLine:
         )
 
     def cut(self, *, first_to_second: bool = True, second_to_first: bool = True) -> None:
-        """Lose everything sent from now on, in one direction or both; neither end is notified."""
+        """Lose everything sent from now on, in one or both directions; neither end is notified."""
         self.lanes[0].cut = first_to_second
         self.lanes[1].cut = second_to_first
 
     def heal(self) -> None:
-        """End a partition; envelopes under way go on, lost ones stay lost."""
+        """End a partition; envelopes in transit continue, lost ones stay lost."""
         self.cut(first_to_second=False, second_to_first=False)
 
     def drop(self) -> None:
-        """Break the connection as a reset does: both ends notice, envelopes under way are lost."""
+        """Break the connection as a reset does: both ends notice; envelopes in transit are lost."""
         self.generation += 1
         for lane in self.lanes:
             lane.clear()
@@ -163,8 +163,8 @@ class MemoryLine:
         Parameters
         ----------
         place
-            0 or 1. Of several links at one place the one that connected last has the line, as with
-            one client identifier at a broker; the other loses it, and connects again.
+            0 or 1. Of several links at one end, the last one to connect owns the line, as with a
+            shared client identifier at a broker; the other link loses it, and reconnects.
         name
             Name of the other end.
         clock
@@ -243,13 +243,14 @@ def memory_pair(
     Parameters
     ----------
     clock
-        Clock of the line and, unless ``clocks`` are given, of both ends.
+        Clock of the line and, unless ``clocks`` is specified, of both ends.
     names
-        Names of the first and the second end; each link bears the name of the end it leads to.
+        Names of the first and the second end; each link bears the name of the end to which it
+        leads.
     faults
         None: a perfect line.
     seed
-        Seed of faults, pauses and sessions: the same seed gives the same run.
+        Seed of faults, pauses and sessions: the same seed yields the same run.
     settings
         Settings of both ends.
     clocks

@@ -1,13 +1,12 @@
-"""Keys of the links between plant and clusters: key files, and keys that change while links run.
+"""Keys of the links between plant and clusters: key files, and key changes while links run.
 
-Each cluster shares one key with its plant. While a new key takes over from an old one, an end has
-both: it accepts either, and uses the new one as soon as the other end has shown that it has it too
-(`envelope.Conversation`). So it does not matter which end gets the new key first, nothing is lost,
-and no connection ends.
+Each cluster shares one key with its plant. During a change from an old key to a new one, an end has
+both: it accepts either, and uses the new key as soon as the other end has shown that it also has
+the new key (`envelope.Conversation`). It therefore does not matter which end gets the new key
+first; nothing is lost, and no connection ends.
 
-Keys stand in a file of their own that only its owner may read: ``plant`` and ``password``, and a
-table of keys, as hexadecimal text. Where there are two keys, they stand in a list, the new one
-first.
+Keys are stored in a separate file that only its owner may read: ``plant`` and ``password``, and a
+table of keys, as hexadecimal text. If there are two keys, they form a list, the new key first.
 """
 
 import fcntl
@@ -43,12 +42,12 @@ LinkKeys = tuple[bytes, ...]
 
 
 class KeyRing:
-    """The keys of one link; they may be replaced while it runs.
+    """The keys of one link; they may be replaced while the link runs.
 
     Attributes
     ----------
     keys
-        The newest first; it is replaced as a whole, so any thread may read it.
+        Keys, the newest first; replaced as a whole, so any thread may read it.
     """
 
     def __init__(self, *keys: bytes) -> None:
@@ -56,7 +55,7 @@ class KeyRing:
 
     @property
     def newest(self) -> bytes:
-        """The newest key; empty without a key."""
+        """The newest key; empty if there is none."""
         return self.keys[0] if self.keys else b""
 
 
@@ -93,9 +92,9 @@ class Keys:
     Parameters
     ----------
     path
-        None: there is no file, and there are no keys.
+        Path of the file. None: there is no file, and there are no keys.
     table
-        Name of the table: `HELIOSTATS` in a cluster's file, `CLUSTERS` in a plant's.
+        Name of the table: `HELIOSTATS` in a cluster file, `CLUSTERS` in a plant file.
 
     Attributes
     ----------
@@ -107,7 +106,7 @@ class Keys:
     Raises
     ------
     FormatError
-        If others may read the file, or a value is not a key.
+        If other users may read the file, or a value is not a key.
     """
 
     def __init__(self, path: Path | None, table: str) -> None:
@@ -156,7 +155,7 @@ class Keys:
         return bytes.fromhex(text)
 
     def check(self, names: list[str]) -> None:
-        """Refuse keys of members that do not exist."""
+        """Reject keys of members that do not exist."""
         for name in self.members:
             if name not in names:
                 close = get_close_matches(name, names, n=1)

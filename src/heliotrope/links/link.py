@@ -1,16 +1,17 @@
-"""Links between the plant and its clusters: messages of bytes, fresh or not at all.
+"""Links between the plant and its clusters: byte messages, fresh or not at all.
 
 A `Link` carries datagrams between two ends. It guarantees:
 
-- A message arrives whole, unaltered, in order, at most once, or not at all.
-- A message with an expiry is never delivered after it: not from a queue, not from a broker that
-  was frozen, not from a socket's buffer. Nothing is kept for an end that is absent.
-- `connected` means that the other end was alive within the deadline, and heard this one within the
-  deadline and a period. It rests on our own heartbeats alone, whatever state the transport reports.
+- A message arrives complete, unaltered, in order and at most once, or not at all.
+- A message with an expiry is never delivered after it, neither from a queue nor from a broker that
+  was frozen nor from a socket buffer. Nothing is kept for an absent end.
+- `connected` means that the other end was alive within the deadline, and received from this end
+  within the deadline plus one period. It rests on our own heartbeats alone, whatever state the
+  transport reports.
 
-`CarriedLink` (connection.py) is the one implementation; memory, TCP and MQTT differ only in their
-`Carrier`. envelope.py explains how a receiver knows a message's age without a common clock.
-A bus is not a link: it has one master, and a node that answers does so at once (`Bus`,
+`CarriedLink` (connection.py) is the only implementation; memory, TCP and MQTT differ only in their
+`Carrier`. envelope.py explains how a receiver bounds the age of a message without a common clock. A
+bus is not a link: it has one master, and a node that replies does so at once (`Bus`,
 `cluster.serial_bus`).
 
 ::
@@ -36,22 +37,22 @@ from heliotrope.links.clock import Clock
 
 
 class LinkError(HeliotropeError):
-    """A link cannot be made, or no longer exists."""
+    """A link that cannot be created, or no longer exists."""
 
 
 class LinkLostError(LinkError):
-    """A connection is gone; the link makes another by itself."""
+    """A connection is lost; the link reconnects automatically."""
 
 
 class LinkClosedError(LinkError):
-    """The link was closed for good."""
+    """The link was closed permanently."""
 
 
 class SendOutcome(enum.Enum):
-    """Fate of a message at its sender; the receiver may still refuse it.
+    """Outcome of sending a message; the receiver may still reject the message.
 
-    SENT: the transport took it in time (with MQTT: the broker confirmed it).
-    After any other result the caller may send it again; the first message will not arrive late.
+    SENT: the transport accepted the message in time (with MQTT: the broker confirmed it). After any
+    other outcome the caller may send it again; the first message will not arrive late.
     """
 
     SENT = "sent"
@@ -61,21 +62,22 @@ class SendOutcome(enum.Enum):
 
 @dataclass(slots=True)
 class Statistics:
-    """Counts of a link since it was made.
+    """Counts of a link since it was created.
 
     Attributes
     ----------
     sent, received
         Messages handed to the transport; messages handed to the caller.
     dropped, expired
-        Not sent: not connected; could not go out in time.
+        Messages not sent: because the link was not connected; because they could not be sent in
+        time.
     late, overflowed
-        Not delivered: older than their expiry; dropped as the oldest of a full queue.
+        Messages not delivered: older than their expiry; dropped as the oldest in a full queue.
     repeated, refused, retained
-        Not delivered: duplicates and overtaken messages; damaged, forged or of another
-        conversation; kept by a broker from before.
+        Messages not delivered: duplicates and overtaken messages; damaged, forged or from another
+        conversation; retained by a broker.
     opened, failures, reconnects
-        Connections made; attempts that failed; connections made after the first.
+        Connections made; failed attempts; connections made after the first.
     last_received
         When the last envelope of any kind arrived, in s of the monotonic clock.
     """
@@ -97,31 +99,32 @@ class Statistics:
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """Times and sizes of a link; both ends should have the same.
+    """Times and sizes of a link; both ends should use the same values.
 
     Parameters
     ----------
     period
         Time between heartbeats, in s.
     deadline
-        Silence after which the other end counts as gone, in s; at least twice the period.
-        The plant's lease to a cluster is 3 s, so the default leaves half of it.
+        Silence after which the other end counts as lost, in s; at least twice the period. The
+        plant's lease to a cluster is 3 s, so the default leaves half of it.
     capacity
-        Received messages that may wait for the caller; beyond it the oldest is dropped.
+        Maximum number of received messages waiting for the caller; beyond it the oldest is dropped.
     largest
-        Size limit of a message, in bytes.
+        Maximum size of a message, in bytes.
     horizon
-        Longest time to an expiry that is accepted, in s.
+        Maximum time to an expiry that is accepted, in s.
     open_limit
-        Time limit for making a connection, in s.
+        Timeout for making a connection, in s.
     first_pause, longest_pause
-        Pauses between attempts to connect, in s: doubled each time, and drawn between half and all
-        of that, so that the clusters of a field do not reconnect in step.
+        Shortest and longest pause between connection attempts, in s. The pause doubles each time
+        and is drawn between half and all of its value, so that the clusters of a field do not
+        reconnect simultaneously.
 
     Raises
     ------
     InputError
-        Values that contradict each other.
+        If values contradict each other.
     """
 
     period: float = 0.5
@@ -154,8 +157,8 @@ class LinkSettings:
 class Link(Protocol):
     """One end of a link; see the docstring of this module for its guarantees.
 
-    ``run`` belongs in a TaskGroup of the owner (or use `running`); it ends when the link is
-    closed. ``receive`` has one caller at a time.
+    Run ``run`` in a TaskGroup of the owner (or use `running`); it returns when the link is closed.
+    ``receive`` may have only one caller at a time.
     """
 
     @property
@@ -165,17 +168,17 @@ class Link(Protocol):
 
     @property
     def connected(self) -> bool:
-        """Whether the other end was alive, and heard this end, within the deadline."""
+        """Whether the other end was alive, and received from this end, within the deadline."""
         ...
 
     @property
     def closed(self) -> bool:
-        """Whether the link is closed for good."""
+        """Whether the link is closed permanently."""
         ...
 
     @property
     def silent_for(self) -> float:
-        """Time since the other end was certainly alive, in s; infinite if it never was."""
+        """Time since the other end was last known to be alive, in s; infinite if never."""
         ...
 
     @property
@@ -185,7 +188,7 @@ class Link(Protocol):
 
     @property
     def statistics(self) -> Statistics:
-        """Counts since the link was made."""
+        """Counts since the link was created."""
         ...
 
     async def run(self) -> None:
@@ -195,7 +198,7 @@ class Link(Protocol):
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
     ) -> SendOutcome:
-        """Send a message by ``expires`` of the monotonic clock, or not at all."""
+        """Send a message by ``expires`` on the monotonic clock, or not at all."""
         ...
 
     async def receive(self) -> bytes:
@@ -203,21 +206,21 @@ class Link(Protocol):
         ...
 
     async def close(self) -> None:
-        """Close the link for good."""
+        """Close the link permanently."""
         ...
 
 
 class Bus(Protocol):
-    """A bus whose only master is this side: it sends a frame and reads the answer."""
+    """A bus with this side as its only master, which sends a frame and reads the reply."""
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open; only answers show which nodes are alive."""
+        """Whether the port is open; only replies show which nodes are alive."""
         ...
 
     @property
     def closed(self) -> bool:
-        """Whether the bus is closed for good."""
+        """Whether the bus is closed permanently."""
         ...
 
     async def run(self) -> None:
@@ -233,17 +236,17 @@ class Bus(Protocol):
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the answer; empty without one."""
+        """Send a frame and return the reply; empty if there is none."""
         ...
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame that is not answered."""
+        """Send a frame that expects no reply."""
         ...
 
     async def close(self) -> None:
-        """Close the bus for good."""
+        """Close the bus permanently."""
         ...
 
 
@@ -258,7 +261,7 @@ class Backoff:
     first, longest
         In s.
     chance
-        Draws between half of a pause and all of it.
+        Generator that draws between half of a pause and all of it.
     """
 
     def __init__(self, first: float, longest: float, chance: random.Random) -> None:
@@ -268,7 +271,7 @@ class Backoff:
         self._pause = first
 
     def reset(self) -> None:
-        """Begin again with the first pause, after a success."""
+        """Restart with the first pause, after a success."""
         self._pause = self._first
 
     def next(self) -> float:
@@ -279,14 +282,14 @@ class Backoff:
 
 
 class Heartbeat:
-    """A steady rhythm of sending, and a record of the other side's silence.
+    """Periodic sending, and a record of how long the other side has been silent.
 
     Parameters
     ----------
     clock
-        Its monotonic time decides.
+        Clock whose monotonic time decides.
     period, deadline
-        Time between beats, and limit of silence, in s.
+        Time between heartbeats, and maximum silence, in s.
     """
 
     def __init__(self, clock: Clock, period: float, deadline: float) -> None:
@@ -297,16 +300,16 @@ class Heartbeat:
         self._now = asyncio.Event()
 
     def heard(self, at: float | None = None) -> None:
-        """Note that the other side was alive, now or at an instant of the clock.
+        """Note that the other side was alive, now or at a given time of the clock.
 
-        Time never goes back here: news older than the latest renews nothing.
+        Earlier times than the latest known one are ignored.
         """
         now = self._clock.monotonic()
         self._heard = max(self._heard, now if at is None else min(at, now))
 
     @property
     def silent_for(self) -> float:
-        """Time since the other side was alive, in s; infinite if it never was."""
+        """Time since the other side was alive, in s; infinite if never."""
         return self._clock.monotonic() - self._heard
 
     @property
@@ -315,7 +318,7 @@ class Heartbeat:
         return self.silent_for <= self._deadline
 
     def prompt(self) -> None:
-        """Beat at once, and continue the rhythm from there."""
+        """Send a heartbeat at once, and continue the rhythm from there."""
         self._now.set()
 
     async def run(self, beat: Callable[[], Awaitable[object]]) -> None:
@@ -334,7 +337,7 @@ class Heartbeat:
 
 
 class Inbox:
-    """Received messages not yet taken: a bounded queue in which nothing outlives its expiry."""
+    """Received messages not yet taken: a bounded queue that drops messages at their expiry."""
 
     def __init__(self, clock: Clock, capacity: int, statistics: Statistics) -> None:
         self._clock = clock
@@ -345,7 +348,7 @@ class Inbox:
         self._closed = False
 
     def put(self, data: bytes, expires: float) -> None:
-        """Add a message; if the box is full, its oldest is dropped and counted."""
+        """Add a message; if the queue is full, its oldest message is dropped and counted."""
         if len(self._items) >= self._capacity:
             self._items.popleft()
             self._statistics.overflowed += 1
@@ -363,7 +366,7 @@ class Inbox:
         Raises
         ------
         LinkClosedError
-            When the box is closed; messages left in it are not delivered.
+            If the inbox is closed; remaining messages are not delivered.
         """
         while not self._closed:
             while self._items:
@@ -388,7 +391,7 @@ async def received(link: Link) -> AsyncIterator[bytes]:
 
 
 async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]) -> None:
-    """Run parts side by side until an event is set, then cancel them; if one fails, all end."""
+    """Run parts concurrently until an event is set, then cancel them; if one fails, all end."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(part) for part in parts]
         await closing.wait()
@@ -423,7 +426,7 @@ class Runnable(Protocol):
 
 @contextlib.asynccontextmanager
 async def running(*parts: Runnable) -> AsyncIterator[None]:
-    """Run links, buses and servers during a block, and close them together at its end."""
+    """Run links, buses and servers during a block, and close all of them at its end."""
     failure: Exception | None = None
     async with asyncio.TaskGroup() as group:
         for part in parts:

@@ -1,14 +1,14 @@
 """Messages between the plant and its clusters, sent over a `Link`.
 
 A message is one line of JSON, a newline, and a block of bytes (empty except in STATUS and
-PARAMETERS). The line names the kind and holds the fields. Unknown fields are ignored, so that
-a newer plant can talk to an older cluster; an unknown kind is refused with its name.
+PARAMETERS). The line contains the kind and the fields. Unknown fields are ignored, so that a newer
+plant can talk to an older cluster; an unknown kind is rejected by name.
 
 Plant to cluster: `Lease`, `Command`, `Emergency`, `Parameters`, `Ask`, `Acknowledge`.
 Cluster to plant: `ClusterStatus`, `Progress`, `Alarm`, `Answer`.
 
-Every message that moves a mirror towards the receiver carries the token of the command authority
-and is sent with an expiry of the link; `Emergency` needs neither, and is accepted from anyone.
+Every message that moves a beam towards the receiver carries the token of the command authority and
+is sent with a link expiry; `Emergency` needs neither, and is accepted from any sender.
 """
 
 import dataclasses
@@ -60,11 +60,11 @@ NEVER = 0xFFFFFFFF
 
 
 class ProtocolError(HeliotropeError):
-    """Bytes that are not a message, or a message that this side doesn't know."""
+    """Bytes that are not a message, or a message that this side does not know."""
 
 
 class Stage(Enum):
-    """Stage of a command at one heliostat; the last three are final."""
+    """Stage of a command at one heliostat; the last three stages are final."""
 
     ACCEPTED = "accepted"  # by the cluster
     SENT = "sent"  # on the bus
@@ -76,11 +76,11 @@ class Stage(Enum):
 
 @dataclass(frozen=True)
 class Lease:
-    """The plant is present, and commands under this token (0: nobody may command).
+    """The plant is present, and commands under this token (0: no commands are accepted).
 
-    The cluster may go on for ``lifetime`` s after its arrival, and for ``autonomy`` s more. Its
-    expiry on the link limits how long it may be under way. ``run`` names one start of one plant;
-    "" from an older plant.
+    The cluster may continue for ``lifetime`` s after the arrival of the lease, and for ``autonomy``
+    s more. Its expiry on the link limits the time in transit. ``run`` identifies one start of one
+    plant; "" from an older plant.
     """
 
     kind: ClassVar[str] = "lease"
@@ -92,10 +92,10 @@ class Lease:
 
 @dataclass(frozen=True)
 class Command:
-    """A command of the wire, by its name and values, to heliostats by name ((): all).
+    """A bus command, by its name and values, to heliostats by name ((): all).
 
     ``identity`` is repeated in every `Progress`. ``lifetime`` in s counts from the arrival at the
-    cluster; the command arrives before its expiry on the link, or not at all.
+    cluster; the command arrives before its link expiry, or not at all.
     """
 
     kind: ClassVar[str] = "command"
@@ -109,7 +109,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Emergency:
-    """DEFOCUS or STOW, to heliostats by name ((): all): accepted from anyone, before all else."""
+    """DEFOCUS or STOW, to heliostats by name ((): all): accepted from any sender, with priority."""
 
     kind: ClassVar[str] = "emergency"
     identity: str
@@ -119,9 +119,9 @@ class Emergency:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Items of one heliostat's journal (`lcu.journal.ITEMS`), to be stored there.
+    """Items for the journal of one heliostat (`lcu.journal.ITEMS`), to be stored there.
 
-    ``sizes`` gives the size of each item in ``block``; ``lifetime`` as in `Command`.
+    ``sizes`` are the sizes of the items in ``block``; ``lifetime`` is as in `Command`.
     """
 
     kind: ClassVar[str] = "parameters"
@@ -137,7 +137,7 @@ class Parameters:
     def of(
         cls, identity: str, heliostat: str, items: Mapping[str, bytes], token: int
     ) -> "Parameters":
-        """Return the message for items by name."""
+        """Return the message for given items by name."""
         names = tuple(items)
         sizes = tuple(len(items[name]) for name in names)
         block = b"".join(items.values())
@@ -149,7 +149,7 @@ class Parameters:
         Raises
         ------
         ProtocolError
-            If names, sizes and block don't fit together.
+            If names, sizes and block do not fit together.
         """
         if len(self.names) != len(self.sizes) or sum(self.sizes) != len(self.block):
             raise ProtocolError(
@@ -167,12 +167,11 @@ class Parameters:
 class Ask:
     """A question.
 
-    ``what``: ``checksums``, ``stored`` and ``diagnosis`` (of a heliostat), ``statistics``,
-    ``discover``, ``frames``. The answer to ``diagnosis`` is the ``result`` of the last diagnosis of
-    movement (`lcu.diagnosis`).
-    The answer to ``statistics`` names all heliostats in the order of the rows of `ClusterStatus`.
-    The answer to ``frames``, what went over the bus, comes when its time or number is reached; its
-    block holds a `BUS_ENTRY` and the bytes for each.
+    Kind of query: ``checksums``, ``stored`` and ``diagnosis`` (for a heliostat), ``statistics``,
+    ``discover``, ``frames``. The reply to ``diagnosis`` is the ``result`` of the last motion
+    diagnosis (`lcu.diagnosis`). The reply to ``statistics`` names all heliostats in the order of
+    the rows of `ClusterStatus`. The reply to ``frames``, a record of the bus traffic, is sent when
+    its time or number is reached; its block contains a `BUS_ENTRY` and the bytes of each frame.
     """
 
     kind: ClassVar[str] = "ask"
@@ -183,9 +182,10 @@ class Ask:
 
 @dataclass(frozen=True)
 class Acknowledge:
-    """A person acknowledges a latched row of the cluster's safety table, shown by an `Alarm`.
+    """An operator acknowledges a latched row of the cluster's safety table, shown by an `Alarm`.
 
-    ``role`` is the name of a `safety.AcknowledgeRole`. `Progress` says DONE, or REFUSED and why.
+    ``role`` is the name of a `safety.AcknowledgeRole`. `Progress` reports DONE, or REFUSED with the
+    reason.
     """
 
     kind: ClassVar[str] = "acknowledge"
@@ -197,18 +197,19 @@ class Acknowledge:
 
 @dataclass(frozen=True)
 class ClusterStatus:
-    """State of the cluster and all its heliostats, sent once a second.
+    """State of the cluster and all its heliostats, sent once per second.
 
-    ``names``, in the order of the rows, is sent in the first message of a connection and in
-    every tenth after it, as each may be lost; otherwise it is ().
-    ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` the bound of its error.
-    ``site`` holds `Site.numbers`, for which it computes the sun; () from an older cluster.
+    ``names``, in the order of the rows, is sent in the first message of a connection and in every
+    tenth message after that, as each may be lost; otherwise it is (). ``utc_s`` is the cluster's
+    own time (POSIX seconds), ``time_error_s`` the bound on its error. ``site`` contains the
+    `Site.numbers` for which the cluster computes the sun vector; () from an older cluster.
     ``settings`` is the checksum of the settings that all clusters should share, eight hexadecimal
-    digits (`links.common_settings`); "" from an older cluster.
-    ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
-    ``run`` is the run of the plant that it belongs to, ``barred`` those that get no lease.
-    With the names come the ``alarms`` of the cluster that are active, each as "condition subject",
-    and ``alarms_listed`` is true: what is not among them is over, though its end may be lost.
+    digits (`links.common_settings`); "" from an older cluster. ``lease_left`` is in s; below 0 the
+    plant's lease has expired. ``cycle_s`` is the duration of the last poll cycle. ``run`` is the
+    plant run that the cluster belongs to, ``barred`` are the runs that get no lease. Together with
+    the names the status lists the active ``alarms`` of the cluster, each as "condition subject",
+    and ``alarms_listed`` is true; an alarm that is not listed has cleared, even if the clearing
+    message was lost.
     """
 
     kind: ClassVar[str] = "status"
@@ -230,7 +231,7 @@ class ClusterStatus:
     settings: str = ""
 
     def nodes(self) -> "npt.NDArray[Any]":
-        """Return the rows, of dtype `NODE`, read only.
+        """Return the rows, of dtype `NODE`, read-only.
 
         Raises
         ------
@@ -246,7 +247,7 @@ class ClusterStatus:
 
 @dataclass(frozen=True)
 class Progress:
-    """A stage that a command has reached; ``text`` says why it was refused or failed.
+    """A stage that a command has reached; ``text`` states why it was refused or failed.
 
     Without a heliostat it concerns the whole command.
     """
@@ -260,7 +261,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to `Ask`; ``data`` is plain JSON, ``block`` stored bytes."""
+    """The reply to `Ask`; ``data`` is plain JSON, ``block`` contains stored bytes."""
 
     kind: ClassVar[str] = "answer"
     identity: str
@@ -307,12 +308,12 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Return the message encoded in some bytes.
+    """Return the message encoded in given bytes.
 
     Raises
     ------
     ProtocolError
-        If they are not a message, or of a kind or version that this side doesn't know.
+        If they are not a message, or are of a kind or version that this side does not know.
     """
     line, _, block = data.partition(b"\n")
     try:

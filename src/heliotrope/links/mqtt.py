@@ -1,26 +1,26 @@
 """Links over an MQTT broker (Mosquitto), version 5 of the protocol.
 
-Each cluster has two topics, one for each direction, and a third for information only::
+Each cluster has two topics, one per direction, and a third for information only::
 
     PREFIX/CLUSTER/down      plant to cluster
     PREFIX/CLUSTER/up        cluster to plant
     PREFIX/CLUSTER/status    "online", and as the last will of the cluster "offline"; retained
 
-Messages go with QoS 1, never retained, and with their remaining time as message expiry, so that
-the broker discards what it holds too long. The broker counts in whole seconds, and not while it is
-frozen, so the receiver judges again (envelope.py). Sessions begin clean and end with the
-connection: nothing is kept for a cluster that is away. A retained message on the way up or down
-is not a current order; it is refused and counted.
+Messages are sent with QoS 1, never retained, and with their remaining lifetime as message expiry,
+so that the broker discards messages that it holds too long. The broker counts in whole seconds, and
+not while it is frozen, so the receiver checks again (envelope.py). Sessions begin clean and end
+with the connection; nothing is kept for an absent cluster. A retained message on the up or down
+topic is not a current command; it is rejected and counted.
 
-Whoever the broker lets in may publish under a cluster's topic. The broker is told the size of the
-largest envelope and keeps longer messages to itself; one that comes nevertheless is refused before
-anything is computed over it.
+Any client that the broker admits may publish to a cluster's topic. The broker is told the size of
+the largest envelope and does not forward longer messages; a longer one that arrives anyway is
+rejected before anything is computed from it.
 
-Nothing rests on the status, on the last will or on MQTT's keepalive: a broker that is frozen
-keeps its connections. Our heartbeats pass through the broker to the other end and back, and
-their absence ends a connection.
+Nothing depends on the status, on the last will or on MQTT's keepalive, because a frozen broker
+keeps its connections. Our heartbeats pass through the broker to the other end and back, and their
+absence ends a connection.
 
-Nagle's algorithm is switched off at this end; the broker needs ``set_tcp_nodelay true``, or it
+Nagle's algorithm is disabled at this end; the broker needs ``set_tcp_nodelay true``, otherwise it
 adds up to 40 ms to a small message.
 """
 

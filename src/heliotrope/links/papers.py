@@ -1,7 +1,8 @@
-"""Papers of a program: key files and certificates, taken while it runs when they are renewed.
+"""Credentials of a program: key files and certificates, reloaded when they are renewed.
 
-Files are checked every two seconds, in a thread, so a slow disk delays nothing. What cannot be
-used raises an alarm, and what was in force stays so. The ends of certificates are watched.
+Files are checked every two seconds in a thread, so that a slow disk delays nothing. A file that
+cannot be used raises an alarm, and the previous content stays in force. The expiry of certificates
+is monitored.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""A link with a listener that sees all messages of the link's owner, and may hold them up."""
+"""A link with a listener that sees all messages of the link's owner, and may delay them."""
 
 from typing import Protocol
 
@@ -10,15 +10,15 @@ class LinkListener(Protocol):
     """A listener at one end of a link."""
 
     async def posted(self, data: bytes, now: float) -> None:
-        """Note a message that the owner hands to the link; it is sent when this returns."""
+        """Note a message that the owner passes to the link; it is sent when this method returns."""
         ...
 
     def sent(self, data: bytes, now: float) -> None:
-        """Note a message that has left, and when it was handed to the transport."""
+        """Note a message that has been sent, and when it was passed to the transport."""
         ...
 
     async def waits(self) -> None:
-        """Note that the owner waits for a message; the link is asked when this returns."""
+        """Note that the owner waits for a message; the link is read when this method returns."""
         ...
 
     def received(self, data: bytes, now: float) -> None:
@@ -41,7 +41,7 @@ class TappedLink:
     Attributes
     ----------
     inner
-        Messages sent through it directly bypass the listener.
+        Wrapped link; messages sent through it directly bypass the listener.
     """
 
     def __init__(self, inner: Link, clock: Clock, listener: LinkListener) -> None:
@@ -60,12 +60,12 @@ class TappedLink:
 
     @property
     def closed(self) -> bool:
-        """Whether the link is closed for good."""
+        """Whether the link is closed permanently."""
         return self.inner.closed
 
     @property
     def silent_for(self) -> float:
-        """Time since the other end was certainly alive, in s; infinite if it never was."""
+        """Time since the other end was last known to be alive, in s; infinite if never."""
         return self.inner.silent_for
 
     @property
@@ -75,7 +75,7 @@ class TappedLink:
 
     @property
     def statistics(self) -> Statistics:
-        """Counts since the link was made."""
+        """Counts since the link was created."""
         return self.inner.statistics
 
     async def run(self) -> None:
@@ -101,5 +101,5 @@ class TappedLink:
         return data
 
     async def close(self) -> None:
-        """Close the link for good."""
+        """Close the link permanently."""
         await self.inner.close()

@@ -1,17 +1,17 @@
 """Links over TCP: a server for the plant, a client for each cluster.
 
-A frame is a length of 4 bytes (big-endian) and an envelope. COBS would let a reader find the
-next frame after lost bytes, but TCP loses none. A length above the limit, or below that of a proof,
-is refused before anything of the frame is kept, and ends the connection.
+A frame is a length of 4 bytes (big-endian) and an envelope. COBS would let a reader find the next
+frame after lost bytes, but TCP loses none. A length above the limit, or below that of an
+authentication tag, is rejected before any of the frame is stored, and ends the connection.
 
-Handshake, each step one frame: server, 32 random bytes; client, 32 random bytes, its proof and
-its name; server, its proof. A proof is HMAC-SHA256 of a label, both random numbers and the name
-under the shared key, so neither a recording nor a reflection passes. The envelopes that
-follow are sealed with a key derived in the same way. This authenticates both ends and detects any
-alteration; it encrypts nothing: TLS does that.
+The handshake has one frame per step: server, 32 random bytes; client, 32 random bytes, its
+authentication tag and its name; server, its authentication tag. A tag is HMAC-SHA256 of a label,
+both random numbers and the name under the shared key, so neither a replay nor a reflection is
+accepted. The envelopes that follow are sealed with a key derived in the same way. This
+authenticates both ends and detects any alteration, but does not encrypt; encryption is left to TLS.
 
-Nothing may be delivered late, so no data waits in this process: an envelope is made when the
-transport has nothing left to write, and a closed connection discards what it holds. The receiver
+Nothing may be delivered late, so no data waits in this process: an envelope is created only when
+the transport has nothing left to write, and a closed connection discards its data. The receiver
 judges the age of data that waited in the kernel (envelope.py).
 """
 
@@ -383,7 +383,7 @@ def tcp_link(
     host, port
         Address of the plant's server.
     name, key
-        Name and key of this cluster, as the plant knows them; the keys of a ring may change.
+        Name and key of this cluster, as known to the plant; the keys of a ring may change.
     clock, settings
         As in `CarriedLink`.
     tls
@@ -392,7 +392,7 @@ def tcp_link(
     Raises
     ------
     InputError
-        A name or key that cannot be used.
+        If the name or key cannot be used.
     """
     ring = ring_of(name, key)
     settings = settings or LinkSettings()
@@ -401,34 +401,34 @@ def tcp_link(
 
 
 class TcpServer:
-    """The plant's side: one link for each cluster that it knows.
+    """The plant's side: one link for each configured cluster.
 
     Parameters
     ----------
     host, port
-        Where to listen; port 0: any free port, shown by ``port``.
+        Address to listen on; port 0: any free port, shown by ``port``.
     keys
         Name and key of each cluster, at least 16 bytes each; the keys of a ring may change.
     clock, settings
-        As in `CarriedLink`; `LinkSettings.open_limit` is the time limit of the handshake.
+        As in `CarriedLink`; `LinkSettings.open_limit` is the timeout of the handshake.
     tls
         See `server_tls`.
 
     Attributes
     ----------
     links
-        By name of the cluster; ``run`` runs them.
+        The links by cluster name; ``run`` runs them.
     port
-        Where it listens, 0 before it does.
+        Port on which it listens; 0 before it does.
     refused
-        Count of connections that did not pass the handshake.
+        Number of connections that failed the handshake.
     last_refusal
-        Why the last of them was refused.
+        Why the last of these was rejected.
 
     Raises
     ------
     InputError
-        A name or key that cannot be used.
+        If a name or key cannot be used.
     """
 
     def __init__(
@@ -477,7 +477,7 @@ class TcpServer:
         Raises
         ------
         LinkError
-            If it cannot listen there.
+            If it cannot listen at that address.
         """
         try:
             server = await asyncio.get_running_loop().create_server(

@@ -1,4 +1,4 @@
-"""TLS of the links: contexts from PEM files, made again when the files are renewed."""
+"""TLS for the links: contexts from PEM files, recreated when the files are renewed."""
 
 import ssl
 from collections.abc import Callable
@@ -42,15 +42,15 @@ def server_tls(
     Parameters
     ----------
     certificate, key
-        The server's own.
+        The server's own certificate and key.
     authority
-        Authority that signed the clusters' certificates; None: clusters need no certificate, as
-        they have keys.
+        Authority that signed the clusters' certificates; None: clusters need no certificate,
+        because they have keys.
 
     Raises
     ------
     InputError
-        Files that cannot be used.
+        If the files cannot be used.
     """
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -71,14 +71,14 @@ def client_tls(
     Parameters
     ----------
     authority
-        Authority that signed the server's certificate; no other is trusted.
+        Authority that signed the server's certificate; no other authority is trusted.
     certificate, key
-        The cluster's own, both or neither.
+        The cluster's own certificate and key, both or neither.
 
     Raises
     ------
     InputError
-        Files that cannot be used.
+        If the files cannot be used.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -91,17 +91,17 @@ def client_tls(
 
 
 class RenewedTls:
-    """A TLS context that is made again when its files are renewed; connections keep theirs.
+    """A TLS context that is recreated when its files are renewed; connections keep the old context.
 
     Parameters
     ----------
     make
-        Makes it from the files.
+        Function that creates it from the files.
 
     Raises
     ------
     InputError
-        Files that cannot be used.
+        If the files cannot be used.
     """
 
     def __init__(self, make: Callable[[], ssl.SSLContext]) -> None:
@@ -113,11 +113,11 @@ class RenewedTls:
         return self._context
 
     def renew(self) -> None:
-        """Make it again; if that fails, the present one stays.
+        """Recreate the context; if that fails, the present context stays in use.
 
         Raises
         ------
         InputError
-            Files that cannot be used.
+            If the files cannot be used.
         """
         self._context = self._make()

@@ -1,8 +1,8 @@
-"""The local interface of a running plant: frames over Unix sockets, bounded on every side.
+"""The local interface of a running plant: frames over Unix sockets, with limits on all resources.
 
 `LocalServer` listens in the plant's process; `LocalConnection` (asyncio) and `ask_once` (blocking)
-call it. The package knows nothing of a plant: `plant.interface` says which calls there are and who
-may make them. It needs the standard library only, so a command in an emergency starts at once.
+call it. The package is independent of the plant: `plant.interface` defines the calls and who may
+make them. It needs only the standard library, so that an emergency command starts at once.
 
 Begin with `frames`.
 """

@@ -1,11 +1,11 @@
-"""Token buckets: how often something may happen, by key."""
+"""Token buckets: limit how often something may happen, by key."""
 
 from collections import OrderedDict
 from collections.abc import Callable
 
 
 class Buckets:
-    """A token bucket for each key.
+    """One token bucket per key.
 
     Parameters
     ----------
@@ -14,9 +14,9 @@ class Buckets:
     burst
         Tokens in a full bucket.
     monotonic
-        Returns the time, s.
+        Function that returns the time, s.
     largest
-        Number of keys that are kept; the longest unused are dropped first.
+        Maximum number of keys that are kept; the least recently used are dropped first.
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class Buckets:
         self._kept: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, key: str) -> float:
-        """Take a token; return the time until there is one again, s; 0 if one was taken."""
+        """Take a token; return the time until one is available again, s; 0 if one was taken."""
         now = self._now()
         tokens, at = self._kept.pop(key, (self._burst, now))
         tokens = min(self._burst, tokens + self._rate * (now - at))

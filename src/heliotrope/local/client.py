@@ -24,11 +24,11 @@ from heliotrope.local.sockets import connect
 
 
 class AwayError(HeliotropeError):
-    """The plant's process cannot be reached, or does not answer."""
+    """The plant's process cannot be reached, or does not reply."""
 
 
 class CallError(HeliotropeError):
-    """A call that the plant's process has refused; ``kind`` is the kind of the error."""
+    """A call that the plant's process refused; ``kind`` is the kind of error."""
 
     def __init__(self, kind: str, text: str) -> None:
         super().__init__(text)
@@ -49,17 +49,17 @@ def value_of(answer: Frame) -> Any:
 
 
 class LocalConnection:
-    """A standing connection that is opened again whenever it has ended.
+    """A persistent connection that is reopened whenever it has ended.
 
     Parameters
     ----------
     path
         Socket of the plant.
     hello
-        First frame: ``{"key": ...}``, ``{"token": ...}``, or ``{"user": True}``, which rests on the
-        user of this process alone.
+        First frame: ``{"key": ...}``, ``{"token": ...}``, or ``{"user": True}``, which is
+        authenticated only by the user of this process.
     timeout
-        Limit for connecting and for each answer, s.
+        Timeout for connecting and for each reply, s.
     """
 
     def __init__(self, path: Path, hello: dict[str, Any], timeout: float = 30.0) -> None:
@@ -70,7 +70,7 @@ class LocalConnection:
         self._turn = asyncio.Lock()
 
     async def run(self, pause: float = 0.25) -> None:
-        """Keep the connection up until cancelled."""
+        """Maintain the connection until cancelled."""
         while True:
             with contextlib.suppress(HeliotropeError, EOFError, OSError, TimeoutError):
                 await self._live()
@@ -104,7 +104,7 @@ class LocalConnection:
 
     @property
     def up(self) -> bool:
-        """Whether the connection stands."""
+        """Whether the connection is established."""
         return self._writer is not None
 
     async def ask(
@@ -116,16 +116,16 @@ class LocalConnection:
         on_behalf: Any = None,
         within: float | None = None,
     ) -> tuple[Any, bytes]:
-        """Make a call; return value and blob of the answer, within a limit of its own if given, s.
+        """Make a call; return value and blob of the reply, within a separate timeout if set, s.
 
         Raises
         ------
         CallError
-            If the plant refuses it.
+            If the plant refuses the call.
         AwayError
-            If the plant cannot be reached, or does not answer in time.
+            If the plant cannot be reached, or does not reply in time.
         FrameError
-            A request that is larger than the plant reads; nothing is sent.
+            If a request exceeds the plant's limit; nothing is sent.
         """
         writer = self._writer
         if writer is None:
@@ -164,7 +164,7 @@ def ask_once(
     blob: bytes = b"",
     timeout: float = 30.0,
 ) -> Any:
-    """Connect, make one call, and return the value of its answer; see `fetch_once`."""
+    """Connect, make one call, and return the value of the reply; see `fetch_once`."""
     return fetch_once(path, hello, call, arguments, blob, timeout)[0]
 
 
@@ -176,12 +176,12 @@ def fetch_once(
     blob: bytes = b"",
     timeout: float = 30.0,
 ) -> tuple[Any, bytes]:
-    """Connect, make one call, and return value and blob of its answer; without an event loop.
+    """Connect, make one call, and return the value and blob of the reply; without an event loop.
 
     Raises
     ------
     CallError
-        If the plant refuses it.
+        If the plant refuses the call.
     AwayError
         If the plant cannot be reached.
     """

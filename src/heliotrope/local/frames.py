@@ -2,9 +2,9 @@
 
 A frame is the mark ``HLP1``, the lengths of head and blob (uint32 each, little-endian), the head (a
 JSON object) and the blob (bytes). A request has ``id``, ``call``, ``arguments`` and, if a console
-makes it, ``for``: the person on whose behalf. An answer has the ``id`` with a ``value``, or with
-``error`` (its kind) and ``text``. The first frame of a connection identifies the caller: ``key`` or
-``token``.
+sends it, ``for``: the person on whose behalf it is made. A reply has the ``id`` with a ``value``,
+or with ``error`` (its kind) and ``text``. The first frame of a connection identifies the caller:
+``key`` or ``token``.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ REQUEST_HEAD, REQUEST_BLOB = 1 << 20, 8 << 20
 HELLO_HEAD = 4096
 #: Bytes of a blob that are read at once where it is passed over.
 _PART = 1 << 16
-#: Kind of an error that is a mistake of the program.
+#: Error kind for a defect in the program.
 INTERNAL = "internal"
 #: Largest head and blob of an answer, bytes.
 ANSWER_HEAD, ANSWER_BLOB = 64 << 20, 64 << 20

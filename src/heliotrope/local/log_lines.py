@@ -1,8 +1,8 @@
-"""Lines of the log: one for each record, bounded, in which no text of others can begin a line.
+"""Log lines: one per record, of bounded length, in which foreign text cannot start a new line.
 
-A record may hold what a client has sent, in its message or in the error that it reports. Control
-characters, also those that only some programs take for line breaks or that reverse the order of
-letters, are written as escapes; the lines of a traceback begin with a mark.
+A record may contain text that a client has sent, in its message or in the error that it reports.
+Control characters, including those that only some programs treat as line breaks and those that
+reverse the text direction, are escaped; the lines of a traceback begin with a marker.
 """
 
 import logging

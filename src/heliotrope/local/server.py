@@ -1,11 +1,12 @@
-"""The listening side of the local interface: every number is bounded, and a newcomer gets in.
+"""The server side of the local interface: all resources are limited, and newcomers get in.
 
-Connections are taken at a limited rate. One that does not say who it is in time is cut off; where
-all places are taken, the oldest connection gives way. A connection has a limited number of requests
-under way: while they are, nothing more is read from it. A request counts until its answer is
-written, and a client that does not read its answers is cut off. A blob is kept only where the call
-takes one from this caller. Who the caller is, is asked again every few seconds: a connection ends
-when its key or token does, and its requests never have more than the role of now.
+Connections are accepted at a limited rate. A connection that does not identify itself in time is
+closed; if all places are taken, the oldest connection is closed to make room. A connection has a
+limited number of pending requests; while they are pending, nothing more is read from it. A request
+counts until its reply is written, and a client that does not read its replies is disconnected. A
+blob is accepted only if the call allows one from this caller. The identity of the caller is checked
+again every few seconds: a connection ends when its key or token is no longer valid, and its
+requests never have more than the current role.
 """
 
 import asyncio
@@ -58,16 +59,16 @@ class LocalLimits:
     Attributes
     ----------
     strangers, callers, reserved
-        Connections without identification, those with it, and those of consoles: a new one
-        may meet one that ends.
+        Maximum number of connections without identification, with identification, and from
+        consoles; a new connection may overlap one that is ending.
     under_way, console_under_way
-        Requests under way in one connection, and in one of a console, which many persons share.
+        Pending requests per connection, and per console connection, which many operators share.
     hello_s, answer_s
-        Time to identify the caller, and to take an answer, s.
+        Timeout for identifying the caller, and for taking a reply, s.
     pace_s
-        Time between two new connections, s.
+        Minimum time between two new connections, s.
     trusted_s
-        Time after which the caller of a connection is asked for again, s.
+        Time after which the identity of the caller is checked again, s.
     """
 
     strangers: int = 32
@@ -129,15 +130,15 @@ class LocalServer(Generic[C]):
     path
         Socket, in a folder made by `sockets.make_folder`.
     caller
-        Returns who sends the first frame of a connection, given that frame and the user of the
-        process, which is the plant's or root; None refuses it. Asked again while the connection
-        stands, see `LocalLimits.trusted_s`.
+        Function that returns who sent the first frame of a connection, given that frame and the
+        user of the process, which is the plant's user or root; None rejects the connection. It is
+        called again while the connection lasts, see `LocalLimits.trusted_s`.
     answer
-        Returns value and blob of the answer to a request.
+        Function that returns value and blob of the reply to a request.
     kinds
-        Returns kind and text of an error for the client.
+        Function that returns kind and text of an error for the client.
     blob
-        Returns whether the call of a head may bring a blob, from this caller.
+        Function that returns whether the call in a head may carry a blob, from this caller.
     limits
         See `LocalLimits`.
     """
@@ -172,7 +173,7 @@ class LocalServer(Generic[C]):
         self._listener = listen(self._path)
 
     async def run(self) -> None:
-        """Take connections until cancelled."""
+        """Accept connections until cancelled."""
         assert self._listener is not None
         loop = asyncio.get_running_loop()
         try:
@@ -191,7 +192,7 @@ class LocalServer(Generic[C]):
             self.close()
 
     def close(self) -> None:
-        """Stop listening; again, nothing."""
+        """Stop listening; a second call does nothing."""
         if self._listener is not None:
             self._listener.close()
             self._path.unlink(missing_ok=True)

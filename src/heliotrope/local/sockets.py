@@ -13,7 +13,7 @@ from pathlib import Path
 
 from heliotrope.errors import InputError
 
-#: The sockets of a plant: for all calls, and for EMERGENCY, DEFOCUS and STOW alone.
+#: The sockets of a plant: one for all calls, and one for EMERGENCY, DEFOCUS and STOW alone.
 ORDINARY, EMERGENCY = "plant.sock", "emergency.sock"
 _FOLDER = "interface"
 #: Connections that wait to be taken.
@@ -26,12 +26,12 @@ _CREDENTIALS = struct.Struct("3i")
 
 
 def socket_folder(data: Path) -> Path:
-    """Return the folder of the sockets in a plant's data folder."""
+    """Return the socket folder within a plant's data folder."""
     return data / _FOLDER
 
 
 def name_here(user: int) -> str:
-    """Return how a user of this machine is named in records; by number if it has no name."""
+    """Return the name under which a user of this computer is recorded; the number if unnamed."""
     try:
         return f"{pwd.getpwuid(user).pw_name} on this machine"
     except KeyError:

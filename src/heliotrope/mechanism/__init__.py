@@ -1,16 +1,16 @@
-"""One heliostat, or an array of them: joints, drives, parameters, armature, tracking.
+"""Heliostat mechanisms, single or in arrays: joints, drives, parameters, armature, tracking.
 
-A mechanism is data: a chain of joints from the ground to the mirror, two of them driven. Build one
-with `azimuth_elevation`, `two_jacks`, … (`kinds`), give it drives (`rotary`, `linear_paint`, …),
-set its imperfections with `Mechanism.with_parameters`, and point it with `track`.
-`Machine` holds the limits and resting places of its motors.
+A mechanism is data: a chain of joints from the ground to the mirror, two of which are driven. Build
+one with `azimuth_elevation`, `two_jacks`, … (`kinds`), give it drives (`rotary`, `linear_paint`,
+…), set its imperfections with `Mechanism.with_parameters`, and point it with `track`. `Machine`
+holds the motor limits and the rest positions.
 
-The names of these modules are used through the module:
+Use the names in these modules through the module:
 
-- `guo`: Guo's closed form for azimuth-elevation heliostats, a cross-check of `track`.
+- `guo`: Guo's closed-form solution for azimuth-elevation heliostats, a cross-check of `track`.
 - `parameters`: the parameter table and the models.
-- `board_items`: the bytes that a local controller stores of a mechanism and its machine.
-- `board_motion`: where local controllers send their mirrors, over arrays.
+- `board_items`: the bytes that a local controller stores for a mechanism and its machine.
+- `board_motion`: where local controllers send their heliostats, computed over arrays.
 - `kernels`: the compiled code.
 """
 

@@ -1,7 +1,8 @@
-"""A heliostat that moves, as geometry: Grigoriev's armature with its mirror, and a GLB of it.
+"""Geometry of a moving heliostat: Grigoriev's armature with its mirror, exported as GLB.
 
 The armature is drawn as in figure 1 of Grigoriev et al. 2021: bones from the foundation over the
-primary and the secondary axis to the vertex, the axes purple and green, the mirror's normal blue.
+primary and the secondary axis to the vertex, the axes in purple and green, the mirror normal in
+blue.
 """
 
 import json

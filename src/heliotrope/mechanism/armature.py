@@ -1,8 +1,8 @@
-"""The armature: all that tracking needs of a mechanism, in 18 numbers.
+"""The armature: everything that tracking needs to know about a mechanism, in 18 numbers.
 
-With fixed imperfections, any chain turns a vertex and a normal about two lines in space.
-Grigoriev et al. 2021 call this the armature. A local controller stores it and knows no
-error model.
+Whatever its fixed imperfections, a two-axis chain rotates a vertex and a normal about two lines in
+space. Grigoriev et al. 2021 call this reduced form the armature. A local controller stores only the
+armature and needs no error model.
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from heliotrope.values import Card, Value, card_of_arrays
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Armature(Value, Framed):
-    """Two axes with a point on each, a vertex and its normal, at zero joint angles.
+    """Two axes with a point on each, the mirror vertex and the mirror normal, at zero joint angles.
 
     Attributes
     ----------
     table
-        Shape (..., 18): primary axis, point on it, secondary axis, point on it,
-        vertex, normal; ENU, metres. A secondary axis of zero length means a
+        Shape (..., 18): primary axis, point on the primary axis, secondary axis, point on the
+        secondary axis, vertex, normal; ENU, metres. A secondary axis of zero length means a
         single-axis tracker.
     """
 
@@ -50,7 +50,7 @@ class Armature(Value, Framed):
         vertex: npt.ArrayLike,
         normal: npt.ArrayLike,
     ) -> "Armature":
-        """Return an armature from its six vectors (..., 3), ENU metres; directions of any length.
+        """Build an armature from its six vectors (..., 3), ENU metres; directions of any length.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class Armature(Value, Framed):
         return self.table[..., slot.NORMAL : slot.NORMAL + 3]
 
     def pose(self, angles: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return normal and vertex (..., 3) at joint angles (..., 2) in radians."""
+        """Return the normal and the vertex (..., 3) at joint angles (..., 2) in radians."""
         theta = np.asarray(angles, dtype=np.float64)
         first = rotation(self.axis_1, theta[..., 0])
         second = rotation(self.axis_2, theta[..., 1])
@@ -123,12 +123,12 @@ PARALLEL_LIMIT = 1e-3
 
 
 def check_axes(axis_1: FloatArray, axis_2: FloatArray) -> None:
-    """Refuse parallel axes.
+    """Reject parallel axes.
 
     Raises
     ------
     InputError
-        If the axes enclose less than 1 mrad.
+        If the angle between the axes is below 1 mrad.
     """
     sine = np.linalg.norm(np.cross(axis_1, axis_2), axis=-1)
     if (sine < PARALLEL_LIMIT).any():

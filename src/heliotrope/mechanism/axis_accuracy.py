@@ -1,4 +1,4 @@
-"""Zeros and scatter of each axis of a heliostat: Guo's evaluation of tracking data, (43)-(47)."""
+"""Offset and scatter of each heliostat axis: Guo's evaluation of tracking data, (43)-(47)."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,9 @@
-"""The one conversion of a heliostat to what its local controller stores.
+"""Convert a heliostat to the items that its local controller stores; there is no other converter.
 
-A calibrated `Mechanism` becomes an armature, the numbers of two drives and two biases; with its
-`Machine` (limits, stow, defocus and the like) that is all a local controller needs. The plant
-pushes and compares these bytes, and simulated boards are filled with them. They are compared by
-CRC-32: items that differ from the wanted ones are sent again.
+A calibrated `Mechanism` becomes an armature, the constants of two drives and two biases. Together
+with its `Machine` (limits, stow, defocus and the like) these are all that a local controller needs.
+The plant sends these bytes and compares them with the stored ones by CRC-32, and sends again any
+item that differs. Simulated boards are filled with the same bytes.
 """
 
 import struct

@@ -1,6 +1,7 @@
-"""Where local controllers send their mirrors: the safe path to standby, and the end of a DEFOCUS.
+"""Motion of local controllers: the safe path to standby, and the end position of a DEFOCUS.
 
-The law of `lcu.motion` over arrays, for plant and simulation; boards move by the scalar code.
+The same rules as `lcu.motion`, written over arrays for the plant and the simulation; the boards run
+the scalar code.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,8 +16,8 @@ Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 #: Points of a safe path, ENU, m.
 Corners = tuple[tuple[float, float, float], ...]
-#: Gives, for rows (M,) of K heliostats and points (M, 3), the angles of the axes (M, 2) at which
-#: their beams reach these, and whether they do, (M,).
+#: For indices (M,) into K heliostats and points (M, 3), returns the axis angles (M, 2) at which the
+#: beams reach the points, and whether they can reach them, (M,).
 Pose = Callable[[Rows, FloatArray], tuple[FloatArray, Mask]]
 
 

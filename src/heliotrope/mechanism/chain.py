@@ -1,4 +1,4 @@
-"""A mechanism is data: joints from ground to mirror, two of them driven."""
+"""A mechanism as data: a chain of joints from the ground to the mirror, two of them driven."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,7 +37,7 @@ Index = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pose(Value, Framed):
-    """Normals and vertices of mirrors.
+    """Mirror normals and vertices.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Pose(Value, Framed):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Jacobian(Value, Framed):
-    """A pose with its derivatives by P parameters and by the counts of D drives.
+    """A pose with its derivatives with respect to P parameters and the counts of D drives.
 
     Attributes
     ----------
@@ -72,9 +72,9 @@ class Jacobian(Value, Framed):
     names
         The P parameters, in order.
     normal, vertex
-        Derivatives by the parameters, shape (..., P, 3), per rad, m or 1.
+        Derivatives with respect to the parameters, shape (..., P, 3), per rad, m or 1.
     normal_counts, vertex_counts
-        Derivatives by the counts, shape (..., D, 3).
+        Derivatives with respect to the counts, shape (..., D, 3).
     """
 
     pose: Pose
@@ -110,7 +110,7 @@ class Jacobian(Value, Framed):
 
 @runtime_checkable
 class Calibrated(Protocol):
-    """Deviations of parameters from a nominal mechanism: a fit, a record, a file's content."""
+    """Parameter deviations from a nominal mechanism: from a fit, a record or a file."""
 
     @property
     def parameters(self) -> Mapping[str, npt.ArrayLike]:
@@ -153,20 +153,21 @@ class Mechanism(Value, Framed):
     position
         Foot of the chain in ENU metres, (..., 3).
     orientation
-        Rotation from the chain's first frame to ENU, (..., 3, 3).
+        Rotation from the first frame of the chain to ENU, (..., 3, 3).
     axes, origins
-        Unit axis and origin (m) of each joint in its parent's frame, (..., J, 3).
+        Unit axis and origin (m) of each joint in the frame of its parent, (..., J, 3).
     angles
-        Fixed part of each joint's angle, rad, (..., J).
+        Fixed part of each joint angle, rad, (..., J).
     drives
         Batch shape (..., D).
     vertex, normal
-        Mirror's vertex (m) and unit normal in the mirror's frame, (..., 3).
+        Mirror vertex (m) and unit normal in the mirror frame, (..., 3).
     deviations
-        Deviations of the parameters that it carries, by name, as `with_parameters` and
-        `with_calibration` summed them up, rad, m or 1, each (...).
+        Accumulated deviations of the parameters, by name, as set by `with_parameters` and
+        `with_calibration`, rad, m or 1, each (...).
     own
-        Rows of fixed joints that the parameter table does not know; see `kinds.with_joint`.
+        Table entries of fixed joints that the parameter table does not list; see
+        `kinds.with_joint`.
     """
 
     kind: str
@@ -262,7 +263,7 @@ class Mechanism(Value, Framed):
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
-        """The parameter table of this kind, by name."""
+        """The parameter table of this kind of mechanism, by name."""
         kinds = self.drives.table[..., slot.KIND].reshape(-1, len(self.driven))
         linear = tuple(bool((kinds[:, d] == slot.LINEAR).all()) for d in range(kinds.shape[1]))
         table = parameter_table.table(self.joints, self.driven, linear)
@@ -272,7 +273,7 @@ class Mechanism(Value, Framed):
         return table
 
     def parameter(self, name: str) -> Parameter:
-        """Return the row of parameter ``name``.
+        """Return the table entry of parameter ``name``.
 
         Raises
         ------
@@ -287,25 +288,25 @@ class Mechanism(Value, Framed):
             ) from None
 
     def codes(self, names: tuple[str, ...]) -> npt.NDArray[np.int64]:
-        """Return the kernels' code of each parameter, shape (P, 3)."""
+        """Return the kernel code of each parameter, shape (P, 3)."""
         rows = [self.parameter(name).code for name in names]
         return np.array(rows, dtype=np.int64).reshape(-1, 3)
 
     def with_parameters(self, values: Mapping[str, npt.ArrayLike]) -> "Mechanism":
-        """Return the mechanism with parameters moved by ``values``.
+        """Return the mechanism with its parameters moved by ``values``.
 
         Parameters
         ----------
         values
-            Deviation from this mechanism by name, in rad, m or 1;
-            shape (...) or anything that broadcasts to it.
+            Deviation from this mechanism by parameter name, in rad, m or 1; shape (...) or anything
+            that broadcasts to it.
 
         Raises
         ------
         UnknownNameError
             If a name is not in the table.
         InputError
-            If a value is not a number, is no angle in radians, or does not fit the shape.
+            If a value is not a number, is not an angle in radians, or does not fit the shape.
         """
         position, origins = self.position.copy(), self.origins.copy()
         angles, vertex = self.angles.copy(), self.vertex.copy()
@@ -338,15 +339,16 @@ class Mechanism(Value, Framed):
         )
 
     def with_calibration(self, calibration: Calibrated) -> "Mechanism":
-        """Return the mechanism moved by a calibration, for example the result of `fit`.
+        """Return the mechanism moved by a calibration, for example by the result of `fit`.
 
-        One calibration moves many mechanisms alike; a calibration of N heliostats moves N, row by
-        row. A heliostat or a group of a plant takes its rows by name.
+        A calibration of one heliostat applies to every mechanism in the array; a calibration of N
+        heliostats applies to N mechanisms, one by one. A heliostat or a heliostat group of a plant
+        selects its entries by name.
 
         Raises
         ------
         InputError
-            If it is no calibration, or one of another number of heliostats.
+            If it is not a calibration, or holds a different number of heliostats.
         UnknownNameError
             If this kind of mechanism lacks one of its parameters.
         """
@@ -364,7 +366,7 @@ class Mechanism(Value, Framed):
         return self.with_parameters(moved)
 
     def most(self, name: str) -> float:
-        """Return the largest deviation of a parameter, either way, rad, m or 1."""
+        """Return the largest allowed deviation of a parameter in either direction, rad, m or 1."""
         row = self.parameter(name)
         if row.unit != "rad":
             return _FARTHEST if row.unit == "m" else _LARGEST
@@ -389,7 +391,7 @@ class Mechanism(Value, Framed):
             ) from None
 
     def pose(self, counts: npt.ArrayLike) -> Pose:
-        """Return normals and vertices at drive counts.
+        """Return normals and vertices at the given drive counts.
 
         Parameters
         ----------
@@ -403,20 +405,20 @@ class Mechanism(Value, Framed):
         return Pose(normal.reshape(*shape, 3), vertex.reshape(*shape, 3))
 
     def jacobian(self, counts: npt.ArrayLike, names: tuple[str, ...]) -> Jacobian:
-        """Return the pose and its derivatives by parameters ``names`` and by the counts.
+        """Return the pose and its derivatives by the parameters ``names`` and by the counts.
 
         Parameters
         ----------
         counts
             Shape (..., D); batch axes broadcast against the mechanism's.
         names
-            Parameters of the table, P of them.
+            P parameters of the table.
 
         Notes
         -----
-        The screw formula: a joint's small turn moves the normal by w × n and the
-        vertex by w × (m − o). It is exact wherever the chain itself is differentiable,
-        that is, in every pose except that of a jack stretched flat.
+        This is the screw formula: rotating a joint by a small angle moves the normal by w × n and
+        the vertex by w × (m − o). The formula is exact wherever the chain itself is differentiable,
+        that is, in every pose except that of a fully extended jack.
         """
         flat, rows, shape = self._flatten(counts)
         codes = self.codes(names)
@@ -455,12 +457,12 @@ class Mechanism(Value, Framed):
 
     @cached_property
     def attachment(self) -> FloatArray:
-        """The heliostat's frame to ENU, for points fixed to the mirror, (..., 4, 4).
+        """Transform from the heliostat frame to ENU, for points fixed to the mirror, (..., 4, 4).
 
-        It places a point that is given in the heliostat's frame at zero joint angles of the
-        machine as designed: ``position`` and ``orientation`` (Grigoriev et al. 2021, (5)), and
-        whatever the deviations between the foot and the last driven joint add, because the point
-        is carried by that joint.
+        It maps a point that is specified in the heliostat frame at zero joint angles of the
+        mechanism as designed. It combines ``position`` and ``orientation`` (Grigoriev et al. 2021,
+        (5)) with the displacement caused by all deviations between the foot and the last driven
+        joint, because that joint carries the point.
         """
         designed = self.with_parameters({name: -v for name, v in self.deviations.items()})
         frame = _transformation(designed.orientation, designed.position)
@@ -470,7 +472,7 @@ class Mechanism(Value, Framed):
 
     @cached_property
     def kernel_arrays(self) -> tuple[np.ndarray, ...]:
-        """The arrays that compiled kernels read, with one batch axis (N, …)."""
+        """The arrays that the compiled kernels read, with one batch axis (N, …)."""
         joints, drives = len(self.joints), len(self.driven)
 
         def flat(array: FloatArray, *tail: int) -> FloatArray:
@@ -528,12 +530,12 @@ def _carrier(mechanism: Mechanism) -> FloatArray:
 
 
 def join_mechanisms(parts: Sequence[Mechanism]) -> Mechanism:
-    """Return mechanisms of one kind, each of batch shape (n,), as one of shape (N,).
+    """Join mechanisms of one kind, each of batch shape (n,), into one of shape (N,).
 
     Raises
     ------
     InputError
-        If there are none, or they are of several kinds.
+        If there are no mechanisms, or they are of different kinds.
     """
     kinds = sorted({part.kind for part in parts})
     if len({(part.kind, part.joints, part.driven) for part in parts}) != 1:

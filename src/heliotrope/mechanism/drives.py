@@ -1,19 +1,18 @@
-r"""Drives: motor counts to the angle of a joint, and back.
+r"""Drives: conversion from motor counts to a joint angle, and back.
 
-A drive turns counts into an ideal angle φ, and that into the angle of the joint
+A drive converts counts into an ideal angle φ, and φ into the joint angle
 
 $$θ = bias + (1 + scale)\,φ + worm_{cos} \cos u + worm_{sin} \sin u + sag \cos(φ + phase)$$
 
-where u is the worm's angle (a known ratio times φ, or times the stroke of a jack). For a rotary
-drive φ is linear in the counts. For a linear drive (jack) the law of cosines holds in the triangle
-of joint, fixed end and moving end:
+where u is the worm angle (a known ratio times φ, or times the stroke of a jack). For a rotary drive
+φ is linear in the counts. For a linear drive (jack) the law of cosines holds in the triangle formed
+by the joint, the fixed end and the moving end:
 
 $$Φ(L) = \arccos\frac{c^2 + r^2 - L^2}{2 c r}, \qquad
 φ = φ_0 + σ\,(Φ(k) - Φ(k + counts \cdot rate))$$
 
-The literature writes a linear drive in three ways, all of them equivalent: PAINT
-(`linear_paint`), Grigoriev et al. 2021 (`linear_grigoriev`) and Guo et al. 2013, (41)-(42)
-(`linear_guo`).
+The literature describes a linear drive in three equivalent ways: PAINT (`linear_paint`), Grigoriev
+et al. 2021 (`linear_grigoriev`) and Guo et al. 2013, (41)-(42) (`linear_guo`).
 """
 
 from dataclasses import dataclass
@@ -42,14 +41,13 @@ from heliotrope.values import Card, Value, span
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Drive(Value, Framed):
-    """One drive, or an array of drives of the same or of different kinds.
+    """One drive, or an array of drives, which may be of different kinds.
 
     Attributes
     ----------
     table
-        Shape (..., 19), the numbers that the kernels read. Build it with
-        `rotary`, `direct`, `linear_paint`,
-        `linear_grigoriev` or `linear_guo`.
+        Shape (..., 19), the numbers that the kernels read. Build them with `rotary`, `direct`,
+        `linear_paint`, `linear_grigoriev` or `linear_guo`.
     """
 
     table: FloatArray
@@ -68,7 +66,7 @@ class Drive(Value, Framed):
         return Labelled(tuple(rows), rows, self.variables(tuple(rows)))
 
     def variables(self, axes: tuple[str, ...]) -> dict[str, Variable]:
-        """Return the numbers for a frame, by name; ``axes`` name the batch axes."""
+        """Return the constants for a data frame, by name; ``axes`` names the batch axes."""
         table = self.table if self.shape else self.table[None]
         rotary = table[..., slot.KIND] == slot.ROTARY
         variables = {"kind": Variable(axes, np.where(rotary, "rotary", "jack"))}
@@ -79,13 +77,13 @@ class Drive(Value, Framed):
 
     @property
     def kinds(self) -> str:
-        """Names of its kinds: "rotary", "jack" or "rotary and jack"."""
+        """The kinds of drive present: "rotary", "jack" or "rotary and jack"."""
         codes = self.table[..., slot.KIND]
         names = {"rotary": slot.ROTARY, "jack": slot.LINEAR}
         return " and ".join(name for name, kind in names.items() if (codes == kind).any())
 
     def describe(self) -> str:
-        """Return step and stops in one line for people."""
+        """Describe the step size and the stops in one line, for display."""
         rotary = self.table[..., slot.KIND] == slot.ROTARY
         rate = np.abs(self.table[..., slot.RATE])
         steps = [
@@ -108,14 +106,14 @@ class Drive(Value, Framed):
         return Drive(self.table[..., index, :])
 
     def angles(self, counts: npt.ArrayLike) -> FloatArray:
-        """Return the joint angle in radians at motor counts, both of shape (...)."""
+        """Return the joint angle in radians at the given motor counts, both of shape (...)."""
         return self._run(angles_block, counts, "counts")
 
     def counts(self, angles: npt.ArrayLike) -> FloatArray:
-        """Return the (real) counts at joint angles in radians, both of shape (...).
+        """Return the counts (real numbers) at joint angles in radians, both of shape (...).
 
-        Exact to 1e-9 rad with all periodic terms on. An angle beyond the reach of a jack
-        gives the counts of its end.
+        Exact to 1e-9 rad with all periodic terms included. For an angle beyond the reach of a jack,
+        the counts are those of the end of its travel.
         """
         return self._run(counts_block, angles, "angles")
 
@@ -124,12 +122,12 @@ class Drive(Value, Framed):
         return self._run(slopes_block, counts, "counts")
 
     def replace(self, **values: npt.ArrayLike) -> "Drive":
-        """Return a drive with some of its numbers set, by the names of ``SLOTS``.
+        """Return a drive with some of its constants replaced, by their names in ``SLOTS``.
 
         Raises
         ------
         InputError
-            If a name is not one of them, or a number is out of range.
+            If a name is not in ``SLOTS``, or a value is out of range.
         """
         for name in values:
             if name not in SLOTS:
@@ -155,7 +153,7 @@ class Drive(Value, Framed):
         return out.reshape(shape)
 
 
-#: Names of a drive's numbers, for `Drive.replace` and the parameter table.
+#: Names of a drive's constants, for `Drive.replace` and the parameter table.
 SLOTS = {
     "zero": slot.ZERO,
     "initial_angle": slot.ZERO,
@@ -296,7 +294,7 @@ def _check_monotone(t: FloatArray) -> None:
 
 
 def direct(**values: npt.ArrayLike) -> Drive:
-    """Return a drive whose counts are the angle itself, in radians."""
+    """Return a drive whose counts are the joint angle itself, in radians."""
     return _build(slot.ROTARY, {slot.RATE: 1.0}).replace(**values)
 
 
@@ -309,27 +307,27 @@ def rotary(
     sense: npt.ArrayLike = 1,
     **values: npt.ArrayLike,
 ) -> Drive:
-    """Return a stepper or encoder drive through a gear.
+    """Return a stepper or encoder drive with a gear.
 
     Parameters
     ----------
     steps_per_turn
-        Full steps (or encoder counts) of a turn of the motor.
+        Full steps (or encoder counts) per motor revolution.
     gear_ratio
-        Turns of the motor for one turn of the joint.
+        Motor revolutions per revolution of the joint.
     microsteps
         Counts per full step.
     zero
         Angle at 0 counts, rad.
     sense
-        +1 if the angle grows with the counts, −1 if it falls.
+        +1 if the angle increases with the counts, −1 if it decreases.
     values
         Any of ``SLOTS``: bias, scale, worm_cos, worm_sin, worm_ratio, sag, stops, speed.
 
     Raises
     ------
     InputError
-        If the numbers describe no drive that can move.
+        If no drive with these constants could move.
     """
     steps, micro = (
         as_numbers(steps_per_turn, "steps_per_turn"),
@@ -356,14 +354,14 @@ def linear_paint(
     clockwise: npt.ArrayLike = 1,
     **values: npt.ArrayLike,
 ) -> Drive:
-    """Return a jack with the constants of PAINT's heliostat properties.
+    """Return a jack from the constants in PAINT's heliostat properties.
 
     Parameters
     ----------
     increment
         Counts per metre of stroke.
     initial_stroke_length
-        k, distance of the actuator's ends at 0 counts, m.
+        k, distance between the ends of the actuator at 0 counts, m.
     offset, pivot_radius
         c and r, the two fixed sides of the triangle, m.
     initial_angle
@@ -402,7 +400,7 @@ def linear_grigoriev(
     sense: npt.ArrayLike = 1,
     **values: npt.ArrayLike,
 ) -> Drive:
-    """Return a jack by the law of cosines, θ = angle_zero + sense · Φ(L).
+    """Return a jack from the law of cosines, θ = angle_zero + sense · Φ(L).
 
     Parameters
     ----------
@@ -411,18 +409,18 @@ def linear_grigoriev(
     length_at_zero
         Length of the actuator at 0 counts, m.
     metres_per_count
-        Change of its length per count, m.
+        Change in actuator length per count, m.
     angle_zero
         Joint angle at which the two sides coincide, rad.
     sense
-        +1 if the angle grows with the length.
+        +1 if the angle increases with the length.
     values
         Any of ``SLOTS``.
 
     Notes
     -----
-    Grigoriev et al. 2021 (HelioK) measure the angle from the folded triangle; PAINT
-    measures it from the position at 0 counts. The two zeros differ by Φ(length_at_zero).
+    Grigoriev et al. 2021 (HelioK) measure the angle from the folded triangle, whereas PAINT
+    measures it from the position at 0 counts. The two angle origins differ by Φ(length_at_zero).
     """
     _check_sense(sense)
     a, b = as_numbers(side_a, "side_a"), as_numbers(side_b, "side_b")
@@ -451,7 +449,7 @@ def linear_guo(
     metres_per_count: npt.ArrayLike,
     **values: npt.ArrayLike,
 ) -> Drive:
-    """Return the screw of an elevation axis with the constants of Guo's figure 3.
+    """Return the screw drive of an elevation axis from the constants in Guo's figure 3.
 
     Parameters
     ----------
@@ -460,19 +458,19 @@ def linear_guo(
     side_b
         b, distance OB from the axis to its fixed end, m.
     slope
-        β₀, slope of OB against the horizontal, rad.
+        β₀, slope of OB from the horizontal, rad.
     length_at_zero
         x₀, length of the screw at 0 counts, m.
     metres_per_count
-        Change of the screw's length per count, m; the counts times this are his x.
+        Change in screw length per count, m; Guo's x is this value times the counts.
     values
         Any of ``SLOTS``.
 
     Notes
     -----
-    Guo et al. 2013, (41)-(42) as printed: x = √(a² + b² + 2ab cos(α + β₀)) − x₀. The angle
-    AOB is 180° − α − β₀, so the screw shortens as the mirror rises. For a screw that
-    lengthens use `linear_grigoriev`.
+    Guo et al. 2013, (41)-(42) as printed: x = √(a² + b² + 2ab cos(α + β₀)) − x₀. The angle AOB is
+    180° − α − β₀, so the screw gets shorter as the mirror rises. For a screw that gets longer use
+    `linear_grigoriev`.
     """
     zero = np.pi - as_angles(slope, "slope", np.pi)
     return linear_grigoriev(

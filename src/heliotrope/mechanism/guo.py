@@ -1,21 +1,19 @@
-r"""Guo's closed form for azimuth-elevation heliostats.
+r"""Guo's closed-form solution for azimuth-elevation heliostats.
 
-Six small angles and the offset of the mirror describe the machine; its two joint
-angles follow from the position of the sun without iteration. In the frame ENU the
-normal at drive positions (γ, α) is
+Six small angles and the mirror offset describe the heliostat; its two joint angles follow from the
+sun position without iteration. In the ENU frame the normal at drive positions (γ, α) is
 
 $$n = R_{tilt}(ψ_a, ψ_t)\,R_U(-(γ - γ_0))\,R_N(-τ_1)\,R_E(α - α_0)\,(\sin μ, \cos μ, 0)$$
 
-where R_X is the right-handed rotation about X and R_tilt leans the azimuth axis by ψ_t
-towards the azimuth ψ_a. `forward` evaluates it, `angles` inverts it,
-`track` inverts it for the normal that the sun and the target demand.
+where R_X is the right-handed rotation about X, and R_tilt tilts the azimuth axis by ψ_t towards the
+azimuth ψ_a. `forward` evaluates this equation, `angles` inverts it, and `track` inverts it for the
+normal that the sun and the target require.
 
-Source: Guo, Sun, Wang and Zhang, "Properties of a general azimuth-elevation tracking
-angle formula for a heliostat with a mirror-pivot offset and other angular errors",
-Solar Energy 96 (2013) 159-167; here "Guo". Its frame is left-handed (north, east,
-height); the angles are the same in ours. Its actuator, (41)-(42), is
-`heliotrope.mechanism.drives.linear_guo`. The derivations, and the proof that
-`regularise` uses every symmetry there is, are in `docs/explanation/guo.md`.
+Source: Guo, Sun, Wang and Zhang, "Properties of a general azimuth-elevation tracking angle formula
+for a heliostat with a mirror-pivot offset and other angular errors", Solar Energy 96 (2013)
+159-167; here "Guo". Its frame is left-handed (north, east, height), but the angles are the same in
+our frame. Its actuator, (41)-(42), is `heliotrope.mechanism.drives.linear_guo`. The derivations,
+and the proof that `regularise` uses every existing symmetry, are in `docs/explanation/guo.md`.
 """
 
 from collections.abc import Callable, Mapping
@@ -344,23 +342,22 @@ def _azimuth(c: FloatArray, beta: FloatArray, tau_1: FloatArray, mu: FloatArray)
 def track(
     to_target: npt.ArrayLike, sun: npt.ArrayLike, parameters: GuoParameters, *, exact: bool = False
 ) -> GuoTracking:
-    """Return the drive positions that send the sun to the target: Guo's formula.
+    """Return the drive positions that reflect the sun to the target, by Guo's formula.
 
-    Validity, accuracy, source: see `mirror_normal` and `angles`. Stops are
-    not considered.
+    For validity, accuracy and source see `mirror_normal` and `angles`. Stops are ignored.
 
     Parameters
     ----------
     to_target, sun, exact
-        As `mirror_normal` takes them.
+        As for `mirror_normal`.
     parameters
-        Shapes that broadcast against (...): a field of N at T times takes ``to_target``
-        (N, 3), ``sun`` (T, 1, 3) and parameters (N,).
+        Parameters with shapes that broadcast to (...). A field of N heliostats at T times takes
+        ``to_target`` (N, 3), ``sun`` (T, 1, 3) and parameters (N,).
 
     Raises
     ------
     InputError
-        As `mirror_normal` and `angles`.
+        As for `mirror_normal` and `angles`.
     """
     demanded = mirror_normal(to_target, sun, parameters.offset, exact=exact)
     return angles(demanded.normal, parameters)

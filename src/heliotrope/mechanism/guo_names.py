@@ -1,6 +1,6 @@
-"""Guo's parameters under his own names and units, and those of a mechanism.
+"""Conversion between Guo's parameters (his names and units) and those of a mechanism.
 
-His six angles are ψ_a, ψ_t, γ₀, τ₁, α₀, μ, in degrees; his H_z is in metres.
+Guo's six angles are ψ_a, ψ_t, γ₀, τ₁, α₀, μ, in degrees; his H_z is in metres.
 """
 
 from collections.abc import Mapping

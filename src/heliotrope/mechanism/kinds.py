@@ -1,6 +1,6 @@
-"""Builders of the kinds of mechanism that heliostats have.
+"""Builders for the kinds of mechanism used in heliostats.
 
-Every two-axis kind is the same chain with other axes::
+Every two-axis kind is the same chain with different axes::
 
     position, orientation
       two tilts of the primary axis            (fixed)
@@ -62,36 +62,35 @@ def two_axis(
     position
         Foot of the chain, ENU metres, (..., 3).
     axis_1, axis_2, normal
-        Primary axis, secondary axis and mirror normal at zero angles, in the
-        heliostat's frame, (..., 3), any length.
+        Primary axis, secondary axis and mirror normal at zero angles, in the heliostat frame, (...,
+        3), any length.
     kind, names
-        Name of the kind and of the two driven joints.
+        Name of the kind, and names of the two driven joints.
     leans
-        The two directions ("east", "north", "up") that the primary axis can lean to;
-        by default the two that are most perpendicular to the first mechanism's axis.
+        The two directions ("east", "north", "up") in which the primary axis can tilt; by default
+        the two that are closest to perpendicular to the primary axis of the first mechanism.
     pole
-        End of the primary axis to which the names of the tilts refer; default ``axis_1``.
+        The end of the primary axis that the tilt names refer to; default ``axis_1``.
     origin_1
-        Point on the primary axis, from the position, m.
+        Point on the primary axis, relative to the position, m.
     origin_2
-        Point on the secondary axis, from ``origin_1``, m.
+        Point on the secondary axis, relative to ``origin_1``, m.
     arm
-        From ``origin_2`` to the point about which canting turns the mirror, m.
+        From ``origin_2`` to the point about which canting rotates the mirror, m.
     vertex
-        From that point to the mirror's vertex, m; it turns with the canting.
+        From that point to the mirror vertex, m; it rotates with the canting.
     orientation
-        Rotation from the heliostat's frame to ENU, (..., 3, 3); default identity.
+        Rotation from the heliostat frame to ENU, (..., 3, 3); default identity.
     drives
-        Primary and secondary; default: counts are radians.
+        Primary and secondary drive; by default counts are radians.
 
     Raises
     ------
     InputError
-        If a direction is zero, the axes are parallel, the normal lies along the
-        secondary axis, the orientation is no rotation, two joints have one name, or a
-        point is no vector.
+        If a direction is zero, the axes are parallel, the normal lies along the secondary axis, the
+        orientation is not a rotation, two joints have the same name, or a point is not a vector.
     UnknownNameError
-        If the primary axis leans in an unknown direction.
+        If the primary axis is said to tilt in an unknown direction.
     """
     p = as_vectors(position, "position")
     a1, a2 = normalize(axis_1, "axis_1"), normalize(axis_2, "axis_2")
@@ -311,18 +310,18 @@ def azimuth_elevation(
 ) -> Mechanism:
     """Return azimuth-elevation mechanisms.
 
-    At zero angles the mirror looks north; azimuth grows clockwise from north and
-    elevation upwards, so that without imperfections the joint angles are azimuth and
-    elevation of the normal.
+    At zero angles the mirror faces north; azimuth increases clockwise from north and elevation
+    increases upwards, so without imperfections the joint angles are the azimuth and elevation of
+    the normal.
 
     Parameters
     ----------
     position
         Foot of the pedestal, ENU metres, (..., 3).
     pivot_height
-        Height of the intersection of the axes above it, m, (...).
+        Height of the intersection of the axes above the foot, m, (...).
     pivot_offset
-        Distance of the mirror's surface in front of the pivot, m, (...).
+        Distance of the mirror surface in front of the pivot, m, (...).
     orientation, drives
         As for `two_axis`.
     """
@@ -353,10 +352,10 @@ def tilt_roll(
     pivot_offset: npt.ArrayLike = 0.0,
     drives: tuple[Drive, Drive] | None = None,
 ) -> Mechanism:
-    """Return mechanisms whose first axis (tilt) lies along ``axis``.
+    """Return tilt-roll mechanisms; the first axis (tilt) lies along ``axis``.
 
-    At zero angles the mirror looks up as far as the first axis allows; the second
-    axis (roll) lies in the mirror's plane, perpendicular to the first.
+    At zero angles the mirror faces as far up as the first axis allows; the second axis (roll) lies
+    in the mirror plane, perpendicular to the first.
 
     Parameters
     ----------
@@ -367,10 +366,10 @@ def tilt_roll(
     kind
         Name of the kind.
     pivot_height, spacing, pivot_offset
-        First axis above ground, second axis above the first, mirror's surface above
-        the second, m.
+        Height of the first axis above ground, of the second axis above the first, and of the mirror
+        surface above the second, m.
     drives
-        Tilt and roll.
+        Tilt and roll drive.
 
     Raises
     ------
@@ -406,7 +405,7 @@ def target_aligned(
     pivot_offset: npt.ArrayLike = 0.0,
     drives: tuple[Drive, Drive] | None = None,
 ) -> Mechanism:
-    """Return target-aligned (spinning-elevation) mechanisms: the first axis points at ``aim``.
+    """Return target-aligned (spinning-elevation) mechanisms; the first axis points at ``aim``.
 
     Parameters
     ----------
@@ -437,15 +436,15 @@ def pitch_roll(
     pivot_offset: npt.ArrayLike = 0.0,
     drives: tuple[Drive, Drive] | None = None,
 ) -> Mechanism:
-    """Return pitch-roll mechanisms: a horizontal first axis, at right angles to ``azimuth``.
+    """Return pitch-roll mechanisms; the first axis is horizontal and perpendicular to ``azimuth``.
 
-    A positive pitch leans the mirror, which looks up at zero angles, away from the
-    azimuth (rad) it faces; the roll axis lies in the mirror.
+    At zero angles the mirror faces up. A positive pitch tilts it away from the azimuth (rad) that
+    the heliostat faces; the roll axis lies in the mirror.
 
     Raises
     ------
     InputError
-        If the azimuth is not within four turns.
+        If the azimuth is not within four revolutions.
     """
     facing = as_angles(azimuth, "azimuth", MOST_TURNS)
     axis = np.stack([np.cos(facing), -np.sin(facing), np.zeros_like(facing)], axis=-1)
@@ -494,18 +493,18 @@ def polar(
     pivot_offset: npt.ArrayLike = 0.0,
     drives: tuple[Drive, Drive] | None = None,
 ) -> Mechanism:
-    """Return polar mechanisms: the first axis is parallel to the Earth's.
+    """Return polar mechanisms; the first axis is parallel to the Earth's axis.
 
-    At zero angles the mirror looks at the crossing of the meridian and the celestial
-    equator; a positive declination turns it towards the north pole, and the hour angle
-    follows the sun westwards.
+    At zero angles the mirror faces the intersection of the meridian and the celestial equator; a
+    positive declination turns it towards the north pole, and the hour angle increases westwards
+    with the sun.
 
     Parameters
     ----------
     position
         ENU metres, (..., 3).
     latitude
-        Radians, north positive, (...).
+        Radians, positive north, (...).
     pivot_height, pivot_offset, drives
         As for `tilt_roll`.
 
@@ -542,10 +541,10 @@ def two_jacks(
     joint_translation_2: npt.ArrayLike = (0.0, 0.0, 0.0),
     concentrator_translation: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> Mechanism:
-    """Return the mechanism of Jülich's heliostats, moved by two linear actuators.
+    """Return the mechanism of the heliostats at Jülich, which two linear actuators move.
 
-    The first joint turns about east (elevation), the second about an axis that is up
-    in the frame of the first (azimuth); the mirror looks south at zero angles.
+    The first joint rotates about east (elevation), the second about an axis that points up in the
+    frame of the first joint (azimuth); the mirror faces south at zero angles.
 
     Parameters
     ----------
@@ -585,32 +584,32 @@ def single_axis(
 ) -> Mechanism:
     """Return single-axis trackers (parabolic trough, linear Fresnel).
 
-    Only the plane perpendicular to the axis can be reached: source and destination are
-    projected onto it (Grigoriev et al. 2021, (9)).
+    Only the plane perpendicular to the axis can be reached, so source and destination are projected
+    onto it (Grigoriev et al. 2021, (9)).
 
     Parameters
     ----------
     position
         ENU metres, (..., 3).
     axis, normal
-        Axis, and normal at zero angle, in the tracker's frame, (..., 3).
+        Axis, and normal at zero angle, in the tracker frame, (..., 3).
     leans
         As for `two_axis`.
     pivot_height
-        Axis above the position, m.
+        Height of the axis above the position, m.
     origin
-        Point on the axis, from the position and ``pivot_height``, m, (..., 3).
+        Point on the axis, relative to the position and ``pivot_height``, m, (..., 3).
     vertex
-        Mirror's vertex from that point at zero angle, m.
+        Mirror vertex relative to that point at zero angle, m.
     orientation
-        Rotation from the tracker's frame to ENU, (..., 3, 3); default identity.
+        Rotation from the tracker frame to ENU, (..., 3, 3); default identity.
     drives
-        One drive; default: counts are radians.
+        One drive; by default counts are radians.
 
     Raises
     ------
     InputError
-        If the normal lies along the axis, or the orientation is no rotation.
+        If the normal lies along the axis, or the orientation is not a rotation.
     """
     p, a, n = as_vectors(position, "position"), normalize(axis, "axis"), normalize(normal, "normal")
     if (np.linalg.norm(np.cross(a, n), axis=-1) < 1e-6).any():

@@ -1,6 +1,6 @@
-"""Settings of a heliostat's motors and resting places: what no calibration changes.
+"""Motor settings and rest positions of a heliostat, which calibration does not change.
 
-They come from the plant file (`[groups.NAME.machine]`); `board_items` turns them into the bytes
+They come from the plant file (`[groups.NAME.machine]`); `board_items` converts them to the bytes
 that a local controller stores.
 """
 
@@ -50,7 +50,7 @@ class AxisLimits:
     Raises
     ------
     InputError
-        An empty range, or a rate, an acceleration or a backlash out of range.
+        If a range is empty, or a rate, an acceleration or a backlash is out of range.
     """
 
     low: int
@@ -61,7 +61,7 @@ class AxisLimits:
 
     @property
     def lead(self) -> int:
-        """Steps that a goal going down with the sun is set ahead, as in `lcu.stepper`."""
+        """Steps by which a goal that moves down with the sun is set ahead, as in `lcu.stepper`."""
         return math.ceil(self.backlash / 8)
 
     def __post_init__(self) -> None:
@@ -109,36 +109,38 @@ class Stepping:
 
 @dataclass(frozen=True)
 class Machine:
-    """Motor limits and resting places of one heliostat.
+    """Motor limits and rest positions of one heliostat.
 
     Attributes
     ----------
     axes
-        Tables of the primary and the secondary drive.
+        Limits of the primary and the secondary axis.
     stow
         Position of both axes at stow, steps.
     defocus
-        Angles that both axes turn away, rad.
+        Angles by which both axes turn away from the receiver, rad.
     standby
-        Standby point, ENU, m; None: the local controller keeps the one it has.
+        Standby point, ENU, m; None: the local controller keeps its stored point.
     azimuth_axis
         Index (0, 1) of the axis that leaves stow first.
     way
-        Points that the beam passes from the ground to the standby point, ENU, m, at most
-        `WAY_POINTS`; (): the local controller finds its own.
+        Points through which the beam passes on its way from the ground to the standby point, ENU,
+        m, at most `WAY_POINTS`; (): the local controller finds its own path.
     stepping
-        How the drivers step; None: the local controller keeps what it has, at first no rest.
+        How the motor drivers step; None: the local controller keeps its stored setting, which
+        initially is to keep the drivers powered.
     stow_lights
-        Whether the beam may pass a receiver or a target at some hours of the year while the mirror
-        is at stow: it is one sun. Keep-out volumes are never passed.
+        Whether the beam of the stowed heliostat may cross a receiver or a target at some hours of
+        the year; this is the light of a single heliostat. The beam never crosses a keep-out volume.
     tilt_sensor
-        Whether the mirror carries a tilt sensor, which shows a diagnosis that the mirror moves.
+        Whether the heliostat carries a tilt sensor, with which the plant can confirm that the
+        mirror moves.
 
     Raises
     ------
     InputError
-        A stow position outside the limits or, for drivers that rest, between full steps, a
-        defocus that would leave the beam on the receiver, or too many points.
+        If a stow position is outside the limits or, for drivers that switch off, between full
+        steps; if a defocus would leave the beam on the receiver; or if there are too many points.
     """
 
     axes: tuple[AxisLimits, AxisLimits]
@@ -153,7 +155,7 @@ class Machine:
 
     @property
     def rests(self) -> bool:
-        """Whether the drivers are off between motions."""
+        """Whether the drivers are switched off between motions."""
         return self.stepping is not None and self.stepping.rests
 
     def __post_init__(self) -> None:

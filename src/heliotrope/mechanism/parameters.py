@@ -1,8 +1,8 @@
-"""The parameters of a mechanism: one row each in one table, and the models.
+"""The parameters of a mechanism: one table with one entry per parameter, and the models.
 
-Outside the compiled kernels a parameter is never addressed by a number. Its row gives its
-unit, its physical cause with its positive sense, its names in the literature, and the
-standard deviation that installation and survey leave (the prior).
+Outside the compiled kernels a parameter is never addressed by an index. Its table entry gives the
+unit, the physical cause with its positive sense, the names in the literature, and the standard
+deviation that remains after installation and survey (the prior).
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from heliotrope.mechanism.kernels import slots as slot
 
 @dataclass(frozen=True)
 class Parameter:
-    """A row of the parameter table.
+    """An entry of the parameter table.
 
     Attributes
     ----------
@@ -23,7 +23,7 @@ class Parameter:
     unit
         "rad", "m" or "1" (relative).
     cause
-        Physical cause in the machine.
+        Physical cause in the mechanism.
     positive
         Meaning of a positive value.
     prior
@@ -31,7 +31,7 @@ class Parameter:
     aliases
         Names in the literature.
     code
-        For the kernels: (kind, joint or drive, component).
+        Code for the kernels: (kind, joint or drive, component).
     """
 
     name: str
@@ -294,7 +294,8 @@ _JACKS = (
     "elevation_offset", "azimuth_offset",
 )  # fmt: skip
 
-#: Named subsets to be estimated. ``full`` is every row except the worm, whose ratio must be known.
+#: Named subsets of parameters to estimate. ``full`` is every parameter except the worm terms,
+#: because the worm ratio must be known.
 MODELS: dict[str, tuple[str, ...]] = {
     "malan8": _POSITION + _AZEL,
     "guo6": (*_AZEL, "canting"),

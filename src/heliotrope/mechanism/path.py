@@ -1,9 +1,9 @@
-"""A day as a path: drive positions that follow one another without needless turns.
+"""A day's tracking as a path: successive drive positions without needless slews.
 
-`track` answers each sun by itself: two neighbours in time may stand on different branches, or a
-turn apart. A path is the sequence of all of them with the least cost, found by dynamic programming
-over branches and turns: first as few poses as possible that miss the aim, then as few as possible
-over the top, then as few slews as possible, then the least motion.
+`track` solves each sun position independently, so two successive solutions may lie on different
+branches, or a revolution apart. A path is the least-cost sequence of solutions, found by dynamic
+programming over branches and revolutions. It minimises, in this order: poses that miss the aim,
+poses over the top, slews, and motion.
 """
 
 from dataclasses import dataclass
@@ -30,18 +30,18 @@ _FOLLOWS, _SLACK = 2.0, 1e-6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Slew(Value):
-    """A step that the sun's motion does not explain.
+    """A step of the path that the motion of the sun does not explain.
 
     Attributes
     ----------
     step
-        It ends at this pose of the path.
+        Index of the pose at which the slew ends.
     row
-        Heliostat, counted over the batch axes behind the time.
+        Heliostat index, counted over the batch axes behind the time axis.
     turn
         Change of the joint angles, rad, (D,).
     reason
-        One clause for people.
+        Reason, in one clause, for display.
     """
 
     step: int
@@ -56,12 +56,12 @@ class Slew(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TrackedPath(Value, Framed):
-    """Poses at T times in their order; (...) are the batch axes of the heliostats.
+    """Poses at T successive times; (...) are the batch axes of the heliostats.
 
     Attributes
     ----------
     angles
-        Joint angles, rad, (T, ..., D), without jumps of a turn except in slews.
+        Joint angles, rad, (T, ..., D), without jumps of a full revolution except in slews.
     counts
         Drive counts, real numbers, (T, ..., D).
     normal, vertex
@@ -69,13 +69,13 @@ class TrackedPath(Value, Framed):
     status
         `TrackingStatus` as integers, (T, ...).
     residual
-        Angle between the normal and the demanded one, rad, (T, ...).
+        Angle between the normal and the required normal, rad, (T, ...).
     branch
         (T, ...).
     over_the_top
-        Whether the mirror stands beyond the keyhole, seen from its home position, (T, ...).
+        Whether the mirror is beyond the keyhole, seen from its home position, (T, ...).
     slews
-        The steps that the sun's motion does not explain, in the order of time.
+        The steps that the motion of the sun does not explain, in order of time.
     """
 
     angles: FloatArray
@@ -107,7 +107,7 @@ class TrackedPath(Value, Framed):
         return Labelled(row, labels, self.variables(row))
 
     def variables(self, row: tuple[str, ...]) -> dict[str, Variable]:
-        """Return the arrays for a frame, by name; ``row`` names the axes (T, ...)."""
+        """Return the arrays for a data frame, by name; ``row`` names the axes (T, ...)."""
         return {
             "angle": Variable((*row, "joint"), self.angles, "rad"),
             "count": Variable((*row, "joint"), self.counts),
@@ -139,7 +139,7 @@ def track_path(
     Parameters
     ----------
     mechanism
-        Mechanisms, a heliostat, heliostats or a plant, batch shape (...).
+        Mechanisms, a heliostat, several heliostats or a plant, batch shape (...).
     sun
         Unit vectors to the sun, ENU, (T, 3), or (T, ..., 3) that broadcasts to the batch.
     aim, local
@@ -147,19 +147,20 @@ def track_path(
     current
         Counts before the first pose, (..., D).
     over_the_top
-        Whether the branch over the top may be taken wherever that saves slews or motion. By
-        default it is taken only at times that the other branch does not serve.
+        Whether the over-the-top branch may be used wherever that saves slews or motion. By default
+        it is used only when the other branch cannot reach the aim.
 
     Raises
     ------
     InputError
-        As `track`, or if the sun has no axis of time.
+        As for `track`, or if the sun array has no time axis.
 
     Notes
     -----
-    Both joints turn about fixed axes, so the two branches are mirror images about the keyhole: the
-    angle of the second joint at which the normal comes closest to the primary axis. The branch on
-    the side of the home position (the middle of the stops, or 0) is the usual one.
+    Both joints rotate about fixed axes, so the two branches are mirror images of each other about
+    the keyhole, that is, the angle of the second joint at which the normal comes closest to the
+    primary axis. The usual branch is the one on the side of the home position (the middle of the
+    stops, or 0).
     """
     light = as_vectors(sun, "sun")
     batch = mechanism.armature.shape

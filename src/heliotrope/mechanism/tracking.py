@@ -1,8 +1,8 @@
 """Tracking: the drive positions at which the beam reaches its aim.
 
-Global aiming sends light from a direction (the sun) to a point in the field; local
-aiming sends it to a point that is fixed to the mirror (dish, CPV, trough). Both run
-on the armature, hence for every mechanism and every error model alike.
+Global aiming sends light from a direction (the sun) to a point in the field; local aiming sends it
+to a point that is fixed to the mirror (dish, CPV, trough). Both work on the armature, and so serve
+every mechanism and every error model.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ Branch = Literal["both", 0, 1]
 
 
 class Steered(Protocol):
-    """Anything with axes and drives: mechanisms, a heliostat, heliostats, a plant."""
+    """Anything with axes and drives: mechanisms, a heliostat, several heliostats, a plant."""
 
     @property
     def armature(self) -> Armature:
@@ -47,7 +47,7 @@ class Steered(Protocol):
 
     @property
     def attachment(self) -> FloatArray:
-        """Heliostats' frames to ENU, for points fixed to the mirrors, (..., 4, 4)."""
+        """Transforms from heliostat frames to ENU, for points fixed to the mirrors, (..., 4, 4)."""
 
 
 class TrackingStatus(IntEnum):
@@ -79,7 +79,7 @@ _TEXTS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tracking(Value, Framed):
-    """Solutions of one or both branches; B branches, D drives.
+    """Solutions on one branch or both; B branches, D drives.
 
     Attributes
     ----------
@@ -92,12 +92,12 @@ class Tracking(Value, Framed):
     status
         `TrackingStatus` as integers, (..., B).
     residual
-        Angle between the normal and the demanded one, rad, (..., B).
+        Angle between the normal and the required normal, rad, (..., B).
     iterations
         (..., B).
     best
-        The branch to take, (...): one that reaches the aim with the least motion from
-        the current counts, else the one with the smallest residual.
+        The selected branch, (...): one that reaches the aim with the least motion from the current
+        counts, or else the one with the smallest residual.
     """
 
     angles: FloatArray
@@ -192,50 +192,50 @@ def track(
 ) -> Tracking:
     """Return the drive positions that send light from the sun to the aim.
 
-    All batch shapes broadcast: heliostats with one sun, one heliostat with a day of
-    suns, or (times, 1) suns with (heliostats,) mechanisms.
+    All batch shapes broadcast: several heliostats with one sun vector, one heliostat with the sun
+    vectors of a day, or sun vectors of batch shape (times, 1) with mechanisms (heliostats,).
 
     Parameters
     ----------
     mechanism
-        Mechanisms; a heliostat, heliostats or a plant, as calibrated; or armatures.
+        Mechanisms; a heliostat, several heliostats or a plant, as calibrated; or armatures.
     sun
         Unit vectors to the source, ENU, (..., 3).
     aim
-        Points in ENU metres, (..., 3); with ``local`` points fixed to the mirror, at their
-        positions for zero joint angles in the heliostat's frame (see `Mechanism.attachment`), or
-        in that of the armature.
+        Points in ENU metres, (..., 3); with ``local``, points fixed to the mirror, specified at
+        zero joint angles in the heliostat frame (see `Mechanism.attachment`), or in the armature
+        frame.
     drives
-        Batch shape (..., D); default the mechanism's, or radians for an armature.
+        Batch shape (..., D); by default those of the mechanism, or radians for an armature.
     current
-        Present counts, (..., D). They decide between the branches and between angles that
-        differ by a turn; without them the middle of the stops decides.
+        Present counts, (..., D). They select between the branches and between angles that differ by
+        a revolution; without them the middle of the stops decides.
     branch
-        "both", or the one to solve (0: −, 1: + in Paden-Kahan), which takes half the time.
+        "both", or the branch to solve (0: −, 1: + in Paden-Kahan), which takes half the time.
     local
-        Aim at a point fixed to the mirror (Grigoriev et al. 2021, "Local aiming").
+        Whether the aim is a point fixed to the mirror (Grigoriev et al. 2021, "Local aiming").
     tolerance
-        Largest miss of the beam at the aim, m.
+        Largest allowed miss distance of the beam at the aim, m.
     max_iterations
-        Limit on fixed-point steps.
+        Maximum number of fixed-point steps.
     newton
-        Whether Newton takes over where the fixed point converges slowly.
+        Whether to switch to Newton's method where the fixed point converges slowly.
 
     Returns
     -------
-    For an aim that cannot be reached, the nearest pose; ``status`` and ``residual`` say
-    so, and nothing is raised.
+    For an aim that cannot be reached, the result is the nearest pose; ``status`` and ``residual``
+    report this, and no exception is raised.
 
     Raises
     ------
     InputError
-        If an input is not finite, a sun is not a unit vector, or shapes do not fit.
+        If an input is not finite, a sun vector is not a unit vector, or shapes do not fit.
 
     Notes
     -----
-    Grigoriev et al. 2021, (3)-(9). The fixed point on the vertex contracts by about
-    offset / (2 · slant · sin ζ), ζ being the angle from the primary axis; where a step
-    gains less than a factor of 3.3, Newton with the screw derivative takes over.
+    Grigoriev et al. 2021, (3)-(9). The fixed-point iteration on the vertex contracts by about
+    offset / (2 · slant · sin ζ), where ζ is the angle from the primary axis. Where a step reduces
+    the error by less than a factor of 3.3, Newton's method with the screw derivative takes over.
     """
     armature, table = _tables(mechanism, drives)
     s, p = as_vectors(sun, "sun"), as_vectors(aim, "aim")

@@ -1,19 +1,20 @@
-"""Light between the sun, the mirrors and the surfaces that they light.
+"""Light between the sun, the mirrors and the surfaces that they illuminate.
 
-- `sun_shape` and `attenuation`: the sun's profile, and what the air takes.
-- `beam`: the sun's angular radius, the width of a beam and its strength along its axis. Every other
-  module takes these from there.
-- `offsets`: where an imperfect heliostat throws its beam (Malan's error model as a forward model).
-- `intercept` and `flux`: the share of a beam, and the flux of round beams, on a receiver.
-- `scene`, `surfaces`, `shading` and `receiver_flux`: the engine, from mirrors to the flux in cells;
-  `rays` is a second opinion, and `canting` tilts facets.
-- `plant_flux` and `flux_files`: efficiencies and flux of a plant at a sun, a day or a year, and
-  their files.
+- `sun_shape` and `attenuation`: the sun's radiance profile, and atmospheric attenuation.
+- `beam`: the sun's angular radius, the width of a beam and its irradiance along the axis. Every
+  other module takes these from `beam`.
+- `offsets`: where an imperfect heliostat sends its beam (Malan's error model as a forward model).
+- `intercept`: the fraction of a round beam that a disk or a rectangle intercepts.
+- `scene`, `surfaces`, `shading` and `receiver_flux`: the flux engine, from mirrors to the flux in
+  cells; `rays` is an independent check by ray tracing, and `canting` tilts facets.
+- `plant_flux` and `flux_files`: efficiencies and flux of a plant at a sun position, over a day or a
+  year, and their files.
 - `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation.
-- `obstruction`: the elements that neighbours shade and block, and how far that moves a centroid.
-- `coverage`: the share of a grid's cells that polygons cover (a function of the same name, so it
+- `obstruction`: the mirror elements that neighbours shade and block, and the resulting centroid
+  shift.
+- `coverage`: the fraction of a grid's cells that polygons cover (a function of the same name, so it
   stays there).
-- `keep_out`: beams that enter forbidden volumes; `glare`: the hazard to eyes, for information only.
+- `keep_out`: beams that enter keep-out volumes; `glare`: the eye hazard, for information only.
 
 Begin with `image_offsets` for a tracking error, `field_flux` for a plant.
 """
@@ -36,7 +37,7 @@ from heliotrope.optics.beam import (
     mean_concentration,
 )
 from heliotrope.optics.canting import canted
-from heliotrope.optics.flux import CELLS, FluxView, predict_flux
+from heliotrope.optics.flux import FluxView
 from heliotrope.optics.flux_files import (
     write_heliostats,
     write_map,
@@ -85,13 +86,13 @@ from heliotrope.optics.plant_flux import (
     field_flux,
     flux_day,
     flux_year,
+    scene_flux,
 )
 from heliotrope.optics.rays import RayTrace, trace
 from heliotrope.optics.sun_shape import SUN_SHAPES, Gaussians, SunShape, sun_profile
 
 __all__ = [
     "AIR_MODELS",
-    "CELLS",
     "CHI_SQUARE_90",
     "DAYLIGHT",
     "EFFICIENCIES",
@@ -148,11 +149,11 @@ __all__ = [
     "intercept_rectangle",
     "mean_concentration",
     "nearest",
-    "predict_flux",
     "reflected_beam",
     "safe_distance",
     "safe_range",
     "safe_way",
+    "scene_flux",
     "sun_profile",
     "sweep",
     "target_offsets",

@@ -1,13 +1,14 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: which part of each mirror sees the sun and its aim past mirrors and towers.
+"""Compiled: which part of each mirror sees the sun and its aim past other mirrors and towers.
 
-A mirror's row of SIZE numbers holds its centre, its axes x and y and its normal (3 each), half its
-width and height, its curvature 1 / 2f, and a radius that holds it. An occluder is a convex polygon.
-A ray that leaves the mirror at (x, y) goes along d + D (x, y), D being the derivative of the
-reflected direction by the place on the curved mirror; 0 for shading. The occluder's corners are
-carried along these rays into the mirror's plane, and the polygons are subtracted from the mirror's
-rectangle one by one. What is left is a list of convex pieces, however many there are.
+A mirror is stored as SIZE numbers: its centre, its axes x and y and its normal (3 each), half its
+width and height, its curvature 1 / 2f, and the radius of an enclosing sphere. An occluder is a
+convex polygon. A ray that leaves the mirror at (x, y) has the direction d + D (x, y), where D is
+the derivative of the reflected direction with respect to the position on the curved mirror; D is 0
+for shading. The corners of the occluder are projected along these rays into the mirror plane, and
+the polygons are subtracted from the mirror's rectangle one by one. The remainder is a list of
+convex pieces of any length.
 """
 
 import math

@@ -2,15 +2,16 @@
 # mypy: allow-untyped-defs
 """Compiled: the images of mirrors on surfaces, as sums of elliptic Gaussians.
 
-A mirror's parts (facets, or equal divisions) each have a lit area, a centroid and a covariance. At
-distance t along the mirror's central ray, a part's image has its mean where the centroid's ray goes
-and the covariance A C Aᵀ, A being the derivative of the ray's place by the place on the part. Parts
-whose images lie close together are merged by their moments. Each image is convolved with the
-slope's and the belief's Gaussians, and with a sum of Gaussians for the sun.
+The parts of a mirror (facets, or equal divisions) each have a lit area, a centroid and a
+covariance. At distance t along the mirror's central ray, the image of a part has its mean where the
+ray from the centroid arrives, and the covariance A C Aᵀ, where A is the derivative of the ray's
+position with respect to the position on the part. Parts whose images are close together are merged
+by their moments. Each image is convolved with the Gaussians of the slope errors and of the
+calibration uncertainty, and with a sum of Gaussians for the sun.
 
-Surfaces are columns of cells in equal rows: along a column the exponent is a quadratic form of the
-height, so the values of the cells follow from two multiplications each. The size of the cells
-counts as a further variance.
+Surfaces are columns of cells of equal height. Along a column the exponent is a quadratic form of
+the height, so each cell value costs two multiplications. The cell size counts as an additional
+variance.
 """
 
 import math

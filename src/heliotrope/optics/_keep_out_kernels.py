@@ -2,19 +2,19 @@
 # mypy: allow-untyped-defs
 """Compiled: distances to keep-out volumes, and beams marched towards them.
 
-A volume is a row of SIZE numbers: kind; centre and radius of a sphere around it; then, by
-kind, as listed at `SIZE`. Corners of prisms lie in one array of (x, y); a prism's row holds
-the place of its first corner and their number.
+A volume is stored as SIZE numbers: kind; centre and radius of an enclosing sphere; then, by kind,
+the values listed at `SIZE`. The corners of all prisms are in one array of (x, y); a prism stores
+the index of its first corner and the number of its corners.
 
-A beam is a solid of revolution about a ray: at distance t along it its radius is
-r(t) = R · max(1, t / b) + q t, R being the mirror's, b the focal distance and q the spread.
-|cos θ − t / b| and |1 − t cos θ / b|, the half-widths in and across the plane of incidence θ
-of an ideal mirror in units of R, are never larger than max(1, t / b): the solid holds the
-beam at every incidence, with its astigmatism.
+A beam is a solid of revolution about a ray: at distance t along the ray its radius is r(t) = R ·
+max(1, t / b) + q t, where R is the mirror radius, b the focal distance and q the spread.
+|cos θ − t / b| and |1 − t cos θ / b| are the half-widths of the beam of an ideal mirror, in and
+across the plane of incidence θ, in units of R. They never exceed max(1, t / b), so the solid
+contains the beam at every incidence, including its astigmatism.
 
-A distance function never grows faster than the way gone, and r no faster than R / b + q. So
-from a clearance g = distance − r the beam is clear for at least g / (1 + R / b + q) more:
-marching by such steps misses nothing.
+A distance function never changes by more than the distance travelled, and r never grows faster than
+R / b + q. Therefore, with clearance g = distance − r, the beam is clear for at least another g / (1
++ R / b + q), and marching in such steps misses nothing.
 """
 
 import math

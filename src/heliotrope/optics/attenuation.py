@@ -1,19 +1,19 @@
-r"""What the air between a mirror and the receiver takes, by published models.
+r"""Atmospheric attenuation between a mirror and the receiver, by published models.
 
-Of the light is lost over d km:
+Fraction of the light that is lost over d km:
 
 - `clear`: 0.006789 + 0.1046 d − 0.0170 d² + 0.002845 d³ (Vittitoe and Biggs, SAND78-1137C, 1978,
   for a visibility of 23 km; the default of DELSOL3 and SolarPILOT).
-- `hazy`: 0.01293 + 0.2748 d − 0.03394 d² (the same, for 5 km).
+- `hazy`: 0.01293 + 0.2748 d − 0.03394 d² (same source, for 5 km).
 - `mirval`: 0.00679 + 0.1176 d − 0.0197 d² to 1 km, then 1 − exp(−0.1106 d) (Leary and Hankins,
   SAND77-8280, 1979, p. 14).
 - `ballestrin-clear`: 0.0029544 + 0.1522128 d − 0.018598 d² + 0.0015182 d³, and `ballestrin-hazy`:
-  0.0077941 + 0.5549083 d − 0.147887 d² + 0.0153718 d³ (as Tonatiuh has Ballestrín's).
+  0.0077941 + 0.5549083 d − 0.147887 d² + 0.0153718 d³ (Ballestrín's models as given in Tonatiuh).
 - `none`: 0.
 - A number, the visibility V in km: 1 − exp(−d ln 50 / V), Koschmieder's law at a contrast of 2 %.
 
 The polynomials were fitted for slant ranges of up to a few kilometres. Beyond their maximum, or
-where they leave 0 to 1, the greatest loss so far holds.
+where they leave the range 0 to 1, the largest loss up to that distance is used.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ _POLYNOMIALS = {
     "ballestrin-clear": (0.0029544, 0.1522128, -0.018598, 0.0015182),
     "ballestrin-hazy": (0.0077941, 0.5549083, -0.147887, 0.0153718),
 }
-#: Names of models.
+#: Names of the models.
 AIR_MODELS = (*_POLYNOMIALS, "mirval")
 #: ln 50: Koschmieder's extinction times visibility, at a contrast of 2 %.
 _CONTRAST = float(np.log(50.0))
@@ -41,19 +41,19 @@ _VISIBILITY = (0.1, 500.0)
 
 
 def air_loss(distance: npt.ArrayLike, model: str | float = "clear") -> FloatArray:
-    """Return the share of the light that the air absorbs and scatters, 0 to 1, (...).
+    """Return the fraction of the light that the atmosphere absorbs and scatters, 0 to 1, (...).
 
     Parameters
     ----------
     distance
-        From mirror to receiver, m, (...), 0 or more; NaN gives NaN.
+        From mirror to receiver, m, (...), 0 or more; NaN yields NaN.
     model
         One of `AIR_MODELS`, or the visibility, km.
 
     Raises
     ------
     InputError
-        If there is no such model, or the visibility is out of range.
+        If the model does not exist, or the visibility is out of range.
     """
     return air_model(model)(as_float(distance))
 

@@ -1,13 +1,13 @@
-r"""Beams: the sun's angular radius, the width of a beam, and its strength along its axis.
+r"""Beams: the sun's angular radius, the width of a beam, and its irradiance along the axis.
 
-Every other module takes these from here. There are two models of a beam:
+Every other module takes these from here. There are two beam models:
 
-- `beam_sigma` gives the standard deviation of a Gaussian beam, for what falls on a receiver. The
-  angular variances of the sun's disk, of the mirror's slope and of the tracking add up; a mirror
-  doubles the latter two:
-  $σ_{beam}^2 = σ_{sun}^2 + (2 σ_{slope})^2 + (2 σ_{tracking})^2$.
-- `MirrorOptics` and `Beams` describe a solid that surely holds the beam, for what must stay dark:
-  keep-out volumes and eyes.
+- `beam_sigma` returns the standard deviation of a Gaussian beam, to compute what falls on a
+  receiver. The angular variances of the solar disk, of the mirror slope and of the tracking add up;
+  reflection doubles the latter two errors: $σ_{beam}^2 = σ_{sun}^2 + (2 σ_{slope})^2 + (2
+  σ_{tracking})^2$.
+- `MirrorOptics` and `Beams` describe a solid that is guaranteed to contain the beam, for what must
+  stay dark: keep-out volumes and eyes.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors, common_shape, normalize
 
-#: Angular radius of the sun's disk, rad.
+#: Angular radius of the solar disk, rad.
 SUN_RADIUS = 4.65e-3
 #: Standard deviation per axis of a uniform solar disk, rad: half of its radius.
 SUN_SIGMA = 0.5 * SUN_RADIUS
@@ -26,8 +26,8 @@ SUN_SIGMA = 0.5 * SUN_RADIUS
 REACH = 3000.0
 #: Default direct normal irradiance, W/m².
 NOMINAL_DNI = 1000.0
-#: Squared distance within which 90 % of a two-dimensional Gaussian lie, χ² with two degrees of
-#: freedom.
+#: Squared normalised distance that contains 90 % of a two-dimensional Gaussian: χ² with two degrees
+#: of freedom.
 CHI_SQUARE_90 = 2.0 * float(np.log(10.0))
 
 
@@ -38,27 +38,27 @@ def beam_sigma(
     slope: npt.ArrayLike = 0.0,
     sun_shape: npt.ArrayLike = SUN_SIGMA,
 ) -> FloatArray:
-    """Return the standard deviation per axis of a beam on a plane across it, m, (...).
+    """Return the standard deviation per axis of a beam on a plane perpendicular to it, m, (...).
 
     Parameters
     ----------
     slant
         Distance from mirror to aperture, m, (...).
     tracking, slope
-        Standard deviations per axis of the *normal*, of the whole mirror and over its
-        surface, rad, (...). Each counts twice in the beam.
+        Standard deviations per axis of the *normal*, of the whole mirror (tracking) and over its
+        surface (slope), rad, (...). Each counts twice in the beam.
     sun_shape
-        Standard deviation per axis of the sun's disk, rad, (...).
+        Standard deviation per axis of the solar disk, rad, (...).
 
     Raises
     ------
     InputError
-        If a value is negative or not finite, the slant is 0, or shapes do not broadcast.
+        If a value is negative or not finite, the slant range is 0, or shapes do not broadcast.
 
     Notes
     -----
-    The mirror is taken as focused on the aperture, so its size adds nothing, and its
-    astigmatism away from normal incidence is left out. Malan's beam is another: `intercept_disks`.
+    The mirror is assumed to be focused on the aperture, so its size does not widen the beam, and
+    astigmatism at oblique incidence is neglected. For Malan's beam model see `intercept_disks`.
     """
     d = checked("slant", slant, "m", positive=True)
     t = checked("tracking", tracking, "rad")
@@ -93,10 +93,10 @@ class MirrorOptics:
     width, height
         m, (N,).
     focus
-        Focal distance of canting and curvature together, m, (N,); infinite if flat.
+        Focal distance from canting and curvature together, m, (N,); infinite if flat.
     error
-        Bound on everything that turns or widens the beam beyond the sun's radius (slope,
-        tracking, the sun's motion meanwhile), half angle, rad, (N,).
+        Bound on everything that deflects or widens the beam beyond the sun's radius (slope,
+        tracking, the sun's motion between updates), half angle, rad, (N,).
     reflectivity
         (N,).
     """
@@ -159,7 +159,7 @@ class MirrorOptics:
 
     @property
     def area(self) -> FloatArray:
-        """Aperture, m², (N,)."""
+        """Mirror area, m², (N,)."""
         return self.width * self.height
 
     @property
@@ -169,11 +169,11 @@ class MirrorOptics:
 
     @property
     def spread(self) -> FloatArray:
-        """Half angle of the solid that holds the beam, rad, (N,)."""
+        """Half angle of the solid that contains the beam, rad, (N,)."""
         return SUN_RADIUS + self.error
 
     def broadcast(self, count: int) -> "MirrorOptics":
-        """Return ``count`` mirrors, repeating a single one."""
+        """Return ``count`` mirrors, by repeating a single mirror."""
         if len(self) not in (1, count):
             raise InputError(f"mirrors: {len(self)} for {count} beams; give one, or one for each")
         return MirrorOptics(
@@ -249,14 +249,14 @@ def concentration(
     focus: npt.ArrayLike,
     half_angle: npt.ArrayLike = SUN_RADIUS,
 ) -> FloatArray:
-    """Return the irradiance on a beam's axis over that on the mirror times reflectivity.
+    """Return the ratio of on-axis irradiance to that on the mirror times reflectivity.
 
-    The mirror is a disk of ``area`` with an ideal focus, hit head-on; the sun a uniform disk.
-    From a point at distance x the part of the mirror within √(area/π) and within
-    x β / |1 − x/b| of its centre shows the sun, at the sun's radiance, so C is the square of
-    min(√(area/π) / (x β), 1 / |1 − x/b|). Ho et al. give the mean over the beam's section,
-    which is less everywhere (`mean_concentration`). An oblique mirror may be stronger near its
-    line foci, up to the limit that the sun's radiance sets: the first of the two terms.
+    The mirror is a disk of ``area`` with an ideal focus at normal incidence; the sun is a uniform
+    disk. From a point at distance x, the part of the mirror within √(area/π) and within x β / |1 −
+    x/b| of its centre shows the sun at the sun's radiance, so C is the square of min(√(area/π) / (x
+    β), 1 / |1 − x/b|). Ho et al. give the mean over the beam's cross-section, which is smaller
+    everywhere (`mean_concentration`). At oblique incidence a mirror may be stronger near its line
+    foci, up to the limit set by the sun's radiance, which is the first of the two terms.
 
     Parameters
     ----------
@@ -281,12 +281,11 @@ def mean_concentration(
     focus: npt.ArrayLike,
     half_angle: npt.ArrayLike = SUN_RADIUS,
 ) -> FloatArray:
-    """Return the mean over a beam's section of its irradiance over that on the mirror.
+    """Return the beam irradiance, averaged over the cross-section, over that on the mirror.
 
     The estimate of Ho, Ghanbari and Diver (2011) for specular reflection by a focused mirror:
-    mirror area over beam area, C = (|1 − x/b| + x β / R)⁻², R being the radius of a disk of
-    the mirror's area.
-    Eyes are judged by the irradiance on the axis, which is larger.
+    mirror area over beam area, C = (|1 − x/b| + x β / R)⁻², where R is the radius of a disk with
+    the mirror's area. Eye hazards are judged by the irradiance on the axis, which is larger.
 
     Parameters
     ----------
@@ -300,14 +299,14 @@ def mean_concentration(
 
 @dataclass(frozen=True)
 class Crossing:
-    """The light of N beams at P points.
+    """The irradiance from N beams at P points.
 
     Attributes
     ----------
     concentration
         Concentration of each beam, (P, N).
     irradiance
-        Sum over the beams, W/m², on a surface that faces each of them, (P,).
+        Sum over the beams, W/m², on a surface normal to each beam, (P,).
     count
         Number of beams that reach the point, (P,).
     """
@@ -318,11 +317,11 @@ class Crossing:
 
 
 def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI) -> Crossing:
-    """Return the irradiance of all beams at points (P, 3), such as standby points.
+    """Return the irradiance from all beams at points (P, 3), such as standby points.
 
-    The mirror is a disk with an ideal focus. From a point at distance d from the axis, the part
-    of it within x β / |1 − x/b| of d / |1 − x/b| shines: two disks, whose common area is known in
-    closed form. On the axis the result is that of `concentration`.
+    The mirror is a disk with an ideal focus. From a point at distance d from the axis, the sun is
+    visible in the part of the disk within x β / |1 − x/b| of d / |1 − x/b|. The area common to
+    these two disks is known in closed form. On the axis the result equals that of `concentration`.
     """
     p = np.atleast_2d(as_vectors(points, "points"))
     to = p[:, None, :] - given.origin
@@ -342,15 +341,15 @@ def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI) -
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """Expected error of M beams, each from one sun to one aim.
+    """Expected error of M beams, each for one sun position and one aim.
 
     Computed by `heliotrope.calibration.uncertainty.expected_error`.
 
     Attributes
     ----------
     covariance
-        Covariance right of and above the aim as seen from the mirror, rad², (M, 2, 2); NaN where
-        the pose is out of reach.
+        Covariance to the right of and above the aim as seen from the mirror, rad², (M, 2, 2); NaN
+        where the pose is out of reach.
     reachable
         Whether the mechanism reaches the pose, (M,).
     """
@@ -365,9 +364,9 @@ class ExpectedError:
 
     @property
     def ellipse(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The 90 % ellipse: semi-axes (rad, the longer first) and the longer's angle, (M,).
+        """The 90 % ellipse: semi-axes (rad, the longer first) and angle of the longer axis, (M,).
 
-        The angle is counter-clockwise from the right, rad.
+        The angle is counterclockwise from the right, rad.
         """
         known = np.asarray(np.isfinite(self.covariance).all(axis=(-1, -2)))
         values, vectors = np.linalg.eigh(np.where(known[:, None, None], self.covariance, 0.0))

@@ -1,10 +1,12 @@
 """Canting: how the facets of a mirror are tilted towards a focus.
 
-The facets of a heliostat stand in the plane of its mirror, edge to edge. SolarPILOT's kinds:
+The facets of a heliostat lie in the plane of its mirror, edge to edge. SolarPILOT's canting
+methods:
 
-- on axis, at one focal length for the field, or at each heliostat's distance to its aim: to first
-  order in the size of the mirror, the facets are tangent to a paraboloid;
-- off axis, at a moment: every facet sends the middle of the sun to the aim then, and only then.
+- on-axis, with one focal length for the field, or with each heliostat's slant range: to first order
+  in the size of the mirror, the facets are tangent to a paraboloid;
+- off-axis, for one moment: at that moment, and only then, every facet sends the centre of the sun
+  to the aim.
 """
 
 from dataclasses import replace
@@ -35,20 +37,20 @@ def canted(
     Parameters
     ----------
     mirrors
-        In their poses; their focal length becomes that of each facet's own curvature.
+        Mirrors in their poses; their focal length becomes that of each facet's own curvature.
     facets
         Columns and rows, 1 to 50 each.
     canting
-        Focal length on axis, m (infinity: none); "slant": each mirror's distance to its aim; or
-        the sun for which they are canted off axis, unit vector, (3,).
+        On-axis focal length, m (infinity: no canting); "slant": each mirror's distance to its aim;
+        or the sun vector for which they are canted off-axis, (3,).
     plant, aim
-        Plant whose heliostats the mirrors are, and their aim points, for canting off axis.
+        Plant that the mirrors belong to, and its aim points, for off-axis canting.
 
     Raises
     ------
     InputError
-        If the numbers are out of range, a heliostat cannot reach its aim at the sun of canting, or
-        the plant is missing.
+        If the numbers are out of range, a heliostat cannot reach its aim at the canting sun
+        position, or the plant is missing.
     """
     columns, rows = facets
     if not (1 <= columns <= 50 and 1 <= rows <= 50):

@@ -1,9 +1,9 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""The share of each cell of a grid that polygons cover, exactly.
+"""The fraction of each grid cell that polygons cover, computed exactly.
 
-Cell ``[i, j]`` reaches from ``j - 1/2`` to ``j + 1/2`` across and from ``i - 1/2`` to ``i + 1/2``
-down: the centres of cells are whole numbers.
+Cell ``[i, j]`` extends from ``j - 1/2`` to ``j + 1/2`` horizontally and from ``i - 1/2`` to ``i +
+1/2`` downwards, so cell centres have integer coordinates.
 """
 
 import math

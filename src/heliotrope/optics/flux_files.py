@@ -1,10 +1,10 @@
-"""Files of the flux and the efficiencies of a plant, for people and for other programs.
+"""Files with the flux and the efficiencies of a plant, for people and for other programs.
 
-- `write_heliostats`: one line for each heliostat, with SolarPILOT's names of the columns.
-- `write_map`: the flux on the receivers, one line for each cell.
-- `write_netcdf`: both in one NetCDF file (classic format), as xarray and others read it.
-- `write_sam`: the optical efficiency over the sun's positions as SAM takes it.
-- `write_solartherm`: the same as SolarTherm takes it.
+- `write_heliostats`: one line per heliostat, with SolarPILOT's column names.
+- `write_map`: the flux on the receivers, one line per cell.
+- `write_netcdf`: both in one NetCDF file (classic format), readable by xarray and other tools.
+- `write_sam`: the optical efficiency over the sun positions, in SAM's format.
+- `write_solartherm`: the same in SolarTherm's format.
 """
 
 import io
@@ -28,21 +28,21 @@ HELIOSTAT_COLUMNS = (
 
 
 def write_heliostats(path: str | Path, found: PlantFlux, year: FluxTable | None = None) -> None:
-    """Write a table (CSV) of the heliostats' efficiencies; empty cells are unknown.
+    """Write a table (CSV) of heliostat efficiencies; empty cells are unknown values.
 
     Parameters
     ----------
     path
         File.
     found
-        Efficiencies at one sun.
+        Efficiencies at one sun position.
     year
-        Of the same plant: gives the column ``Annual efficiency``.
+        Table of the same plant, for the column ``Annual efficiency``.
 
     Notes
     -----
-    "Blocking" and "Shading" are shares of their own, and "Shading and blocking" that of their
-    exact union, which is what the total counts.
+    "Blocking" and "Shading" are computed separately; "Shading and blocking" is that of their exact
+    union, which enters the total.
     """
     e = found.efficiencies
     columns: list[FloatArray] = [
@@ -148,9 +148,9 @@ def _put(
 
 
 def write_sam(path: str | Path, table: FluxTable) -> None:
-    """Write a table over the sun's positions as SAM takes it for a power tower (CSV).
+    """Write a table over sun positions in SAM's format for power towers (CSV).
 
-    Each line has the sun's azimuth (clockwise from north) and zenith angle in degrees, and the
+    Each line contains the sun's azimuth (clockwise from north) and zenith angle in degrees, and the
     optical efficiency of the field, without a header: the matrix ``eta_map`` of SSC's
     ``csp_solver_pt_sf_perf_interp``.
     """
@@ -160,10 +160,11 @@ def write_sam(path: str | Path, table: FluxTable) -> None:
 
 
 def write_solartherm(path: str | Path, table: FluxTable) -> None:
-    """Write a table over a year as SolarTherm reads it (.motab).
+    """Write a table over a year in SolarTherm's format (.motab).
 
-    The table ``optics`` has the declination down and the hour angle across, in degrees, as its
-    ``Solar_angles.dec_hra``; the efficiency is 0 where the sun stands below 2°.
+    The table ``optics`` has the declination along rows and the hour angle along columns, in
+    degrees, as in SolarTherm's ``Solar_angles.dec_hra``; the efficiency is 0 where the sun is below
+    2°.
 
     Raises
     ------

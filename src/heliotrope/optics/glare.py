@@ -1,17 +1,18 @@
-"""Glare: the effect of heliostats' beams on an eye. For information only.
+"""Glare: the effect of heliostat beams on the eye. For information only.
 
-The form is that of Ho, Ghanbari and Diver, "Methodology to assess potential glint and glare hazards
-from concentrating solar power plants", J. Sol. Energy Eng. 133 (2011) 031021. Their text has not
-been read: formulae and constants come from later descriptions and carry no equation numbers; the
-tests hold one anchor, a look at the bare sun. No decision of the plant rests on this module: where
-people may look into beams it asks for less than one sun (`heliotrope.plant.field.aims.MOST_SUNS`).
-Do not approve a place for people by these figures. Inside, irradiances are in W/m² (the paper:
-W/cm², 1 W/cm² = 10⁴ W/m²).
+The method has the form of Ho, Ghanbari and Diver, "Methodology to assess potential glint and glare
+hazards from concentrating solar power plants", J. Sol. Energy Eng. 133 (2011) 031021. We have not
+read the paper itself: formulae and constants come from later descriptions and carry no equation
+numbers, and the tests check only one reference case, a look at the bare sun. No decision of the
+plant rests on this module: where people may look into beams, the plant requires less than one sun
+(`heliotrope.plant.field.aims.MOST_SUNS`). Do not approve a place for people on the basis of these
+figures. Internally, irradiances are in W/m² (in the paper: W/cm², 1 W/cm² = 10⁴ W/m²).
 
-Limits. The thresholds are for a short look (0.15 s, the blink) through the naked eye in
-daylight: not for binoculars, telescopes or cameras, and not for a forced stare. The sun is a
-uniform disk; its centre is about a fifth brighter than its mean. Mirrors are disks with an
-ideal focus and no slope error, which errs to the safe side. Attenuation in air is ignored.
+Limits. The thresholds apply to a short look (0.15 s, the blink reflex) with the naked eye in
+daylight; they do not apply to binoculars, telescopes or cameras, nor to a forced stare. The sun is
+modelled as a uniform disk; its centre is in fact about a fifth brighter than its mean. Mirrors are
+disks with an ideal focus and no slope error, which errs on the safe side. Atmospheric attenuation
+is ignored.
 """
 
 import math
@@ -37,7 +38,7 @@ SMALLEST = 1e-6
 
 @dataclass(frozen=True)
 class Eye:
-    """An eye: pupil (m; daylight adjusted), focal length (m), transmission of its media."""
+    """An eye: pupil (m; daylight adapted), focal length (m), transmittance of the ocular media."""
 
     pupil: float = 2e-3
     focal_length: float = 17e-3
@@ -52,7 +53,7 @@ class Eye:
             raise InputError(f"eye: transmission {self.transmission} must be above 0, at most 1")
 
 
-#: The eye of the paper.
+#: The eye assumed in the paper.
 DAYLIGHT = Eye()
 
 
@@ -114,17 +115,17 @@ def flash_threshold(subtended: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True)
 class Glare:
-    """The exposure of an eye at each place (...).
+    """The exposure of an eye at each location (...).
 
     Attributes
     ----------
     burn, flash
-        Retinal irradiance over the thresholds of damage and of an after-image; 1 is at the
+        Retinal irradiance divided by the thresholds of damage and of an after-image; 1 is at the
         threshold.
     corneal
         Irradiance of all sources together at the eye, W/m².
     subtended
-        Full angle of a disk as large as all sources together, rad; 0 without sources.
+        Full angle of a disk with the solid angle of all sources together, rad; 0 without sources.
     """
 
     burn: FloatArray
@@ -134,7 +135,7 @@ class Glare:
 
     @property
     def hazard(self) -> npt.NDArray[np.int8]:
-        """`Hazard` as integers; at a threshold counts as above it."""
+        """`Hazard` as integers; a value at a threshold counts as above it."""
         worse = np.where(self.flash >= 1.0, Hazard.AFTER_IMAGE, Hazard.LOW)
         return np.asarray(np.where(self.burn >= 1.0, Hazard.DAMAGE, worse), dtype=np.int8)
 
@@ -150,9 +151,9 @@ def glare_of_one(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DA
 def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DAYLIGHT) -> Glare:
     """Return an upper bound of the hazard of several sources seen at once.
 
-    Images of sources that lie side by side may touch on the retina and heat it as one. Their
-    arrangement is not considered: the worst selection counts, as one disk with the sum of
-    their solid angles. A further source can only add.
+    Images of sources that lie side by side may touch on the retina and heat it as one. The
+    arrangement of the sources is not considered: the worst selection counts, as one disk with the
+    sum of their solid angles. An additional source can only increase the bound.
 
     Parameters
     ----------
@@ -162,11 +163,11 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
 
     Notes
     -----
-    Of all selections with the solid angle W (in units of ω²) none has more irradiance than
-    g(W), that of the brightest first, a source's fraction included: concave and linear
-    between its corners. Both thresholds depend on g and W as g / W^a with a constant a from 0
-    to 1, which on a line has no maximum but at its ends; a changes at ω = 0.118 rad only. So
-    the corners and that point hold the maximum, in N log N.
+    Of all selections with solid angle W (in units of ω²), none has more irradiance than g(W), the
+    selection of the brightest sources first, including a fraction of the last source. g is concave
+    and piecewise linear. Both thresholds depend on g and W as g / W^a with a constant a from 0 to
+    1, which has no maximum in the interior of a linear piece; a changes only at ω = 0.118 rad. The
+    maximum is therefore at one of the corners or at that point, and is found in N log N.
     """
     e, w = np.broadcast_arrays(as_float(corneal), as_float(subtended))
     if e.ndim == 0 or not (np.isfinite(e).all() and np.isfinite(w).all()):
@@ -212,8 +213,8 @@ def glare_at(
 ) -> Glare:
     """Return the hazard to an eye at points (P, 3) that looks into the beams.
 
-    Each beam is a source as wide as the part of its mirror that shines: a mirror of
-    concentration C is seen under ω = 2 β √C, since it shows the sun at the sun's radiance.
+    Each beam is a source as wide as the part of its mirror in which the sun is visible. A mirror
+    with concentration C subtends ω = 2 β √C, since it shows the sun at the sun's radiance.
     """
     _irradiance(dni)
     concentration = crossing(given, points, dni=dni).concentration
@@ -229,11 +230,11 @@ def safe_range(
     reflectivity: float = 1.0,
     eye: Eye = DAYLIGHT,
 ) -> tuple[float, float]:
-    """Return the distances along one beam between which a look into it may burn, m.
+    """Return the range of distances along one beam where a look into it may burn, m.
 
-    (0, 0) if it nowhere does. On the axis the ratio to the threshold is K ω with
-    K = ρ DNI d² τ / (4 β² f² · 0.118 W/cm²) while ω < 0.118 rad, and ω = 2 min(R / x,
-    β / |1 − x/b|): it is reached where ω = 1 / K.
+    The range is (0, 0) if the beam burns nowhere. On the axis the ratio to the threshold is K ω
+    with K = ρ DNI d² τ / (4 β² f² · 0.118 W/cm²) while ω < 0.118 rad, and ω = 2 min(R / x, β / |1 −
+    x/b|); the threshold is reached where ω = 1 / K.
 
     Parameters
     ----------
@@ -269,8 +270,8 @@ class GlareMap:
     Attributes
     ----------
     right, up
-        From the point, to the right and upwards as seen from the side that the normal points
-        to (east and north in a horizontal plane), m, (W,) and (H,).
+        Offsets from the point, to the right and upwards as seen from the side that the normal
+        points to (east and north in a horizontal plane), m, (W,) and (H,).
     points
         ENU, m, (H, W, 3).
     glare
@@ -284,7 +285,7 @@ class GlareMap:
 
     @property
     def radius(self) -> float:
-        """Largest distance from the point at which a look may burn, m; 0 if nowhere."""
+        """Largest distance from the point at which a look may burn, m; 0 if it burns nowhere."""
         bad = self.glare.hazard == Hazard.DAMAGE
         away = np.hypot(*np.meshgrid(self.right, self.up))
         return float(np.max(np.where(bad, away, 0.0)))
@@ -305,15 +306,15 @@ def glare_map(
     Parameters
     ----------
     given
-        Beams that stand by there, and any others.
+        Beams at standby there, and any other beams.
     center
         ENU, m, (3,).
     size
         Side of the square, m.
     cells
-        Points on a side, at least 2.
+        Number of grid points per side, at least 2.
     normal
-        Normal of its plane, (3,).
+        Normal of the plane of the square, (3,).
     dni
         W/m².
     eye
@@ -346,19 +347,19 @@ def safe_distance(
     dni: float = NOMINAL_DNI,
     eye: Eye = DAYLIGHT,
 ) -> float:
-    """Return the radius about a standby point beyond which no beam's axis reaches ``limit``.
+    """Return the radius about a standby point beyond which no beam axis reaches ``limit``.
 
-    The axes of all beams are sampled on both sides of the point, where a beam is strongest.
-    Points between the axes are not sampled; `glare_map` covers them.
+    The axes of all beams are sampled on both sides of the point, where a beam is strongest. Points
+    between the axes are not sampled; `glare_map` covers them.
 
     Parameters
     ----------
     given
-        Beams that stand by there.
+        Beams at standby there.
     center
         ENU, m, (3,).
     limit
-        Hazard that must not occur outside.
+        Hazard that must not occur outside the radius.
     reach, step
         Largest distance from the point, and spacing of the samples, m.
     dni

@@ -1,17 +1,18 @@
-r"""Intercept: the share of a heliostat's beam that falls into the receiver's aperture.
+r"""Intercept: the fraction of a heliostat's beam that enters the receiver aperture.
 
 Two models:
 
-- `intercept_circle` and `intercept_rectangle`, ours: the beam is Gaussian, with the standard
-  deviation σ of `beam_sigma` on the plane of the aperture. A centred circle of radius R takes up
-  $1 - \exp(-R^2 / 2 σ^2)$. Every σ is a standard deviation *per axis*; the two-dimensional RMS is
-  √2 times as large.
-- `intercept_disks`, Malan's (3.2)-(3.3): the beam is a disk of even strength, and the aperture the
-  same disk about the aim.
+- `intercept_circle` and `intercept_rectangle`, our own: the beam is Gaussian, with the standard
+  deviation σ of `beam_sigma` on the aperture plane. A centred circle of radius R intercepts $1 -
+  \exp(-R^2 / 2 σ^2)$. Every σ is a standard deviation *per axis*; the two-dimensional RMS is √2
+  times as large.
+- `intercept_disks`, Malan's (3.2)-(3.3): the beam is a disk of uniform irradiance, and the aperture
+  is the same disk about the aim.
 
-Use the Gaussian: a ray trace (`examples/malan_intercept.py`) agrees with it to 0.7 percentage
-points. In the aperture that (3.2) prints, an error of 1 mrad costs 0.4 points by the ray trace and
-10.3 by the disks: a beam of even strength loses at the rim at once, and a real beam is weak there.
+Use the Gaussian model: a ray trace (`examples/malan_intercept.py`) agrees with it to 0.7 percentage
+points. For the aperture in (3.2) as printed, an error of 1 mrad costs 0.4 points according to the
+ray trace and 10.3 according to the disk model, because a uniform beam loses power at the rim at
+once, whereas a real beam is weak at its rim.
 """
 
 import numpy as np
@@ -35,20 +36,20 @@ def intercept_circle(
     right: npt.ArrayLike = 0.0,
     up: npt.ArrayLike = 0.0,
 ) -> FloatArray:
-    """Return the share of a Gaussian beam that falls into a circle, 0 to 1, (...).
+    """Return the fraction of a Gaussian beam that falls into a circle, 0 to 1, (...).
 
     Parameters
     ----------
     radius
         Radius of the aperture, m, (...).
     sigma
-        Standard deviation per axis of the beam on the aperture's plane, m, (...), as
-        `beam_sigma` gives it; with ``sigma_up`` that of the horizontal axis.
+        Standard deviation per axis of the beam on the aperture plane, m, (...), as returned by
+        `beam_sigma`; with ``sigma_up`` that of the horizontal axis.
     sigma_up
-        That of the other axis if the beam is elliptical, m, (...).
+        That of the vertical axis if the beam is elliptical, m, (...).
     right, up
-        Centre of the beam from the centre of the aperture, m, (...), such as
-        ``image_offsets(...).right``. NaN gives NaN.
+        Beam centre relative to the aperture centre, m, (...), such as ``image_offsets(...).right``.
+        NaN yields NaN.
 
     Raises
     ------
@@ -57,10 +58,10 @@ def intercept_circle(
 
     Notes
     -----
-    A centred circular beam gives 1 − exp(−R²/2σ²); an offset one
-    the distribution of Rice, which is the non-central χ² with two degrees of freedom. All
-    are computed by one Gauss-Legendre integral: within 1e-10 up to R = 200 σ for elliptical
-    beams, and for circular ones within 1e-11 of SciPy's ``chndtr``, which ends at R = 10⁵ σ.
+    A centred circular beam follows 1 − exp(−R²/2σ²); an offset beam follows the Rice distribution,
+    which is the non-central χ² with two degrees of freedom. All cases are computed by one
+    Gauss-Legendre integral: within 1e-10 up to R = 200 σ for elliptical beams, and for circular
+    beams within 1e-11 of SciPy's ``chndtr``, which is limited to R = 10⁵ σ.
     """
     r = checked("radius", radius, "m", positive=True)
     s = checked("sigma", sigma, "m", positive=True)
@@ -83,7 +84,7 @@ def intercept_disks(
 ) -> FloatArray:
     r"""Return Malan's intercept ratio, normalised for slant, 0 to 1, (...).
 
-    Two equal disks, R = 2 d q in radius with q = θ_s / 2 + σ_slope and D = 2 d θ_t apart,
+    Two equal disks of radius R = 2 d q, with q = θ_s / 2 + σ_slope, at a distance D = 2 d θ_t
     overlap by
 
     $$\frac{2}{\pi}\left(\arccos x - x \sqrt{1 - x^2}\right), \qquad
@@ -94,9 +95,9 @@ def intercept_disks(
     tracking
         θ_t, tracking error of the normal as an offset, rad, (...).
     slope
-        Mean slope error of the mirror's surface, rad, (...).
+        Mean slope error of the mirror surface, rad, (...).
     sun_angle
-        θ_s, the angle that the sun's disk subtends, rad, (...).
+        θ_s, the angle that the solar disk subtends, rad, (...).
 
     Raises
     ------
@@ -105,9 +106,9 @@ def intercept_disks(
 
     Notes
     -----
-    Malan (3.2)-(3.3) as printed: 92.2 % at 0.75 mrad and 89.7 % at 1 mrad with his 9.3 mrad and
-    1.5 mrad. For a perfect mirror his R is d θ_s, which his text calls the diameter of the smallest
-    image; its radius is half of it.
+    Malan (3.2)-(3.3) as printed: 92.2 % at 0.75 mrad and 89.7 % at 1 mrad with his 9.3 mrad and 1.5
+    mrad. For a perfect mirror his R is d θ_s, which his text calls the diameter of the smallest
+    image; its radius is half of that.
     """
     t = checked("tracking", tracking, "rad")
     q = checked("sun_angle", sun_angle, "rad") / 2.0 + checked("slope", slope, "rad")
@@ -126,7 +127,7 @@ def intercept_rectangle(
     right: npt.ArrayLike = 0.0,
     up: npt.ArrayLike = 0.0,
 ) -> FloatArray:
-    """Return the share of a Gaussian beam that falls into a rectangle, 0 to 1, (...).
+    """Return the fraction of a Gaussian beam that falls into a rectangle, 0 to 1, (...).
 
     Parameters
     ----------
@@ -142,7 +143,7 @@ def intercept_rectangle(
 
     Notes
     -----
-    The product of two one-dimensional shares, each a difference of error functions; exact.
+    The product of two one-dimensional fractions, each a difference of error functions; exact.
     """
     w = checked("width", width, "m", positive=True)
     h = checked("height", height, "m", positive=True)

@@ -1,12 +1,11 @@
-"""Beams and keep-out volumes: which beams enter them, at rest and in motion, and the safe way.
+"""Beams and keep-out volumes: which beams enter them, at rest and in motion; the safe path.
 
-A beam is followed as a solid of revolution about its axis that surely holds it: as wide as
-the mirror's diagonal, widening by the sun's radius and a stated error, and further beyond
-the mirror's focus (see `_keep_out_kernels`). "Clear" is therefore proven; "enters" means
-that this solid comes within a millimetre of the volume. The solid is made of balls, so it
-extends half a mirror's diagonal beyond both ends: a volume within the swing of a mirror
-counts as entered. Nothing shades a beam here, neither the ground nor other mirrors nor the
-tower.
+A beam is modelled as a solid of revolution about its axis that is guaranteed to contain the beam:
+as wide as the mirror diagonal, widening by the sun's radius and a stated error, and further beyond
+the focus of the mirror (see `_keep_out_kernels`). "Clear" is therefore proven, whereas "enters"
+means that this solid comes within a millimetre of the volume. The solid is made of spheres, so it
+extends half a mirror diagonal beyond both ends, and a volume within the swing of a mirror counts as
+entered. Nothing shades a beam in this model, neither the ground nor other mirrors nor the tower.
 """
 
 from collections.abc import Sequence
@@ -63,7 +62,7 @@ class Entries:
     Attributes
     ----------
     volumes
-        Names, V of them.
+        Names of the V volumes.
     first, last
         Distances along the beam of the first and last contact, m, (N, V).
     point
@@ -86,7 +85,7 @@ class Entries:
 
 
 def find_entries(given: Beams, volumes: Sequence[Volume], *, dni: float = NOMINAL_DNI) -> Entries:
-    """Return where beams at rest enter volumes, and their irradiance there.
+    """Return where beams at rest enter volumes, and the irradiance there.
 
     Parameters
     ----------
@@ -127,19 +126,19 @@ class Sweep:
     Attributes
     ----------
     volumes
-        Names, V of them.
+        Names of the V volumes.
     at
-        End of the clear part of the path: index of its corner plus share of the next leg,
-        (N, V).
+        End of the clear part of the path: index of its corner plus fraction of the next leg, (N,
+        V).
     distance
-        Along the beam to the contact, m, (N, V).
+        Distance along the beam to the contact, m, (N, V).
     point
         Point on the axis at the contact, ENU, (N, V, 3).
     irradiance
         Largest value on the axis within the volume in that pose, W/m², (N, V); 0 where
         clear.
     poses
-        Number of poses tried for all pairs together.
+        Number of poses tested for all pairs together.
     """
 
     volumes: tuple[str, ...]
@@ -168,25 +167,25 @@ def sweep(
 ) -> Sweep:
     """Return where beams enter volumes while the joints move along a path.
 
-    The whole path is proven, not samples of it: see `_keep_out_kernels`. Where no proof is
-    found at the given resolution, the beam counts as entering.
+    The check covers the whole path, not samples of it; see `_keep_out_kernels`. If the path cannot
+    be proven clear at the given resolution, the beam counts as entering.
 
     Parameters
     ----------
     armatures
-        (N,) or ().
+        Mechanisms, (N,) or ().
     path
-        Joint angles of the corners, rad, (N, K, 2) or (K, 2). On each leg both joints move
-        in proportion; if one arrives before the other, that is a further corner.
+        Joint angles of the corners, rad, (N, K, 2) or (K, 2). On each leg both joints move in
+        proportion; if one joint arrives before the other, add a corner at that point.
     sun
-        Unit vector to the sun, (3,) or (N, 3); its motion meanwhile belongs to the mirrors'
-        ``error``.
+        Unit vector to the sun, (3,) or (N, 3); the sun's motion during the sweep must be included
+        in the mirrors' ``error``.
     mirrors, volumes
-        N or one; V.
+        N mirrors or one; V volumes.
     reach
         Distance up to which beams are followed, m.
     resolution
-        Turn of the beam below which a span of the path is not split further, rad.
+        Rotation of the beam below which a span of the path is not split further, rad.
     dni
         W/m².
 
@@ -246,22 +245,22 @@ def _leaving(
 
 @dataclass(frozen=True)
 class Way:
-    """The way of one heliostat from stow to its standby point.
+    """The path of one heliostat from stow to its standby point.
 
     Attributes
     ----------
     aims
-        Along the ground to the foot of the tower and up, ENU, m, (K, 3).
+        Aim points along the ground to the foot of the tower and up, ENU, m, (K, 3).
     path
-        Joint angles, rad, (M, 2): stow; azimuth turned; elevation turned to the first aim;
-        then the aims.
+        Joint angles, rad, (M, 2): stow; azimuth at its goal; elevation at the first aim; then the
+        aims.
     clear
-        Whether every beam on it is proven to stay out of every volume, and every aim is
+        Whether every beam on the path is proven to stay out of every volume, and every aim is
         reachable.
     motion
-        Result of the check.
+        Result of the keep-out check.
     text
-        One line for an operator.
+        One line for the operator.
     """
 
     aims: FloatArray
@@ -274,7 +273,7 @@ class Way:
     def back(self) -> FloatArray:
         """The same poses in reverse, rad, (M, 2): down, away, elevation, azimuth last.
 
-        They are proven for the sun of the check; hours later a new way is needed.
+        They are proven for the sun position of the check only; hours later a new path is needed.
         """
         return self.path[::-1]
 
@@ -284,7 +283,7 @@ def ground_way(
 ) -> FloatArray:
     """Return aims (K, 3) along straight lines from ``first`` to ``foot`` to ``standby``.
 
-    Neighbours are at most 20 mrad apart as seen from the vertex; all (3,), ENU metres.
+    Successive aims are at most 20 mrad apart as seen from the vertex; all (3,), ENU metres.
     """
     m = as_vectors(vertex, "vertex")
     corners = [as_vectors(p, "aim") for p in (first, foot, standby)]
@@ -314,14 +313,14 @@ def safe_way(
     first_distance: float = 10.0,
     reach: float = REACH,
 ) -> Way:
-    """Return the way of one heliostat from stow to its standby point, verified.
+    """Return the verified path of one heliostat from stow to its standby point.
 
-    From stow the azimuth turns first, then the elevation, until the beam meets the ground
-    ``first_distance`` away; the beam then goes along the ground to the foot of the tower and
-    up. The first point is tried towards the foot, then further and further to both sides:
-    turning the elevation moves the beam through the vertical plane of that point, which
-    misses the tower if the point lies to its side. The first clear way is returned, else the
-    one that gets furthest, with the obstacle.
+    From stow the azimuth moves first, then the elevation, until the beam meets the ground
+    ``first_distance`` away; the beam then travels along the ground to the foot of the tower and up.
+    The first ground point is tried in the direction of the foot, then at increasing angles to both
+    sides. As the elevation moves, the beam sweeps the vertical plane through that point, which
+    misses the tower if the point is to one side of it. The first clear path is returned; if there
+    is none, the path that gets furthest is returned with the obstacle.
 
     Parameters
     ----------
@@ -332,13 +331,14 @@ def safe_way(
     sun
         Unit vector to the sun, (3,).
     foot, standby
-        Point on the ground where beams begin to rise, and their end, ENU, m, (3,).
+        Point on the ground where beams begin to rise, and the standby point where they end, ENU, m,
+        (3,).
     mirrors
         One mirror.
     volumes
         Volumes that no beam may enter.
     drives
-        Drives of the two joints, for their stops; default none.
+        Drives of the two joints, for their stops; default no stops.
     first_distance
         m.
     reach

@@ -1,4 +1,4 @@
-"""The flux of a heliostat's beam on a target's plane, with its exact centroid."""
+"""The flux of a heliostat beam on the target plane, with its exact centroid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,18 +35,18 @@ _ALIGNED = 1e-6
 
 @dataclass(frozen=True)
 class Beam:
-    """Flux on a grid in a target's plane, bilinear between samples and 0 beyond them.
+    """Flux on a grid in the target plane, bilinear between samples and 0 beyond them.
 
     The bilinear surface has exactly the power and the centroid of the samples.
 
     Attributes
     ----------
     flux
-        W/m², rows upwards and columns to the right as seen from the target's front, (H, W).
+        W/m², rows upwards and columns to the right as seen from the front of the target, (H, W).
     step
-        Between samples, m.
+        Spacing of the samples, m.
     origin
-        Place of sample [0, 0], metres right of and above the target's centre, (2,).
+        Position of sample [0, 0], metres to the right of and above the target centre, (2,).
     """
 
     flux: FloatArray
@@ -75,7 +75,7 @@ class Beam:
         centre: npt.ArrayLike = (0.0, 0.0),
         power: float | None = None,
     ) -> "Beam":
-        """Return the beam in a picture taken from the target's front, at a right angle.
+        """Return the beam from a picture taken from the front of the target, at normal view.
 
         Parameters
         ----------
@@ -84,9 +84,9 @@ class Beam:
         metres_per_pixel
             Size of a pixel on the target.
         centre
-            Middle of the picture, metres right of and above the target's centre.
+            Middle of the picture, metres to the right of and above the target centre.
         power
-            W, to which it is scaled; None: the picture is in W/m².
+            Power in W to which the picture is scaled; None: the picture is in W/m².
         """
         flux = as_float(image)
         if flux.ndim != 2:
@@ -97,12 +97,13 @@ class Beam:
 
     @classmethod
     def together(cls, beams: Sequence["Beam"]) -> "Beam":
-        """Return the light of one or more beams as one, on a grid that holds all of them.
+        """Return the sum of one or more beams as one beam, on a grid that contains all of them.
 
         Raises
         ------
         InputError
-            Their samples do not fall on one grid, as those of `reflected_beam` with one step do.
+            If their samples do not lie on a common grid, as those of `reflected_beam` with one step
+            do.
         """
         step = beams[0].step
         places = np.array([beam.origin for beam in beams]) / step
@@ -125,12 +126,12 @@ class Beam:
 
     @cached_property
     def peak(self) -> float:
-        """Greatest flux, W/m²."""
+        """Maximum flux, W/m²."""
         return float(self.flux.max())
 
     @cached_property
     def centroid(self) -> FloatArray:
-        """Centre of the energy on the plane, also beyond the target, m, (2,)."""
+        """Centre of the energy on the plane, including light beyond the target, m, (2,)."""
         return _centroid(self.flux, self.origin, self.step)
 
     @cached_property
@@ -147,13 +148,13 @@ class Beam:
 
     @property
     def corners(self) -> FloatArray:
-        """Corners of its grid with a margin of one step, where its light ends, m, (4, 2)."""
+        """Corners of the beam's extent, the grid plus a margin of one step, m, (4, 2)."""
         rows, columns = self.flux.shape
         ends = np.array([(-1, rows), (columns, rows), (columns, -1), (-1, -1)], dtype=np.float64)
         return self.origin + ends * self.step
 
     def at(self, plane: npt.ArrayLike) -> FloatArray:
-        """Return the flux at points (..., 2) of the plane, W/m², (...)."""
+        """Return the flux at points (..., 2) in the plane, W/m², (...)."""
         from scipy.ndimage import map_coordinates
 
         place = (as_float(plane) - self.origin) / self.step
@@ -168,7 +169,7 @@ class Beam:
         return replace(self, origin=self.origin + as_float(by))
 
     def coarser(self, factor: int) -> "Beam":
-        """Return the beam with ``factor`` samples each way merged; power and centroid stay."""
+        """Return the beam with blocks of ``factor`` samples merged; power and centroid stay."""
         if factor < 2:
             return self
         rows, columns = (-(-n // factor) for n in self.flux.shape)
@@ -185,7 +186,8 @@ class Beam:
     def swept(self, motion: npt.ArrayLike) -> "Beam":
         """Return the mean over an exposure in which the beam moves by metres right and up (2,).
 
-        It moves evenly about its place in the middle of the exposure: the centroid stays.
+        The beam moves uniformly about its position in the middle of the exposure, so the centroid
+        stays.
         """
         from scipy.signal import fftconvolve
 
@@ -202,9 +204,9 @@ class Beam:
         return Beam(flux, self.step, self.origin - reach * self.step)
 
     def on_target(self, target: Target) -> tuple[float, FloatArray]:
-        """Return the share of the energy that falls on a target, and its centroid, m, (2,).
+        """Return the fraction of the energy that falls on a target, and its centroid, m, (2,).
 
-        The centroid is NaN if there is none. Samples at the border count in part.
+        The centroid is NaN if that fraction is zero. Samples at the border count in part.
         """
         inside = coverage(
             [(target.plane_coordinates(target.corners) - self.origin) / self.step],
@@ -230,15 +232,15 @@ def gaussian_beam(
     Parameters
     ----------
     centre
-        Metres right of and above the target's centre, (2,).
+        Metres to the right of and above the target centre, (2,).
     sigma_major, sigma_minor
-        Standard deviations along its axes, m; a circle if only one is given.
+        Standard deviations along its axes, m; a circle if only one is specified.
     angle
         Angle of the major axis from the right, counterclockwise as seen from the front, rad.
     power
         W.
     step
-        Step of the grid, m; default a twelfth of the smaller σ.
+        Grid step, m; default a twelfth of the smaller σ.
     """
     minor = sigma_major if sigma_minor is None else sigma_minor
     _above_zero("gaussian beam: sigma_major", sigma_major, "m")
@@ -270,17 +272,17 @@ def flat_top_beam(
     Parameters
     ----------
     centre
-        Metres right of and above the target's centre, (2,).
+        Metres to the right of and above the target centre, (2,).
     width, height
-        Sides, or diameters, m; a square or a circle if only one is given.
+        Sides, or diameters, m; a square or a circle if only one is specified.
     angle
-        Turn, counterclockwise as seen from the front, rad.
+        Rotation, counterclockwise as seen from the front, rad.
     power
         W.
     step
-        Step of the grid, m; default a sixtieth of the smaller side. The border is one step wide.
+        Grid step, m; default a sixtieth of the smaller side. The border is one step wide.
     round_
-        Ellipse instead of rectangle.
+        Whether the beam is an ellipse instead of a rectangle.
     """
     tall = width if height is None else height
     _above_zero("flat-top beam: width", width, "m")
@@ -328,56 +330,56 @@ def reflected_beam(
     Parameters
     ----------
     target
-        The beam falls on its plane; light beyond the border is kept.
+        The target; the beam falls on its plane, and light beyond the border is kept.
     mirror_center
         ENU metres, (3,).
     sun
         Unit vector to the sun, ENU, (3,).
     width, height
-        Size of the mirror, m; ignored if facets are given.
+        Size of the mirror, m; ignored if facets are specified.
     aim
-        ENU metres, (3,); default: the target's centre. Sets the normal by the bisector law.
+        ENU metres, (3,); default: the target centre. Determines the normal as the bisector.
     normal
         The mirror's unit normal, ENU, (3,), instead of an aim.
     R_enu_mirror
-        Instead of both: columns x (right), y (up) and z (normal) of the mirror, (3, 3).
-        Without it, x is horizontal.
+        Instead of aim and normal: columns x (right), y (up) and z (normal) of the mirror, (3, 3).
+        By default, x is horizontal.
     facets
-        Columns and rows of equal facets without gaps, or the facets of one heliostat with
-        their own tilts.
+        Columns and rows of equal facets without gaps, or the facets of one heliostat with their own
+        tilts.
     focal
-        Distance of the focus towards which the facets are tilted, m; None: the slant range;
-        infinity: no tilt.
+        Distance of the focus towards which the facets are canted, m; None: the slant range;
+        infinity: no canting.
     facet_focal
         Focal length of each facet's own curvature, m; None: as ``focal``, infinity: flat.
     slope_error
-        Standard deviation of the surface's normal per axis, rad.
+        Standard deviation of the surface normal per axis, rad.
     sun_shape
-        "pillbox", "limb" or "quartic" (darkened towards the limb), or "buie" (with an aureole).
+        "pillbox", "limb" or "quartic" (limb darkening), or "buie" (with aureole).
     circumsolar
-        Parameter χ of Buie's shape, nearly the circumsolar ratio, 0.01 to 0.8.
+        Parameter χ of Buie's shape, approximately the circumsolar ratio, 0.01 to 0.8.
     reflectivity, dni
-        Share and W/m². Their product with the area and the cosine of incidence is the power;
-        atmospheric extinction is not included.
+        Reflectivity (0 to 1) and irradiance (W/m²). Their product with the area and the cosine of
+        incidence is the power; atmospheric attenuation is not included.
     neighbours
-        Mirrors that shade and block elements of this one; None: none does.
+        Mirrors that shade and block elements of this mirror; None: no shading or blocking.
     step
-        Step of the grid, m.
+        Grid step, m.
     elements
-        Each facet is divided into the square of this number.
+        Each facet is divided into the square of this number of elements.
 
     Raises
     ------
     InputError
-        If a value is invalid, sun or target are behind the mirror, the mirror is behind the
-        target, its neighbours hide all of it, or the grid would have more than 4096 samples along
-        a side.
+        If a value is invalid, the sun or the target is behind the mirror, the mirror is behind the
+        target, its neighbours hide all of it, or the grid would have more than 4096 samples per
+        side.
 
     Notes
     -----
-    The central ray of each element is exact. The spread around it is the same for the whole
-    beam and linear in the angles. With an angle φ between beam and target normal, this neglects
-    a shift of about d tan φ / cos φ · σ² (0.4 mm at d = 200 m, φ = 30°, σ = 1.7 mrad).
+    The central ray of each element is exact. The spread around it is the same for the whole beam
+    and linear in the angles. At an angle φ between the beam and the target normal, this neglects a
+    shift of about d tan φ / cos φ · σ² (0.4 mm at d = 200 m, φ = 30°, σ = 1.7 mrad).
     """
     _reflection_guards(slope_error, sun_shape, circumsolar, reflectivity, dni, step, elements)
     center = _vector(mirror_center, "mirror_center")

@@ -14,7 +14,7 @@ def mirror_axes(normal: FloatArray) -> FloatArray:
 
 
 def equal_facets(width: float, height: float, count: tuple[int, int], focal: float) -> Facets:
-    """Return equal facets of one mirror, tilted towards a focus; (1, F, 3).
+    """Return equal facets of one mirror, canted towards a focus; (1, F, 3).
 
     Parameters
     ----------
@@ -23,8 +23,8 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
     count
         Columns and rows.
     focal
-        Distance of the focus, m; infinity: all in one plane. Centres lie on the paraboloid
-        z = (x² + y²) / 4f, to which each facet is tangent at its centre.
+        Distance of the focus, m; infinity: all in one plane. The centres lie on the paraboloid z =
+        (x² + y²) / 4f, to which each facet is tangent at its centre.
     """
     for name, side in (("width", width), ("height", height)):
         if not (np.isfinite(side) and side > 0.0):

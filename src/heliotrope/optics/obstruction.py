@@ -1,9 +1,10 @@
-"""Shading and blocking by neighbours, and how far they move the centroid of a beam.
+"""Shading and blocking by neighbours, and how far they shift the centroid of a beam.
 
-A neighbour shades an element of a mirror if it is between the element and the sun, and blocks
-it if it is in the path of the reflected ray. The rest of the mirror has another middle. A
-flat mirror's beam moves by as much; the beam of a mirror that is focused on the target hardly moves
-while light comes along the axis, and moves by a part of it at an angle, where it is astigmatic.
+A neighbour shades an element of a mirror if it stands between the element and the sun, and blocks
+it if it stands in the path of the reflected ray. The unobstructed part of the mirror has a
+different centre. The beam of a flat mirror shifts by the same amount. The beam of a mirror focused
+on the target hardly shifts while light arrives along the axis; at oblique incidence, where the
+mirror is astigmatic, the beam shifts by a fraction of that amount.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ _ROOM = 0.1
 
 
 def nearest(places: FloatArray, count: int = NEAREST) -> npt.NDArray[np.intp]:
-    """Return the rows of the nearest other places of each place (N, 3), (N, J)."""
+    """Return the indices of the J nearest neighbours of each position (N, 3), (N, J)."""
     most = min(count + 1, len(places))
     neighbours = np.asarray(cKDTree(places).query(places, k=most)[1]).reshape(len(places), most)
     return np.asarray(neighbours[:, 1:], dtype=np.intp)
@@ -32,7 +33,7 @@ def nearest(places: FloatArray, count: int = NEAREST) -> npt.NDArray[np.intp]:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """J flat mirrors beside another one; their upper edges are level.
+    """J flat mirrors beside another mirror; their upper edges are level.
 
     Attributes
     ----------
@@ -48,7 +49,7 @@ class Neighbours:
     height: FloatArray
 
     def hide(self, points: FloatArray, way: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return the mask of points whose ray the neighbours block, (E,).
+        """Return the mask of points whose ray the neighbours obstruct, (E,).
 
         Parameters
         ----------
@@ -71,7 +72,7 @@ class Neighbours:
         return np.asarray(within.any(axis=1))
 
     def of(self, chosen: npt.NDArray[np.bool_]) -> "Neighbours":
-        """Return the chosen neighbours, (J,)."""
+        """Return the selected neighbours, (J,)."""
         return Neighbours(
             self.center[chosen], self.normal[chosen], self.width[chosen], self.height[chosen]
         )
@@ -79,16 +80,17 @@ class Neighbours:
     def before(
         self, center: FloatArray, normal: FloatArray, size: tuple[float, float], *ways: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return the mask of neighbours that may hide a part of a mirror, (J,): a quick check.
+        """Return the mask of neighbours that may hide part of a mirror, (J,): a quick check.
 
-        Their corners are projected into the mirror's plane, where their boxes must touch its own.
+        The neighbours' corners are projected into the mirror plane, where their bounding boxes must
+        overlap the mirror's.
 
         Parameters
         ----------
         center, normal
-            Middle of the mirror, ENU metres, and its unit normal, (3,).
+            Centre of the mirror, ENU metres, and its unit normal, (3,).
         size
-            Its width and height, m.
+            Width and height of the mirror, m.
         ways
             Unit vectors to the sun and to the target, (3,) each.
         """
@@ -115,11 +117,11 @@ class CentroidShift:
     Attributes
     ----------
     shift
-        Centroid with neighbours less that without, right and up on the target's plane, m, (2,);
+        Centroid with neighbours minus centroid without, right and up on the target plane, m, (2,);
         NaN if they hide the whole mirror.
     shaded, blocked, hidden
-        Shares of the mirror's area: without sun, in whose way to the target something stands, and
-        either.
+        Fractions of the mirror area that are shaded, that are blocked on the way to the target, and
+        that are either.
     """
 
     shift: FloatArray
@@ -139,29 +141,29 @@ def centroid_shift(
     facet_focal: float = np.inf,
     elements: int = 12,
 ) -> CentroidShift:
-    """Return how far neighbours move the centroid of a beam.
+    """Return how far neighbours shift the centroid of a beam.
 
     Parameters
     ----------
     target
-        The beam falls on its plane.
+        The target; the beam falls on its plane.
     center, normal
-        Middle of the mirror, ENU metres, and its unit normal, (3,).
+        Centre of the mirror, ENU metres, and its unit normal, (3,).
     sun
         Unit vector to the sun, (3,).
     facets
-        Facets of one heliostat, tilted as they are.
+        Facets of one heliostat, with their actual tilts.
     neighbours
-        Mirrors that may shade or block it.
+        Mirrors that may shade or block this mirror.
     facet_focal
         Focal length of each facet's own curvature, m.
     elements
-        Each facet is divided into the square of this number.
+        Each facet is divided into the square of this number of elements.
 
     Notes
     -----
-    Of the central rays: sun shape and slope errors widen the beam and do not move it. The
-    centroid is that of all light, on the target or beside it.
+    The shift is that of the central rays, because sun shape and slope errors widen the beam without
+    shifting it. The centroid includes all light, on the target or beside it.
     """
     R = mirror_axes(normal)
     points, normals, areas = elements_of(facets, facet_focal, elements)

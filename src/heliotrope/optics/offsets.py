@@ -1,12 +1,12 @@
-"""Image offsets: where an imperfect heliostat throws its beam, Malan's error model run forwards.
+"""Image offsets: where an imperfect heliostat sends its beam; Malan's error model run forwards.
 
-A controller knows the *nominal* mechanism and moves the drives so that this one would send
-the sun to the aim. The *actual* mechanism, with its imperfections, takes the same
-counts, and its beam misses the aim by the offsets that this module returns. Nothing here
-depends on the kind of mechanism or of imperfection: both are data of the chain.
+A controller knows the *nominal* mechanism and moves the drives to the counts at which that
+mechanism would send the sun to the aim. The *actual* mechanism, with its imperfections, moves to
+the same counts, and its beam misses the aim by the offsets that this module returns. Nothing here
+depends on the kind of mechanism or of imperfection, because both are data of the chain.
 
-Source: Malan, §4.2 (nine steps), for azimuth-elevation heliostats;
-`docs/explanation/malan.md` reads his steps as operations on the chain.
+Source: Malan, §4.2 (nine steps), for azimuth-elevation heliostats; `docs/explanation/malan.md`
+interprets his steps as operations on the chain.
 """
 
 from dataclasses import dataclass
@@ -67,8 +67,8 @@ class ImageOffsets(Value, Framed):
     def beam_error(self) -> FloatArray:
         """Beam error to the right and upwards, rad, (..., 2).
 
-        Offset over slant range, as Malan divides; for a heliostat at its nominal position
-        this is the tangent of the angle.
+        Offset over slant range, as in Malan; for a heliostat at its nominal position this is the
+        tangent of the angle.
         """
         return np.stack([self.right / self.slant, self.up / self.slant], axis=-1)
 
@@ -78,8 +78,8 @@ class ImageOffsets(Value, Framed):
         Parameters
         ----------
         axis
-            Batch axes to average over, such as that of the times; default all. NaN are
-            left out; the RMS of no value is NaN.
+            Batch axes to average over, such as the time axis; default all. NaN values are left out;
+            the RMS of no values is NaN.
         """
         square = (self.distance / self.slant) ** 2
         known = np.isfinite(square)
@@ -92,17 +92,17 @@ class ImageOffsets(Value, Framed):
 def image_offsets(
     nominal: Mechanism, actual: Mechanism, sun: npt.ArrayLike, aim: npt.ArrayLike
 ) -> ImageOffsets:
-    """Return where the beams of actual heliostats fall when driven as nominal ones.
+    """Return where the beams of actual heliostats fall when driven as nominal heliostats.
 
-    All batch shapes broadcast: a day of suns with one heliostat, (times, 1) suns with
-    (heliostats,) mechanisms, or one nominal mechanism with many actual ones.
+    All batch shapes broadcast: the sun vectors of a day with one heliostat, sun vectors (times, 1)
+    with mechanisms (heliostats,), or one nominal mechanism with many actual ones.
 
     Parameters
     ----------
     nominal
         The mechanism that the controller assumes.
     actual
-        The real mechanism, of the same kind: ``nominal.with_parameters(...)``.
+        The actual mechanism, of the same kind: ``nominal.with_parameters(...)``.
     sun
         Unit vectors to the sun, ENU, (..., 3).
     aim
@@ -111,14 +111,14 @@ def image_offsets(
     Raises
     ------
     InputError
-        If the mechanisms are of different kinds, an input is not finite, a sun is not a
-        unit vector, or shapes do not fit.
+        If the mechanisms are of different kinds, an input is not finite, a sun vector is not a unit
+        vector, or shapes do not fit.
 
     Notes
     -----
-    If two poses reach the aim, the controller takes the one within the stops of the
-    nominal drives. An azimuth-elevation mechanism without stops may go over the top,
-    where the sign of an elevation bias is reversed.
+    If two poses reach the aim, the controller takes the pose within the stops of the nominal
+    drives. An azimuth-elevation mechanism without stops may go over the top, where the sign of an
+    elevation bias is reversed.
 
     Malan, §4.2 with (4.26) resolved: +right and +up are as seen from the
     heliostat, looking at the aim. Accuracy: 1e-13 m at 40 m against an independent
@@ -157,14 +157,14 @@ def target_offsets(
     nominal, actual, sun
         As for `image_offsets`, with its errors.
     target
-        The target whose plane they fall on.
+        The target on whose plane they fall.
     aim
-        ENU metres, (..., 3); default the target's centre.
+        ENU metres, (..., 3); default the target centre.
 
     Returns
     -------
-    Metres to the right of and above the target's centre as seen from its front,
-    (..., 2). NaN as for `image_offsets`, and where the beam comes from behind.
+    Metres to the right of and above the target centre as seen from the front, (..., 2). NaN as for
+    `image_offsets`, and where the beam arrives from behind.
     """
     point = target.center if aim is None else as_vectors(aim, "aim")
     _, pose, beam = _stand(nominal, actual, sun, point)

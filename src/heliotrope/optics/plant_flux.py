@@ -1,8 +1,8 @@
-"""The flux and the efficiencies of a plant: at one sun, over a day, and over a year.
+"""The flux and the efficiencies of a plant: at one sun position, over a day, and over a year.
 
-The field's efficiencies stand in the order of the light, each as a share of what the one before
-left, so that their product is the total: cosine, shading and blocking together (`lit`), mirror
-(reflectivity and soiling), air, intercept.
+The efficiencies of the field are listed in the order of the light path, each as a fraction of what
+the previous one left, so that their product is the total: cosine, shading and blocking together
+(`lit`), mirror (reflectivity and soiling), atmosphere, intercept.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ from heliotrope.sun import Times, unix_seconds, vector
 from heliotrope.values import Card, Value, amount, span
 
 Progress = Callable[[int, int], None]
-#: Efficiencies of a mirror and of a field, in the order of the light; shading and blocking are
+#: Efficiencies of a mirror and of a field, in the order of the light path; shading and blocking are
 #: parts of "lit".
 EFFICIENCIES = ("cosine", "shading", "blocking", "lit", "mirror", "air", "intercept", "total")
 #: The sun's greatest declination, rad.
@@ -42,37 +42,37 @@ LOWEST = np.radians(2.0)
 
 @dataclass(frozen=True)
 class FieldOptics:
-    """What the light of a field depends on, beside plant and sun.
+    """What the light from a field depends on, besides plant and sun position.
 
     Attributes
     ----------
     dni
         Direct normal irradiance, W/m².
     shape
-        Shape of the sun, or its name: `heliotrope.optics.SunShape`.
+        Sun shape, or its name: `heliotrope.optics.SunShape`.
     air
-        Model of the air, or the visibility, km: `heliotrope.optics.air_loss`.
+        Atmospheric model, or the visibility, km: `heliotrope.optics.air_loss`.
     slope
-        Standard deviation of the surface's normal per axis, rad.
+        Standard deviation of the surface normal per axis, rad.
     error
-        Two-dimensional standard deviation of the mirrors' normals that is expected of their
-        calibration, rad, () or (N,).
+        Two-dimensional standard deviation of the mirror normals expected from their calibration,
+        rad, () or (N,).
     reflectivity, clean
-        Of the clean mirror, and the share that soiling leaves, 0 to 1, () or (N,).
+        Reflectivity of the clean mirror, and the fraction that soiling leaves, 0 to 1, () or (N,).
     focus
-        "slant": each mirror is focused on its aim; "flat"; or the focal length, m. Of mirrors with
-        facets it is that of each facet.
+        "slant": each mirror is focused on its aim; "flat"; or the focal length, m. For mirrors with
+        facets it applies to each facet.
     facets
-        Columns and rows of equal facets; None: as the plant file has them.
+        Columns and rows of equal facets; None: as in the plant file.
     canting
-        Of these facets: "slant", a focal length or the sun at which they are canted off axis; see
-        `heliotrope.optics.canting.canted`.
+        Canting of these facets: "slant", a focal length or the sun vector for which they are canted
+        off-axis; see `heliotrope.optics.canting.canted`.
     cells
-        Rows and columns of each receiver; None: as the engine chooses.
+        Rows and columns of each receiver; None: chosen by the engine.
     towers
-        What else shades and blocks.
+        Other objects that shade and block.
     gaussians
-        Number of Gaussians of the sun's image, 1 to 4.
+        Number of Gaussians for the sun image, 1 to 4.
     """
 
     dni: float = 900.0
@@ -90,12 +90,12 @@ class FieldOptics:
     gaussians: int = 3
 
     def changed(self, changes: dict[str, Any]) -> "FieldOptics":
-        """Return it with other values.
+        """Return the settings with other values.
 
         Raises
         ------
         UnknownNameError
-            If it has no such attribute.
+            If there is no such attribute.
         """
         known = [each.name for each in fields(self)]
         for name in changes:
@@ -106,7 +106,7 @@ class FieldOptics:
     def scene(
         self, plant: Plant, sun: FloatArray, aim: npt.ArrayLike | None, receivers: tuple[str, ...]
     ) -> Scene:
-        """Return the scene of a plant under this light."""
+        """Return the scene of a plant under these conditions."""
         error = as_float(self.error)
         if not (np.isfinite(error) & (error >= 0.0) & (error < 0.2)).all():
             raise InputError(f"flux: an error of {error.max():g} rad must be from 0 to 0.2 rad")
@@ -131,36 +131,40 @@ class FieldOptics:
         mirrors = canted(scene.mirrors, self.facets, self.canting, plant=plant, aim=aim)
         return replace(scene, mirrors=mirrors)
 
+    def engine(self, scene: Scene) -> FieldFlux:
+        """Return the flux of a scene under this light."""
+        return FieldFlux(scene, sun=self.shape, air=self.air, gaussians=self.gaussians)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlantFlux(Value, Framed):
-    """Flux and efficiencies of N heliostats at one sun.
+    """Flux and efficiencies of N heliostats at one sun position.
 
     Attributes
     ----------
     plant
         Name.
     names, position, aim
-        Of the heliostats; positions and aims, ENU m, (N, 3).
+        Of the heliostats; positions and aims in ENU m, (N, 3).
     sun
         Unit vector, (3,).
     dni
         W/m².
     area
-        Of the mirrors, m², (N,).
+        Area of the mirrors, m², (N,).
     clean, reflectivity
         Of each mirror, (N,).
     efficiencies
-        Shares of each mirror, (N,); NaN for one that cannot reach its aim.
+        Efficiencies of each mirror, (N,); NaN for a mirror that cannot reach its aim.
     maps
-        Flux on each receiver. A cylinder's is unrolled: metres clockwise from the north, or from
-        the middle of its opening; a mesh is one row of cells.
+        Flux on each receiver. A cylinder is unrolled: metres clockwise from north, or from the
+        middle of its opening; a mesh is one row of cells.
     surfaces
         The receivers with their cells.
     rays
-        Number of rays, if it was traced; 0: by the engine.
+        Number of rays, if ray-traced; 0: computed by the engine.
     errors, power_error
-        Standard errors of the maps, W/m², and of the power, W, if traced.
+        Standard errors of the maps, W/m², and of the power, W, if ray-traced.
     """
 
     plant: str
@@ -214,12 +218,12 @@ class PlantFlux(Value, Framed):
 
     @property
     def peak(self) -> float:
-        """Greatest flux in a cell, W/m²."""
+        """Maximum flux in a cell, W/m²."""
         return max(float(view.flux.max()) for view in self.maps)
 
     @property
     def intercept(self) -> float:
-        """Share of the field's light that reaches a receiver; NaN without light."""
+        """Fraction of the field's light that reaches a receiver; NaN without light."""
         return self.summary["intercept"]
 
     @property
@@ -291,37 +295,37 @@ def field_flux(
     light: FieldOptics | None = None,
     **changes: Any,
 ) -> PlantFlux:
-    """Return what each heliostat of a plant puts on the receivers, and what is lost where.
+    """Return the flux that each heliostat puts on the receivers, and the losses on the way.
 
     Parameters
     ----------
     plant
         As calibrated.
     time
-        One time; see `heliotrope.sun.Times`. Or give the sun.
+        One time; see `heliotrope.sun.Times`. Alternatively pass ``sun``.
     receiver
         Name or names; "": all receivers of the plant. A beam counts where it lands first.
     sun
         Unit vector, (3,), instead of a time.
     aim
-        Aim points, ENU m, (3,) or (N, 3); None: each heliostat's own, else the middle of the
+        Aim points, ENU m, (3,) or (N, 3); None: each heliostat's own aim, or the middle of the
         first receiver.
     rays
-        Number of random rays that are traced instead, 1e3 to 1e9; 0: none. This needs the extra
-        ``rays``, and is a second opinion.
+        Number of random rays to trace instead, 1e3 to 1e9; 0: no ray tracing. Ray tracing needs the
+        extra ``rays`` and serves as an independent check.
     seed
-        Of the rays.
+        Seed of the rays.
     progress
-        Called with the rays done and the rays of all.
+        Called with the numbers of rays (done, total).
     light
-        Everything else; None: as `FieldOptics` has it.
+        All other settings; None: the defaults of `FieldOptics`.
     **changes
         Any attribute of `FieldOptics` by name, such as ``dni=850.0`` or ``shape="buie:0.05"``.
 
     Raises
     ------
     InputError
-        If there is no receiver, the sun is below the horizon, more than one time is given, no
+        If there is no receiver, the sun is below the horizon, more than one time is passed, no
         heliostat reaches its aim, or a number is out of range.
     UnknownNameError
         If there is no receiver or option of that name.
@@ -333,14 +337,31 @@ def field_flux(
         raise InputError(f"flux: none of the {len(plant)} heliostats can reach its aim at this sun")
     if rays:
         return _traced(plant, scene, optics, rays, seed, progress)
-    engine = FieldFlux(scene, sun=optics.shape, air=optics.air, gaussians=optics.gaussians)
-    intercepts = [power / max(float(engine.leaving.sum()), 1e-300) for power in engine.powers]
+    engine = optics.engine(scene)
+    engine.check_met()
+    return _result(plant, scene, engine.efficiencies, _views(engine))
+
+
+def scene_flux(scene: Scene, light: FieldOptics) -> list[FluxView]:
+    """Return the flux on the surfaces of a scene.
+
+    Parameters
+    ----------
+    scene
+        The field as it stands. Without a mirror that shines the maps are zero.
+    light
+        Shape of the sun, air, and number of Gaussians.
+    """
+    return _views(light.engine(scene))
+
+
+def _views(engine: FieldFlux) -> list[FluxView]:
+    leaving, surfaces = float(engine.leaving.sum()), engine.scene.surfaces
     lit = int((engine.leaving > 0.0).sum())
-    maps = [
-        _view(*each, lit)
-        for each in zip(scene.surfaces, engine.maps, engine.powers, intercepts, strict=True)
+    return [
+        _view(surface, flux, power, power / leaving if leaving > 0.0 else np.nan, lit)
+        for surface, flux, power in zip(surfaces, engine.maps, engine.powers, strict=True)
     ]
-    return _result(plant, scene, engine.efficiencies, maps)
 
 
 def _names(receiver: str | tuple[str, ...]) -> tuple[str, ...]:
@@ -422,7 +443,7 @@ def _view(surface: Surface, flux: FloatArray, power: float, intercept: float, li
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FluxTable(Value, Framed):
-    """Efficiencies of a field at M suns.
+    """Efficiencies of a field at M sun positions.
 
     Attributes
     ----------
@@ -431,21 +452,21 @@ class FluxTable(Value, Framed):
     sun
         Unit vectors, (M, 3).
     time
-        Unix seconds, (M,); NaN where the table is over positions of the sun.
+        Unix seconds, (M,); NaN if the table is over sun positions.
     declination, hour
-        Of the sun, rad, (M,); NaN in a table over times.
+        Declination and hour angle of the sun, rad, (M,); NaN in a table over times.
     weight
-        Share of the sum that each sun has, (M,): of the day's or of the year's light.
+        Weight of each sun position, (M,): its fraction of the light of the day or the year.
     dni
         W/m², (M,).
     shares
         Efficiencies of the field, (M,), by name.
     power, peak
-        On all receivers, W, and in the hottest cell, W/m², (M,).
+        On all receivers, W, and in the cell with the highest flux, W/m², (M,).
     names, position
-        Of the N heliostats.
+        Names of the N heliostats.
     heliostat
-        Mean total efficiency of each, weighted by the light, (N,).
+        Mean total efficiency of each heliostat, weighted by the light, (N,).
     """
 
     plant: str
@@ -513,21 +534,22 @@ def flux_day(
     light: FieldOptics | None = None,
     **changes: Any,
 ) -> FluxTable:
-    """Return the efficiencies of a field at times with sunlight, such as a day's.
+    """Return the efficiencies of a field at times with sunlight, such as those of a day.
 
     Parameters
     ----------
     times
-        M times, such as `heliotrope.sun.daylight` gives; those with the sun below 2° are left out.
+        M times, such as those from `heliotrope.sun.daylight`; times with the sun below 2° are left
+        out.
     plant, receiver, aim, light, **changes
         As for `field_flux`.
     progress
-        Called with the suns done and the suns of all.
+        Called with the numbers of sun positions (done, total).
 
     Raises
     ------
     InputError
-        As `field_flux`, or if the sun is up at none of the times.
+        As for `field_flux`, or if the sun is up at none of the times.
     """
     optics = (light or FieldOptics()).changed(changes)
     suns = np.atleast_2d(vector(times, plant.site))
@@ -555,29 +577,29 @@ def flux_year(
     light: FieldOptics | None = None,
     **changes: Any,
 ) -> FluxTable:
-    """Return the efficiencies of a field over the sun's positions in a year.
+    """Return the efficiencies of a field over the sun positions of a year.
 
     Parameters
     ----------
     plant, receiver, aim, light, **changes
         As for `field_flux`; ``dni`` scales the irradiance of a clear day.
     declinations
-        Number of declinations from −23.45° to 23.45°, 2 or more; the sun spends equal times
-        between two of them.
+        Number of declinations from −23.45° to 23.45°, 2 or more; the sun spends equal times between
+        neighbouring declinations.
     hours
         Step of the hour angle, 0.1 to 4 h.
     progress
-        Called with the suns done and the suns of all.
+        Called with the numbers of sun positions (done, total).
 
     Raises
     ------
     InputError
-        As `field_flux`, or if the numbers are out of range.
+        As for `field_flux`, or if the numbers are out of range.
 
     Notes
     -----
-    Suns below 2° are left out. The means are weighted by the irradiance of a clear day after
-    Meinel, 0.7^(AM^0.678), AM = 1 / sin(elevation) being the air mass.
+    Sun positions below 2° are left out. The means are weighted by clear-day irradiance according to
+    Meinel, 0.7^(AM^0.678), where AM = 1 / sin(elevation) is the air mass.
     """
     if not (2 <= declinations <= 100 and 0.1 <= hours <= 4.0):
         raise InputError(
@@ -628,7 +650,8 @@ def _table(
     heliostat = np.zeros(len(plant))
     for k, sun in enumerate(suns):
         scene = replace(light, dni=float(dni[k])).scene(plant, sun, aim, receivers)
-        engine = FieldFlux(scene, sun=light.shape, air=light.air, gaussians=light.gaussians)
+        engine = light.engine(scene)
+        engine.check_met()
         efficiencies = engine.efficiencies
         rows.append(field_efficiencies(efficiencies, scene.mirrors.area))
         power[k] = sum(engine.powers)

@@ -1,12 +1,13 @@
-"""A second opinion on the flux: random rays, traced through the triangles of `embreex`.
+"""An independent check of the flux: random rays, traced through triangles by `embreex`.
 
-It shares nothing with the flux engine but the scene and the sun's random rays. Each ray begins on
-a mirror, at a random place with a random slope error. Backwards it goes to a random place of the
-sun: what it meets on the way shades it. Forwards it is reflected: what it meets before a surface
-blocks it. Not for production: 10⁷ rays take about half a minute.
+The tracer shares nothing with the flux engine but the scene and the random rays of the sun. Each
+ray begins on a mirror, at a random point with a random slope error. Backwards it goes to a random
+point of the sun; an object that it meets on the way shades it. Forwards it is reflected; an object
+that it meets before a surface blocks it. Not for production, because 10⁷ rays take about half a
+minute.
 
-Left out, as in the engine: the sag of the mirrors, which are flat to their neighbours, and the
-light that one surface keeps from another.
+As in the engine, two effects are neglected: the sagitta of the mirrors, which count as flat when
+they obstruct their neighbours, and the shading of one surface by another.
 """
 
 from collections.abc import Callable
@@ -35,18 +36,18 @@ _SIDES = 96
 
 @dataclass(frozen=True, eq=False)
 class RayTrace:
-    """What random rays say of a scene with H mirrors and K surfaces.
+    """Ray-traced results for a scene with H mirrors and K surfaces.
 
     Attributes
     ----------
     flux, error
-        Of each surface, W/m², and its standard error, in the shape of its cells.
+        Flux on each surface, W/m², and its standard error, in the shape of its cells.
     power, power_error
         On each surface, W, and its standard error, (K,).
     cosine, shading, blocking, lit, intercept
-        Shares of each mirror, (H,), as in `Efficiencies`; NaN where no ray was traced.
+        Efficiencies of each mirror, (H,), as in `Efficiencies`; NaN where no ray was traced.
     count
-        Rays from each mirror, (H,).
+        Number of rays from each mirror, (H,).
     """
 
     flux: tuple[FloatArray, ...]
@@ -75,15 +76,16 @@ def trace(
     Parameters
     ----------
     scene
-        Mirrors, surfaces, towers, and a sun.
+        Mirrors, surfaces, towers, and a sun vector.
     rays
-        Number of rays from the whole field, 1e3 to 1e9; each mirror gets its share by area.
+        Number of rays from the whole field, 1e3 to 1e9; each mirror gets rays in proportion to its
+        area.
     sun, air
         As for `FieldFlux`.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
     progress
-        Called with the rays done and the rays of all.
+        Called with the numbers of rays (done, total).
 
     Raises
     ------

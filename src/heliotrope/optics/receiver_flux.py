@@ -1,16 +1,16 @@
-r"""The flux of a field on its receivers, mirror by mirror, kept up to date while mirrors move.
+r"""The flux of a field on its receivers, per mirror, kept up to date as mirrors move.
 
-The image of a mirror is that of its lit part (`shading`): the convex polygons' area, centroid and
-covariance C go through the mirror to the receiver as A C Aᵀ, A being the derivative of the ray's
-place by the place on the mirror, which holds the astigmatism at the true angle of incidence. To it
-come, as covariances of the ray's direction times the square of the distance, the slope errors
-(4 σ² in the plane of incidence and 4 σ² cos² θ across it), the covariance of the belief, and the
-sun as a short sum of Gaussians. Facets, and the parts of a flat mirror, each have their own image;
-images that lie together are merged.
+The image of a mirror is that of its lit part (`shading`). The area, centroid and covariance C of
+the convex polygons are mapped through the mirror to the receiver as A C Aᵀ, where A is the
+derivative of the ray's position with respect to the position on the mirror; A contains the
+astigmatism at the true angle of incidence. Covariances of the ray direction times the squared
+distance are added: the slope errors (4 σ² in the plane of incidence and 4 σ² cos² θ across it), the
+covariance of the calibration, and the sun as a short sum of Gaussians. Facets, and the parts of a
+flat mirror, each have their own image; images that lie close together are merged.
 
-Left out: the light that one surface keeps from another, reflection by the receivers, the sag of the
-mirrors, and the difference of distances within one mirror. A sun's sum of Gaussians expects a blur
-of at least 0.5 mrad by slope and belief.
+Neglected: shading of one surface by another, reflection by the receivers, the sagitta of the
+mirrors, and differences in distance within one mirror. The sun's sum of Gaussians is accurate for a
+blur of at least 0.5 mrad from slope and calibration errors.
 """
 
 from dataclasses import dataclass
@@ -88,7 +88,7 @@ class FieldFlux:
     Raises
     ------
     InputError
-        If no mirror's beam can meet a surface, or a name is unknown.
+        If a name is unknown.
 
     Notes
     -----
@@ -120,9 +120,9 @@ class FieldFlux:
         self._flux = [np.zeros(surface.cells.shape) for surface in scene.surfaces]
         self._power = [np.zeros((len(mirrors), 2)) for _ in scene.surfaces]
         self._cast(np.arange(len(mirrors)), 1.0)
-        self._check_met()
 
-    def _check_met(self) -> None:
+    def check_met(self) -> None:
+        """Raise InputError if mirrors shine, and none sends light to a surface."""
         for surface, power in zip(self.scene.surfaces, self._power, strict=True):
             if power[:, 0].any() and not power[:, 1].any():
                 raise InputError(

@@ -1,14 +1,14 @@
-"""What the flux engine and the ray tracer are told: mirrors, surfaces, towers and one sun.
+"""The input of the flux engine and the ray tracer: mirrors, surfaces, towers and a sun vector.
 
-Everything is plain, immutable and given by arrays, ENU metres and radians. `scene_of` makes it from
-a plant, a sun and aims. A `Scene` says nothing of the sun's shape and of the air: whoever computes
-takes those as arguments of their own.
+All data are plain, immutable arrays in ENU metres and radians. `scene_of` creates a `Scene` from a
+plant, a sun vector and aims. A `Scene` contains neither the sun shape nor the atmosphere; the
+functions that compute flux take these as separate arguments.
 
 A mirror is a flat rectangle about its centre with a unit normal and two unit axes in its plane,
-``right`` (as seen from its front) and ``up``. Its surface deviates from the plane by little: at
-(x, y) along the axes the normal is tilted by −(x, y) / 2f, f being its focal length. Facets are
-rectangles in this plane, each with a tilt of its own (canting) and a focal length of its own; then
-the mirror's own focal length only serves to cast the shadows of its neighbours.
+``right`` (as seen from its front) and ``up``. Its surface deviates only slightly from the plane: at
+(x, y) along the axes the normal is tilted by −(x, y) / 2f, where f is the focal length. Facets are
+rectangles in this plane, each with its own tilt (canting) and focal length; the mirror's own focal
+length is then used only for casting shadows of its neighbours.
 """
 
 from collections.abc import Sequence
@@ -340,7 +340,7 @@ def scene_of(
     focal = slant if isinstance(focus, str) else np.broadcast_to(as_float(focus), slant.shape)
     size = [np.concatenate([getattr(g, s) for g in plant.groups.values()]) for s in _SIZES]
     built = Mirrors.of(vertex, normal, (size[0], size[1]), ends, focal=focal, **mirrors)
-    table = _facets(plant, focal)
+    table = facets_of(plant, focal)
     if table is not None:
         built = built.with_facets(*table)
     dark = ~np.asarray(tracking.reachable)
@@ -367,8 +367,16 @@ def _aims(plant: Plant, middle: FloatArray, aim: npt.ArrayLike | None) -> FloatA
     return np.where(np.isfinite(ends).all(axis=-1, keepdims=True), ends, middle)
 
 
-def _facets(plant: Plant, focal: FloatArray) -> tuple[FacetTable, npt.NDArray[np.int64]] | None:
-    """Return the facets of all groups, padded to one number; None if no group has any."""
+def facets_of(plant: Plant, focal: FloatArray) -> tuple[FacetTable, npt.NDArray[np.int64]] | None:
+    """Return the facets of a plant's heliostats and the row of each; None if none has facets.
+
+    Parameters
+    ----------
+    plant
+        Facets of groups with fewer are padded with empty ones.
+    focal
+        Focal length of the facets of each heliostat, m, (N,).
+    """
     groups = list(plant.groups.values())
     most = max((g.facets.center.shape[1] for g in groups if g.facets is not None), default=0)
     if most == 0:

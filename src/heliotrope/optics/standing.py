@@ -1,4 +1,4 @@
-"""Beams of mirrors at rest: over all suns of the year, and all together in the air."""
+"""Beams of heliostats at rest: over all sun positions of the year, and superposed in the air."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

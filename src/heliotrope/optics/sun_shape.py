@@ -1,20 +1,20 @@
-r"""How bright the sun is across its disk and around it, and its image as a few Gaussians.
+r"""The brightness of the sun across its disk and around it, and its image as a few Gaussians.
 
-`sun_profile` gives the radiance φ(θ) at an angle θ from the sun's centre, relative to it. With
-x = θ / 4.65 mrad and μ = √(1 − x²), on the disk (x ≤ 1):
+`sun_profile` returns the radiance φ(θ) at an angle θ from the sun's centre, relative to the centre.
+With x = θ / 4.65 mrad and μ = √(1 − x²), on the disk (x ≤ 1):
 
 - `pillbox`: 1.
 - `limb`: 0.3 + 0.93 μ − 0.23 μ², at 550 nm (Cox, Allen's Astrophysical Quantities, 2000).
 - `quartic`: 1 − 0.5138 x⁴, SolarPILOT's "limb-darkened sun".
-- `gaussian`: exp(−θ² / 2σ²), not only on the disk.
-- `buie`: cos 0.326θ / cos 0.308θ on the disk and e^κ θ^γ around it to 43.6 mrad, θ in mrad, with
-  κ = 0.9 ln(13.5 χ) χ^−0.3 and γ = 2.2 ln(0.52 χ) χ^0.43 − 0.1 (Buie, Monger and Dey, Solar Energy
-  74 (2003) 113-122). His χ is only nearly the share of the light that comes from around the disk;
-  `SunShape` takes that share, the circumsolar ratio, and solves for χ.
+- `gaussian`: exp(−θ² / 2σ²), not limited to the disk.
+- `buie`: cos 0.326θ / cos 0.308θ on the disk and e^κ θ^γ around it to 43.6 mrad, θ in mrad, with κ
+  = 0.9 ln(13.5 χ) χ^−0.3 and γ = 2.2 ln(0.52 χ) χ^0.43 − 0.1 (Buie, Monger and Dey, Solar Energy 74
+  (2003) 113-122). Buie's χ is only approximately the fraction of the light that comes from around
+  the disk; `SunShape` takes that fraction, the circumsolar ratio, and solves for χ.
 
-A mirror smears the sun, so a short sum of Gaussians with the sun's exact variance does as well as
-the profile itself (`SunShape.gaussians`). A disk has less in its tails than a Gaussian, so one of
-the weights is negative.
+A mirror blurs the sun, so a short sum of Gaussians with the sun's exact variance is as good as the
+profile itself (`SunShape.gaussians`). A disk has weaker tails than a Gaussian, so one of the
+weights is negative.
 """
 
 from dataclasses import dataclass
@@ -47,14 +47,14 @@ _NODES, _TABLE = 200, 8192
 
 
 class Gaussians(NamedTuple):
-    """A sum of round Gaussians.
+    """A sum of circular Gaussians.
 
     Attributes
     ----------
     weight
-        Sum 1; some may be negative, (G,).
+        Weights with sum 1; some may be negative, (G,).
     variance
-        Per axis, rad², (G,).
+        Variances per axis, rad², (G,).
     """
 
     weight: FloatArray
@@ -63,16 +63,16 @@ class Gaussians(NamedTuple):
 
 @dataclass(frozen=True)
 class SunShape:
-    """The sun's profile with its numbers.
+    """A sun profile with its parameters.
 
     Attributes
     ----------
     name
         One of `SUN_SHAPES`.
     csr
-        Circumsolar ratio of "buie": share of the light from beyond 4.65 mrad.
+        Circumsolar ratio for "buie": fraction of the light from beyond 4.65 mrad.
     sigma
-        Standard deviation per axis of "gaussian", rad.
+        Standard deviation per axis for "gaussian", rad.
     """
 
     name: str = "limb"
@@ -97,7 +97,7 @@ class SunShape:
         Raises
         ------
         InputError
-            If there is none of that name, or the number is missing, wrong or without meaning.
+            If there is no shape of that name, or the number is missing, wrong or not applicable.
         """
         if isinstance(shape, cls):
             return shape
@@ -117,7 +117,7 @@ class SunShape:
 
     @property
     def radius(self) -> float:
-        """Angle beyond which it is dark, rad."""
+        """Angle beyond which the profile is dark, rad."""
         wide = {"gaussian": _REACH * self.sigma, "buie": AUREOLE_RADIUS}
         return wide.get(self.name, SUN_RADIUS)
 
@@ -159,28 +159,28 @@ class SunShape:
         return as_float(below[lit] / below[-1]), as_float(edges[lit])
 
     def within(self, theta: npt.ArrayLike) -> FloatArray:
-        """Return the share of the light from within angles of the centre, rad."""
+        """Return the fraction of the light from within given angles of the centre, rad."""
         below, edges = self._table
         return as_float(np.interp(as_float(theta), edges, below))
 
     def sample(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return directions of random rays: two small angles from the centre, rad, (N, 2)."""
+        """Return the directions of random rays: two small angles from the centre, rad, (N, 2)."""
         below, edges = self._table
         theta = np.interp(rng.random(count), below, edges)
         turn = 2.0 * np.pi * rng.random(count)
         return np.stack([theta * np.cos(turn), theta * np.sin(turn)], axis=-1)
 
     def gaussians(self, count: int = 2, blur: float = BLUR) -> Gaussians:
-        """Return the sum of 1 to 4 Gaussians that is closest to it, with its exact variance.
+        """Return the closest sum of 1 to 4 Gaussians that has the exact variance of the profile.
 
         Parameters
         ----------
         count
-            Number of Gaussians; a Gaussian sun needs but one.
+            Number of Gaussians; a Gaussian sun needs only one.
         blur
-            The images that are compared are blurred by a further Gaussian of this standard
-            deviation per axis, rad, such as slope errors of half of it make. It is rounded to
-            0.1 mrad and kept from 0.3 to 3 mrad. The sum fits wider blurs better still.
+            Standard deviation per axis of an additional Gaussian that blurs the images before they
+            are compared, rad, for example from slope errors of half that size. It is rounded to 0.1
+            mrad and limited to 0.3 to 3 mrad. For wider blurs the sum fits even better.
 
         Raises
         ------
@@ -189,8 +189,8 @@ class SunShape:
 
         Notes
         -----
-        Closest means the smallest integral of the squared difference. `gaussian_error` measures
-        what is left.
+        Closest means the smallest integral of the squared difference. `gaussian_error` measures the
+        remaining difference.
         """
         if not 1 <= count <= 4:
             raise InputError(f"sun shape: {count} Gaussians; give 1 to 4")
@@ -206,7 +206,7 @@ class SunShape:
         return as_float(j0(as_float(frequency)[..., None] * theta) @ share)
 
     def gaussian_error(self, count: int = 2, blur: float = BLUR) -> float:
-        """Return the greatest error of `gaussians`, as a share of the image's peak.
+        """Return the largest error of `gaussians`, as a fraction of the image peak.
 
         Parameters
         ----------
@@ -232,9 +232,9 @@ def sun_profile(theta: npt.ArrayLike, shape: str, circumsolar: float = 0.05) -> 
     Parameters
     ----------
     theta
-        (...).
+        Angles from the centre, (...).
     shape
-        "pillbox", "limb", "quartic" or "buie"; see the module for their formulas.
+        "pillbox", "limb", "quartic" or "buie"; see the module for their formulae.
     circumsolar
         Buie's χ.
 

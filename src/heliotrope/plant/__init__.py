@@ -5,8 +5,8 @@ tickets, messages), `JoinQueue` (the rate at which heliostats join the receiver)
 `BeamWatch` (no beam in a keep-out volume), `ParameterSync` (what local controllers store) and
 `Sentinel` (the safety table and emergencies). Begin with `heliotrope.plant.controller`.
 
-`operations` is what people and pages use, `visits` brings a beam to a target, and `schedule`
-chooses which heliostat is measured next. `kept_audit` needs the store's libraries and is imported
+Operators and pages use `operations`; `visits` brings a beam to a target, and `schedule` chooses
+which heliostat is measured next. `kept_audit` needs the libraries of the store and must be imported
 from its module.
 """
 

@@ -1,8 +1,8 @@
-"""Assembly of a plant from its design, its ports and its settings.
+"""Assembles a plant from its design, its ports and its settings.
 
-The same assembly runs a real plant and a simulated one: what differs is passed in as `Ports`.
-A cluster that does not answer or a camera that gives no frame raises an alarm; the plant goes on
-with the others.
+A real and a simulated plant are assembled by the same code; what differs is passed in as `Ports`. A
+cluster that does not respond or a camera that delivers no frame raises an alarm, and the plant
+continues with the rest.
 """
 
 import asyncio
@@ -181,6 +181,7 @@ class PlantAssembly:
             extra=ports.facts,
             pictures=ports.pictures,
             marking=None if cameras is None else self._marking(cameras),
+            worker=ports.worker,
         )
         #: When each heliostat last moved, or was ordered to, on its way to stow at the end.
         self._moved_at = np.full(len(self.names), math.inf)

@@ -1,11 +1,11 @@
-"""Attempts: what automatic control tries again, how often, and what follows.
+"""Attempts: what automatic control retries, how often, and what follows.
 
-Work that may come to nothing is repeated by one law: each failure in a row lengthens the wait, and
-after the last one the work is *given up* with an alarm that names the reason and the next step.
-Given-up work gets one more turn after a rest, and a new beginning when somebody or something knows
-more (`Attempts.renew`).
+Work that may fail is retried by one rule: each consecutive failure lengthens the wait, and after
+the last attempt the work is *given up* with an alarm that names the reason and the next step.
+Given-up work is tried once more after a pause, and starts afresh when new information arrives from
+an operator or a program (`Attempts.renew`).
 
-Nothing here reads a clock: times are arguments, all of one clock.
+This module reads no clock: times are arguments, all from one clock.
 """
 
 import math

@@ -1,13 +1,14 @@
 """The plant controller: the central controller of a field of clusters.
 
-It knows the state of every heliostat and the age of that knowledge, holds the one command
-authority, accepts people's commands, sends them to the clusters and follows them to their end,
-renews each cluster's lease every second, watches the safety table, and proves an emergency.
+It knows the state of every heliostat and the age of that information, holds the single command
+authority, accepts operator commands, sends them to the clusters and follows them to completion,
+renews each cluster's lease every second, evaluates the safety table, and confirms that emergency
+orders are carried out.
 
-A command is accepted or refused at once (`RefusedError`, with the reason). An accepted command has
-its record in the audit before it is sent, and a `Ticket` to await. DEFOCUS and STOW are accepted
-from anybody and wait for nothing. Nothing moves by itself, neither at the start nor after an
-emergency.
+A command is accepted or refused at once (`RefusedError`, with the reason). An accepted command is
+recorded in the audit before it is sent, and returns a `Ticket` to await. DEFOCUS and STOW are
+accepted from anyone and wait for nothing. No heliostat moves without an order, neither at start-up
+nor after an emergency.
 """
 
 import asyncio
@@ -98,7 +99,7 @@ _SLOW_BEAT = 1.0
 
 @dataclass(frozen=True)
 class Stores:
-    """Stores that outlive a program of the plant.
+    """Stores that outlive one run of the plant program.
 
     Attributes
     ----------
@@ -107,11 +108,12 @@ class Stores:
     wanted
         Parameters that local controllers should store.
     assigned
-        Store of aims and standby points; None: they end with the program.
+        Store of aims and standby points; None: they are lost when the program ends.
     record
-        Store of the emergency that stands; None: it ends with the program.
+        Store of the active emergency; None: it is lost when the program ends.
     disk
-        Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
+        Runs work that waits for a disk; None: it is done in the event loop, as virtual time
+        requires.
     """
 
     audit: Audit
@@ -129,15 +131,15 @@ class PlantController:
     design
         Site, heliostats, receivers, targets.
     links
-        Links by name of the cluster; the owner runs them, for example by a `TcpServer`.
+        Links by cluster name; the owner runs them, for example through a `TcpServer`.
     clock
-        Clock of the plant; everything is timed by its monotonic time.
+        Clock of the plant; all timing uses its monotonic time.
     stores
-        What outlives this program.
+        Stores that outlive this program.
     settings
         Times and limits.
     table
-        Rows of the safety table; None: those of the design at the autonomy of the settings.
+        Rows of the safety table; None: those of the design with the autonomy of the settings.
     entropy
         Source of random bytes for tokens and identities.
     on_alarm
@@ -149,26 +151,26 @@ class PlantController:
     drive_checks
         See their classes.
     beams
-        Mirrors and keep-out volumes; see `BeamCheck`.
+        Check of beams against keep-out volumes; see `BeamCheck`.
     alarms
         The last alarms, oldest first.
     name
-        Name of this run of the plant: UTC of its start, and random digits.
+        Name of this plant run: UTC of its start, and random digits.
     lockouts
-        Locks of persons; EMERGENCY, DEFOCUS and STOW pass them.
+        Personal locks; EMERGENCY, DEFOCUS and STOW override them.
     aims, standbys
-        Points where the beams are sent, ENU, m, (N, 3); NaN where there is none.
+        Points to which the beams are sent, ENU, m, (N, 3); NaN if there is none.
     commands, guards, sentinel
-        What gives persons' commands, and what stops them whatever the paths are; the safety table
-        with the emergencies that stand.
+        What issues operator commands; what blocks them apart from the paths; and the safety table
+        with the active emergencies.
     movements, locks, stepping
         Aims that visits have moved, heliostats that they have locked, and fine steps that they
-        need; the plant gives back what a visit leaves behind.
+        need; the plant restores whatever a visit leaves behind.
 
     Raises
     ------
     InputError
-        A cluster without a link, a link without a cluster, or a heliostat without a cluster.
+        If a cluster has no link, a link has no cluster, or a heliostat has no cluster.
     """
 
     def __init__(
@@ -407,7 +409,7 @@ class PlantController:
     # -- running ---------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run until closed. If any part fails, everything ends, and the leases with it."""
+        """Run until closed. If any part fails, everything stops, and the leases expire."""
         async with asyncio.TaskGroup() as group:
             parts: list[Coroutine[Any, Any, None]] = [self._beats()]
             for end in self._clusters.ends.values():
@@ -425,7 +427,7 @@ class PlantController:
         await self._orders.end(self.now())
 
     async def close(self) -> None:
-        """End the plant and its links; the clusters defocus when their leases are over."""
+        """Stop the plant and its links; the clusters defocus when their leases expire."""
         self._closing.set()
 
     def _lease(self) -> Lease:
@@ -509,62 +511,63 @@ class PlantController:
         return self.clock.monotonic()
 
     def sun_vector(self, ahead: float = 0.0) -> FloatArray:
-        """Return the unit vector to the sun now, or some seconds ahead, ENU, (3,)."""
+        """Return the unit vector to the sun now, or a number of seconds ahead, ENU, (3,)."""
         return fast_vector(self.clock.utc().timestamp() + ahead, self.design.site)
 
     @property
     def standby_unknown(self) -> npt.NDArray[np.bool_]:
-        """A mask of the heliostats that may have any standby point, (N,); see `Points.unknown`."""
+        """A mask of the heliostats whose standby point is unknown, (N,); see `Points.unknown`."""
         return self._proofs.points.unknown("STANDBY")
 
     @property
     def waiting(self) -> int:
-        """Number of heliostats that wait to join the receiver."""
+        """Number of heliostats waiting to join the receiver."""
         return len(self._joining)
 
     @property
     def orders(self) -> tuple[Ticket, ...]:
-        """Commands that have not ended."""
+        """Commands that have not yet ended."""
         return self._orders.open
 
     def put(self, name: str, value: float, subject: str = "", *, made: float | None = None) -> None:
-        """Take a sensor's reading for the safety table or the proof of an emergency.
+        """Take a sensor reading for the safety table or for the proof of an emergency.
 
-        It was made at ``made`` (monotonic s); None: now.
+        It was measured at ``made`` (monotonic s); None: now.
 
         Raises
         ------
         UnknownNameError
-            If it is not one of the settings' sensors.
+            If the sensor is not in the settings.
         """
         self.sentinel.put(name, value, self.now() if made is None else made, subject)
 
     # -- open to anybody -------------------------------------------------------------------
 
     def defocus(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
-        """Take the beams of some heliostats, or of all, off the receiver now; anybody may."""
+        """Move the beams of some or all heliostats off the receiver now; anyone may order this."""
         return self._safe(who, Act.DEFOCUS, heliostats)
 
     def stow(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
-        """Send some heliostats, or all, to stow; anybody may.
+        """Send some or all heliostats to stow; anyone may order this.
 
-        Many go one after the other, see `PlantSettings.stow_rate`; an emergency sends all at once.
+        A large number of heliostats go one after the other, see `PlantSettings.stow_rate`; an
+        emergency sends all at once.
         """
         return self._safe(who, Act.STOW, heliostats)
 
     def locked_for(self, heliostat: str) -> str:
-        """Return the reason for a heliostat's LOCKED, since when and until when, in words."""
+        """Return why a heliostat is LOCKED, since when and until when, in words."""
         mandate = self.authority.visited().get(heliostat)
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
         held = self.guards.reasons(Asked("UNLOCK", (heliostat,)), NOT_NOW)
         return self.locks.reason(heliostat, visit, held.get(heliostat, ""))
 
     def last_order(self, heliostat: str) -> tuple[Record, Ticket] | None:
-        """Return the last command to a heliostat since the start, with its progress."""
+        """Return the last command to a heliostat since start-up, with its progress."""
         return self._orders.last.get(heliostat)
 
     def waits_to_stow(self, heliostat: str) -> bool:
-        """Return whether a heliostat waits for its turn to go to stow."""
+        """Return whether a heliostat is waiting for its turn to stow."""
         return self._orders.to_stow(heliostat)
 
     def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
@@ -583,17 +586,17 @@ class PlantController:
         return ticket
 
     def raise_emergency(self, who: str, act: Act = Act.DEFOCUS, reason: str = "") -> EmergencyOrder:
-        """Order DEFOCUS or STOW of the whole field, with proof; anybody may.
+        """Order a field-wide DEFOCUS or STOW, with proof; anyone may order this.
 
-        Each person's order holds until it is withdrawn, and the rows that it trips until they are
-        acknowledged.
+        Each operator's order holds until it is withdrawn, and the rows that it trips stay tripped
+        until they are acknowledged.
 
         Raises
         ------
         InputError
             Another act.
         RefusedError
-            If the person's order was withdrawn again and again; see `Callers`.
+            If this person's order was withdrawn repeatedly; see `Callers`.
         """
         if act not in (Act.DEFOCUS, Act.STOW):
             raise InputError(f"emergency: {act.name} cannot be ordered; give DEFOCUS or STOW")
@@ -603,7 +606,7 @@ class PlantController:
     # -- the command authority -------------------------------------------------------------
 
     def take_authority(self, person: Person) -> Grant:
-        """Take the command authority, if nobody has it.
+        """Take the command authority, if nobody holds it.
 
         Raises
         ------
@@ -617,7 +620,7 @@ class PlantController:
         return grant
 
     def seize_authority(self, person: Person, reason: str) -> Grant:
-        """Break another person's command authority and take it.
+        """Take the command authority away from another person.
 
         Raises
         ------
@@ -631,30 +634,32 @@ class PlantController:
         return grant
 
     def release_authority(self, person: Person, token: int) -> None:
-        """Give the command authority back; heliostats that wait to join are given up.
+        """Release the command authority; heliostats waiting to join the receiver are dropped.
 
         Raises
         ------
         RefusedError
-            If the authority is another person's.
+            If another person holds the authority.
         """
         self.authority.release(person, token)
         self.note(person, "AUTHORITY", "released")
 
     def withdraw_emergency(self, person: Person, owner: str = "") -> str:
-        """Withdraw a person's own emergency order, or, as an engineer, that of an ``owner``.
+        """Withdraw the person's own emergency order, or, as an engineer, that of an ``owner``.
 
-        The emergency goes on while another person's order stands; the rows that it tripped wait for
-        `acknowledge`.
+        The emergency continues while another person's order is active; the rows that it tripped
+        wait for `acknowledge`.
 
         Returns
         -------
-        What people should know: how often it was repeated, and when the next one is taken.
+        What the operator should know: how often the order was repeated, and when the next one is
+        accepted.
 
         Raises
         ------
         RefusedError
-            If no order of theirs, or of the owner, stands, or the person's role is too low.
+            If neither the person nor the owner has an active order, or the person's role is too
+            low.
         """
         person.must_be(Role.OPERATOR, "withdraw")
         who, calls = owner or person.name, self.sentinel.calls
@@ -671,22 +676,22 @@ class PlantController:
         return told
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
-        """Acknowledge a row of the safety table that waits for it.
+        """Acknowledge a row of the safety table that is waiting for acknowledgement.
 
         Parameters
         ----------
         person
-            Their role must be high enough for the row.
+            The person acknowledging; their role must be high enough for the row.
         condition, subject
-            As the alarm names them. A row that a cluster watches has the cluster as subject; the
-            cluster decides, and ends the alarm if it agrees. For `counts_doubtful` it confirms that
-            the person has seen the heliostat where it should be; for `drive_stalled`, that its
-            mirror follows its drives.
+            As named in the alarm. For a row that a cluster evaluates, the subject is the cluster;
+            the cluster decides, and clears the alarm if it agrees. For `counts_doubtful` the
+            acknowledgement confirms that the person has seen the heliostat where it should be; for
+            `drive_stalled`, that its mirror follows its drives.
 
         Raises
         ------
         RefusedError
-            If the role is too low, or the cause has not gone.
+            If the role is too low, or the cause persists.
         """
         person.must_be(Role.OPERATOR, condition)
         role = person.role.acknowledges_as
@@ -705,7 +710,7 @@ class PlantController:
         self.note(person, "ACKNOWLEDGE", f"{condition} {subject}".strip())
 
     def note(self, person: Person, what: str, note: str) -> None:
-        """Record an act of a person that moves nothing, in the audit."""
+        """Record an action that moves nothing in the audit."""
         self._orders.note(person.name, person.role.title, what, note)
 
     # -- commands --------------------------------------------------------------------------
@@ -718,23 +723,23 @@ class PlantController:
         heliostats: Sequence[str] = (),
         values: Sequence[float] = (),
     ) -> Ticket:
-        """Give a command of the wire to some heliostats, or to all.
+        """Send a bus command to some or all heliostats.
 
         Parameters
         ----------
         person, token
             The person commanding, and the token of the command authority.
         name, values
-            As in `lcu.messages`; for AIM and STANDBY see `aim` and `standby`.
+            As in `lcu.messages`; for AIM and STANDBY use `aim` and `standby`.
         heliostats
             Names; () for all.
 
         Raises
         ------
         RefusedError
-            If it is not accepted; nothing is sent then.
+            If it is not accepted; in that case nothing is sent.
         InputError
-            An unknown name, or values that do not fit.
+            If a name is unknown, or values do not fit.
         """
         if name in messages.SAFE:
             return self._safe(person.name, Act[name], heliostats)
@@ -743,16 +748,16 @@ class PlantController:
     def default_aims(
         self, heliostats: Sequence[str] = (), points: npt.ArrayLike | None = None
     ) -> dict[str, FloatArray]:
-        """Return an aim for each heliostat (() for all), for `aim`; see `aims.default_aims`."""
+        """Return an aim per heliostat (() for all), to pass to `aim`; see `aims.default_aims`."""
         names = tuple(heliostats) or self.field.names
         rows = np.array([self.field.place(name) for name in names], dtype=np.intp)
         vertices = self.beams.armature.origin_1[rows]
         return default_aims(self.design, names, vertices, points)
 
     def aim(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Aim heliostats at points that stop their beams: on the receiver or on a target.
+        """Aim heliostats at points where a surface stops their beams: on a receiver or target.
 
-        Heliostats that track join their new aim at the rate at which they join the receiver.
+        Tracking heliostats move to their new aim at the rate at which they join the receiver.
 
         Parameters
         ----------
@@ -764,12 +769,12 @@ class PlantController:
         Raises
         ------
         RefusedError
-            If it is not accepted, or one of the beams may not go there.
+            If it is not accepted, or one of the beams is not allowed there.
         """
         return self.commands.point(person, token, "AIM", points)
 
     def standby(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Set standby points, beyond which beams go on; see `aim`."""
+        """Set standby points, beyond which the beams continue; see `aim`."""
         return self.commands.point(person, token, "STANDBY", points)
 
     def parameters(
@@ -781,30 +786,30 @@ class PlantController:
         confirmed: str = "",
         record: HeliostatCalibration | None = None,
     ) -> Ticket:
-        """Push items of the journal (see `board_items`) to one heliostat, and keep them wanted.
+        """Send journal items (see `board_items`) to one heliostat, and keep them as wanted.
 
-        Items that change its pose are accepted only where its beam is safe: at stow, or standing
-        still where its beam and its way to standby are free with the present parameters and with
-        the new ones.
+        Items that change the pose are accepted only where the beam is safe: at stow, or at rest
+        where the beam and its path to standby are clear with both the present and the new
+        parameters.
 
         Parameters
         ----------
         person, token
             The person commanding, and the token of the command authority.
         heliostat, items
-            Name, and bytes by item.
+            Name of the heliostat, and bytes by item.
         confirmed
-            Why a change above the limit of the settings is right; the audit keeps it.
+            Why a change above the limit of the settings is right; recorded in the audit.
         record
-            The calibration that the items come from, believed from the moment that they are sent;
-            None: it is taken later.
+            The calibration that the items come from, which the plant believes as soon as they are
+            sent; None: it is adopted later.
 
         Raises
         ------
         RefusedError
             If it is not accepted.
         InputError
-            Items that no plant pushes.
+            If the items are not ones that a plant sends.
         """
         row = self.field.place(heliostat)
         self.wanted.check(heliostat, items)
@@ -840,15 +845,16 @@ class PlantController:
 
     @contextmanager
     def unverified(self, heliostat: str) -> Iterator[None]:
-        """Trust new parameters of a heliostat as little as the present ones, until verified.
+        """Trust new parameters of a heliostat no more than the present ones, until verified.
 
-        It may not join the receiver, and its ways are proven with both.
+        Until then the heliostat may not join the receiver, and its paths are proven with both sets
+        of parameters.
         """
         with self.doubtful.unverified(heliostat), self._proofs.unverified(heliostat):
             yield
 
     def misled(self, heliostat: str, point: FloatArray) -> str | None:
-        """Return the reason, if any, why unverified parameters block a path to a point (3,)."""
+        """Return why unverified parameters block a path to a point (3,), if they do."""
         return self._proofs.misled(heliostat, point)
 
     def _unwritable(self, heliostat: str) -> str | None:
@@ -871,9 +877,9 @@ class PlantController:
         self.want(record.heliostat, self.beliefs.present(record.heliostat)[0])
 
     def want(self, heliostat: str, mechanism: Mechanism) -> None:
-        """Use a mechanism, batch shape (), in the beam checks and in the wanted parameters.
+        """Use a mechanism, batch shape (), in the beam checks and as the wanted parameters.
 
-        The local controller is compared, and written when its state allows it.
+        The local controller is compared with it, and updated when its state allows.
         """
         row = self.field.place(heliostat)
         self._use(row, mechanism.armature.table, mechanism.drives.table)
@@ -881,13 +887,13 @@ class PlantController:
         self._sync.compare(heliostat)
 
     async def ask_cluster(self, cluster: str, what: str, timeout: float) -> Answer | None:
-        """Return a cluster's answer to a question, or None; an unknown cluster is an error."""
+        """Return a cluster's reply to a query, or None; an unknown cluster is an error."""
         if cluster not in self._clusters.ends:
             raise UnknownNameError("cluster", cluster, self._clusters.ends)
         return await self._clusters.answer(cluster, what, timeout)
 
     def compared(self, heliostat: str) -> str:
-        """Return in words how the last comparison of the stored parameters of a heliostat ended."""
+        """Return the result of the last comparison of a heliostat's stored parameters, in words."""
         self.field.place(heliostat)
         return self._sync.compared(heliostat)
 
@@ -897,7 +903,7 @@ class PlantController:
         Raises
         ------
         RefusedError
-            If no answer comes.
+            If there is no reply.
         """
         self.field.place(heliostat)
         return await self._sync.stored(heliostat, timeout)

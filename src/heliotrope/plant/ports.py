@@ -1,8 +1,8 @@
 """Everything that a plant needs from outside, as protocols.
 
 A real plant and a simulated one are built by the same `plant.assembly.PlantAssembly`; they differ
-only in the `Ports` that are passed in: links to clusters, cameras, sensors, a clock, and places for
-records.
+only in the `Ports` that are passed in: links to clusters, cameras, sensors, a clock, and storage
+for records.
 """
 
 from collections.abc import Callable, Coroutine, Mapping, Sequence

@@ -1,6 +1,6 @@
-"""Every kind of refusal of the plant, as data: when, text and remedy.
+"""Every kind of refusal by the plant, as data: when, text and remedy.
 
-`docs/reference/alarms.md` lists them. The places that refuse fill in the text:
+`docs/reference/alarms.md` lists them. The code that refuses fills in the text:
 ``ROLE_TOO_LOW.error(what="TRACK", ...)``.
 
 ::
@@ -66,9 +66,9 @@ class Refusal:
     meaning
         Circumstances in which a command is refused.
     text
-        Text for people, with fields to be filled in.
+        Display text, with fields to fill in.
     remedy
-        What to do: a sentence.
+        What to do: one sentence.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Refusal:
     remedy: str
 
     def error(self, **fields: object) -> RefusedError:
-        """Return the error to be raised; ``fields`` complete its text."""
+        """Return the error to raise; ``fields`` complete its text."""
         return RefusedError(once(self.text.format(**fields)))
 
 

@@ -17,42 +17,44 @@ class PlantSettings:
     Attributes
     ----------
     lease, autonomy
-        A cluster hears the plant within ``lease`` s, and may go on without it for ``autonomy`` s
-        after that (see `safety.conditions`).
+        A cluster must receive from the plant within ``lease`` s, and may continue without the plant
+        for ``autonomy`` s after that (see `safety.conditions`).
     period, beat
-        Pause between leases; between evaluations of the safety table and the queues, s.
+        Interval between leases; interval between evaluations of the safety table and the queues, s.
     join_rate, join_burst
-        Heliostats that may join the receiver in a second, and at once after a rest.
+        Number of heliostats that may join the receiver per second, and at once after a pause.
     join_wait
-        Longest time that a heliostat may wait to join, s.
+        Maximum time that a heliostat may wait to join, s.
     join_life
-        Life of a command to join once its turn has come, s: a delayed command must not arrive
-        together with those whose turn came later.
+        Lifetime of a join command once its turn has come, s; a delayed command must not arrive
+        together with commands whose turn came later.
     lifetime, patience
-        Time allowed until a command is acknowledged, and from then until it is done, s.
+        Timeouts: until a command is acknowledged, and from then until it is done, s.
     stale
-        Age from which a value is stale, s.
+        Age above which a value is stale, s.
     authority
-        Life of the command authority without renewal, s.
+        Lifetime of the command authority without renewal, s.
     sensors
-        Readings of the safety table that come from sensors, by `PlantController.put`.
+        Safety-table readings that come from sensors, through `PlantController.put`.
     given
-        The same that programs give by the HTTP API; see `operations.given_readings`.
+        Safety-table readings that programs supply through the HTTP API; see
+        `operations.given_readings`.
     repeat
-        Pause between repetitions of an emergency order to heliostats that have not acknowledged
+        Interval between repetitions of an emergency order to heliostats that have not acknowledged
         it, s.
     largest_change
-        Largest change of a heliostat's beam by pushed parameters that nobody has confirmed, rad.
+        Maximum change of a heliostat's beam by new parameters that nobody has confirmed, rad.
     stow_rate
-        Heliostats a second that an ordinary STOW of more than these sends on their way, so that
-        their drives do not start together; 0: all at once. By the default 10,000 take 50 s, with
-        2 % of the field starting in a second. A person's LOCK takes one that waits out of its
-        order. Emergencies and the safety table never wait.
+        Number of heliostats per second that start an ordinary STOW of more than this number, so
+        that their drives do not start together; 0: all at once. With the default, 10,000 take 50 s,
+        and 2 % of the field start per second. An operator's LOCK removes a waiting heliostat from
+        its order. Emergencies and the safety table never wait.
     witnesses
         Witnesses of the sun, one of which must agree before the first heliostat of a day joins a
-        receiver; none: the plant says so once a day; None: that is accepted. See `witnesses`.
+        receiver. Empty: the plant reports once a day that there is none; None: this is accepted.
+        See `witnesses`.
     firmware
-        Version of the firmware that every board should have; None: they are not compared.
+        Firmware version that every board should have; None: versions are not compared.
     common
         Settings that every cluster should have; None: the clusters are compared with each other.
     """
@@ -107,12 +109,12 @@ class Counters:
 
 
 def clusters_of(design: Plant) -> dict[str, tuple[str, ...]]:
-    """Return the heliostats of each cluster of a design.
+    """Return the heliostats of each cluster in a design.
 
     Raises
     ------
     InputError
-        A heliostat without a cluster.
+        If a heliostat has no cluster.
     """
     found: dict[str, list[str]] = {}
     for group in design.groups.values():

@@ -1,8 +1,9 @@
-"""Computations of the plant beside its loop, which renews leases and must not wait for them.
+"""Computations outside the plant's event loop, which renews leases and must not wait for them.
 
-A thread would not do: the threads of a process take turns, and one call of a library may keep the
-turn for seconds. So computations are functions of their arguments alone, which processes beside the
-plant compute; in virtual time, and where a computation is as short as a message, at once.
+A thread would not be enough, because the threads of a process take turns, and one library call may
+hold the interpreter for seconds. Computations are therefore functions of their arguments alone,
+which are run in processes beside the plant; in virtual time, and if a computation is as short as a
+message, they run in the event loop.
 """
 
 import asyncio

@@ -1,10 +1,9 @@
-"""Pictures of days, errors, fields and mechanisms, each on given axes or new ones.
+"""Plots of days, errors, fields and mechanisms, on given axes or new ones.
 
-Drawn on axes of matplotlib, which are returned: `day`, `residuals`, `ellipses`, `field_map`,
-`year_map`, `drift`, `receiver_map`, `efficiency_map` and `flux_3d`; reports draw with the same
-functions. `flux_figure` gives a figure of the field's light, and `mechanism_3d` one of plotly with
-a slider of time (``pip install 'heliotrope[notebook]'``). Colours can be told apart by the
-colour-blind.
+`day`, `residuals`, `ellipses`, `field_map`, `year_map`, `drift`, `receiver_map`, `efficiency_map`
+and `flux_3d` draw on matplotlib axes and return them; reports use the same functions. `flux_figure`
+returns a figure of the field's flux, and `mechanism_3d` a plotly figure with a time slider (``pip
+install 'heliotrope[notebook]'``). Colours are distinguishable with colour blindness.
 """
 
 from heliotrope.plot.charts import (

@@ -1,4 +1,4 @@
-"""Charts on axes of matplotlib."""
+"""Charts on matplotlib axes."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,23 +18,23 @@ from heliotrope.sun import Times, unix_seconds
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Colours of Okabe and Ito, told apart by the colour-blind too.
+#: Colours of Okabe and Ito, which are distinguishable with colour blindness.
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#999999")
 #: Most names that are written beside the dots of a map.
 _NAMED = 60
 
 
 class Group(NamedTuple):
-    """Points that are drawn alike.
+    """Points that are drawn in the same style.
 
     Attributes
     ----------
     mask
-        Which points, (M,).
+        Mask of the points, (M,).
     colour, label
-        How they are drawn, and their name in the legend.
+        Style of the points, and their name in the legend.
     odd
-        Whether they are drawn as crosses and do not set the limits of the axes, as outliers.
+        Whether they are drawn as crosses and excluded from the axis limits, as for outliers.
     """
 
     mask: npt.NDArray[np.bool_]
@@ -93,7 +93,7 @@ def day(
     joints: Sequence[str] = ("first drive", "second drive"),
     ax: "Axes | None" = None,
 ) -> "Axes":
-    """Draw the joint angles of one heliostat over the time, and where it does not reach its aim.
+    """Draw the joint angles of one heliostat over time, and where it does not reach its aim.
 
     Parameters
     ----------
@@ -101,16 +101,18 @@ def day(
         A day of one heliostat, as `heliotrope.track_day` returns it; or T times, as for
         `heliotrope.sun.vector`.
     tracked
-        For times: their solutions, batch shape (T,), of which the best branch is drawn; or a path.
+        If times are passed: their solutions, batch shape (T,), of which the best branch is drawn;
+        or a path.
     joints
         Names of the drives.
     ax
-        Axes to draw on; default new ones.
+        Axes to draw on; by default new axes.
 
     Raises
     ------
     InputError
-        If there are not as many solutions as times, or none, or a day and solutions.
+        If the number of solutions differs from the number of times, solutions are missing, or both
+        a day and solutions are passed.
     """
     if isinstance(times, TrackedDay):
         if tracked is not None:
@@ -152,20 +154,20 @@ def residuals(
     groups: Sequence[Group] = (),
     ax: "Axes | None" = None,
 ) -> "Axes":
-    """Draw beam errors to the right (dots) and upwards (triangles) against anything.
+    """Draw beam errors to the right (dots) and upwards (triangles) against any quantity.
 
     Parameters
     ----------
     x
-        Numbers or dates, (M,): elevations of the sun, counts, times.
+        Numbers or dates, (M,): sun elevations, counts, times.
     beam
         Beam errors right and up, rad, (M, 2): ``BeamErrors.offset``, ``Prediction.plane``.
     label
         What ``x`` is, with its unit.
     groups
-        Points that are drawn alike; default all of them.
+        Points that are drawn in the same style; by default all points.
     ax
-        Axes to draw on; default new ones.
+        Axes to draw on; by default new axes.
 
     Raises
     ------
@@ -203,22 +205,23 @@ def ellipses(
     title: str = "",
     ax: "Axes | None" = None,
 ) -> "Axes":
-    """Draw points on a target about its aim, with the ellipses that hold 90 % of them.
+    """Draw points on a target about its aim, with their 90 % ellipses.
 
     Parameters
     ----------
     plane
         To the right of and above the aim, (M, 2).
     covariance
-        Of each point, (M, 2, 2) or (2, 2), in the square of the unit; default no ellipses.
+        Covariance of each point, (M, 2, 2) or (2, 2), in the square of the unit; by default no
+        ellipses.
     unit
         Unit of the axes.
     groups
-        Points that are drawn alike; default all of them.
+        Points that are drawn in the same style; by default all points.
     title
         Title of the axes.
     ax
-        Axes to draw on; default new ones.
+        Axes to draw on; by default new axes.
 
     Raises
     ------
@@ -288,25 +291,26 @@ def field_map(
     whole: bool = False,
     ax: "Axes | None" = None,
 ) -> "Axes":
-    """Draw a map of heliostats coloured by a number; grey where it is NaN.
+    """Draw a map of heliostats coloured by a value; grey where the value is NaN.
 
     Parameters
     ----------
     position
         ENU metres, (N, 3) or (N, 2).
     values
-        One number each, (N,), in the unit of the label; the colours end at the 95th percentile.
+        One value per heliostat, (N,), in the unit of the label; the colour scale ends at the 95th
+        percentile.
     label
-        What the numbers are, with their unit.
+        What the values are, with their unit.
     names
-        Written beside the dots of at most 60 heliostats.
+        Labels beside the dots of at most 60 heliostats.
     targets
         Centres of targets, (K, 3), drawn as triangles.
     whole
-        The colours go from the lowest number to the highest, instead of from 0 to the 95th
-        percentile.
+        Whether the colour scale runs from the lowest to the highest value, instead of from 0 to the
+        95th percentile.
     ax
-        Axes to draw on; default new ones.
+        Axes to draw on; by default new axes.
 
     Raises
     ------
@@ -355,7 +359,7 @@ def year_map(
     label: str = "expected beam error, mrad RMS",
     ax: "Axes | None" = None,
 ) -> "Axes":
-    """Draw the expected beam error for every position of the sun in a year.
+    """Draw the expected beam error for every sun position in a year.
 
     Parameters
     ----------
@@ -363,11 +367,11 @@ def year_map(
         Hour angles (H,) and declinations (D,) of the sun, rad, as in
         `heliotrope.calibration.YearMap`.
     rms
-        Errors, rad, (D, H); NaN where there is none.
+        Errors, rad, (D, H); NaN where there is no value.
     label
         What the colours are.
     ax
-        Axes to draw on; default new ones.
+        Axes to draw on; by default new axes.
 
     Raises
     ------
@@ -402,20 +406,20 @@ def drift(
     shown: Sequence[str] | None = None,
     ax: "Axes | None" = None,
 ) -> "Axes":
-    """Draw parameters of one heliostat over the time, with a band of one standard deviation.
+    """Draw parameters of one heliostat over time, with a band of one standard deviation.
 
     Parameters
     ----------
     times
         T times.
     values, covariance
-        As `heliotrope.Learned.parameters_at` gives them, (T, P) and (T, P, P).
+        As returned by `heliotrope.Learned.parameters_at`, (T, P) and (T, P, P).
     names
-        The P parameters.
+        Names of the P parameters.
     shown
-        Those to draw, of one unit; default all that have the unit of the first.
+        Parameters to draw, all with the same unit; by default all that have the unit of the first.
     ax
-        Axes to draw on; default new ones.
+        Axes to draw on; by default new axes.
 
     Raises
     ------

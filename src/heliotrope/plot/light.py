@@ -21,14 +21,14 @@ _MOST = 4000
 
 
 def receiver_map(view: FluxView, *, ax: "Axes | None" = None) -> "Axes":
-    """Draw the flux on a receiver; a cylinder's is unrolled.
+    """Draw the flux on a receiver; a cylinder is unrolled.
 
     Parameters
     ----------
     view
         One of `heliotrope.optics.PlantFlux.maps`.
     ax
-        Axes to draw on; default new ones.
+        Axes to draw on; by default new axes.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def efficiency_map(found: PlantFlux, by: str = "total", *, ax: "Axes | None" = N
     by
         One of "cosine", "shading", "blocking", "lit", "mirror", "air", "intercept" and "total".
     ax
-        Axes to draw on; default new ones.
+        Axes to draw on; by default new axes.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> 
     by
         As for `efficiency_map`.
     ax
-        Axes of matplotlib in three dimensions; default new ones.
+        Three-dimensional matplotlib axes; by default new axes.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> 
 
 
 def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
-    """Return one picture of a field's light: map, first receiver unrolled, and both in space."""
+    """Return one figure of the field's flux: map, first receiver unrolled, and a 3-D view."""
     import matplotlib.pyplot as plt
 
     figure = plt.figure(figsize=(13.0, 8.0), layout="constrained")

@@ -1,4 +1,4 @@
-"""A mechanism in three dimensions, with a slider of time."""
+"""A mechanism in three dimensions, with a time slider."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ def mechanism_3d(
     title: str = "armature and mirror",
     figure: "Figure | None" = None,
 ) -> "Figure":
-    """Return a figure of plotly: a heliostat's bones, axes and mirror, with a slider of time.
+    """Return a plotly figure: a heliostat's bones, axes and mirror, with a time slider.
 
     Parameters
     ----------
@@ -41,18 +41,19 @@ def mechanism_3d(
     width, height
         Size of the mirror, m.
     labels
-        Names of the T moments on the slider; default their numbers.
+        Names of the T times on the slider; default their indices.
     sun, aim
-        Directions to the sun, (T, 3), and the aim point, ENU m, (3,), whose rays are drawn.
+        Sun vectors, (T, 3), and the aim point, ENU m, (3,), whose rays are drawn.
     title
         Title of the figure.
     figure
-        Figure to draw on; default a new one.
+        Figure to draw on; by default a new figure.
 
     Raises
     ------
     InputError
-        Not one mechanism with two drives, shapes that do not fit, or plotly is not installed.
+        If there is not exactly one mechanism with two drives, shapes do not fit, or plotly is not
+        installed.
     """
     try:
         import plotly.graph_objects as go

@@ -1,12 +1,12 @@
-"""Safety: the table of conditions, its pure evaluation, alarms, and the proof of an emergency.
+"""Safety: the condition table and its evaluation, alarms, and confirmation of emergency orders.
 
 Begin with `CONDITIONS`, the rows of the table, and `evaluate`, which turns readings and time into
-the actions that are demanded. `Proof` records that every heliostat obeyed an emergency order.
-`limited` gives the table with the numbers that a plant sets for its site.
-`JoinLimiter` bounds the rate at which heliostats join the receiver. `Alarm` is a message to people,
-and `heliotrope.safety.alarms` lists every kind of alarm beside the rows.
+the required actions. `Proof` records whether every heliostat obeyed an emergency order. `limited`
+returns the table with the limits that a plant sets for its site. `JoinLimiter` limits the rate at
+which heliostats join the receiver. `Alarm` is a message to operators, and
+`heliotrope.safety.alarms` lists every kind of alarm that is not a row of the table.
 
-Nothing here reads a clock, a sensor or a link.
+No function in this package reads a clock, a sensor or a link.
 """
 
 from heliotrope.safety.alarms import Alarm, AlarmKind

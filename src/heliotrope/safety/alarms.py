@@ -1,8 +1,8 @@
-"""The alarms beside the rows of the safety table, as data: severity, text, consequence, remedy.
+"""Alarms that are not rows of the safety table, as data: severity, text, consequence, remedy.
 
-The code that raises an alarm fills in its text: ``NODE_SILENT.raised("H12", ...)``. So each text
-stands once, and `docs/reference/alarms.md` and the operator's handbook are checked against this
-table and the rows of `safety.conditions`.
+The code that raises an alarm fills in its text: ``NODE_SILENT.raised("H12", ...)``. Each text is
+therefore defined only once, and `docs/reference/alarms.md` and the operator's handbook are checked
+against this table and the rows of `safety.conditions`.
 """
 
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ _PLANT, _CLUSTER = Watcher.PLANT, Watcher.CLUSTER
 
 @dataclass(frozen=True)
 class Alarm:
-    """One alarm, raised or over: a message of the links too.
+    """One alarm, raised or cleared; it is also a message on the links.
 
     Attributes
     ----------
     condition, subject
-        Name of the row or of the `AlarmKind`; the cluster, heliostat, target or sensor it is about,
-        "" for the plant.
+        Name of the row or of the `AlarmKind`; the cluster, heliostat, target or sensor that the
+        alarm concerns, "" for the plant.
     severity, text
         Severity, and text for the operator.
     active
-        Whether it still holds; False ends it.
+        Whether the alarm is still active; False clears it.
     """
 
     kind: ClassVar[str] = "alarm"
@@ -44,21 +44,21 @@ class AlarmKind:
     Attributes
     ----------
     name
-        Name on the wire and on the page.
+        Name in messages and on the page.
     watcher
-        Tier that raises it.
+        Control tier that raises it.
     severity
         Usual severity.
     meaning
         Circumstances in which it is raised.
     text
-        What is wrong and where, with ``{subject}`` and other fields to be filled in.
+        What is wrong and where, with ``{subject}`` and other fields to fill in.
     consequence, remedy
-        What happens by itself, and what the operator should do: a sentence each.
+        What happens automatically, and what the operator should do: one sentence each.
     over
-        Text when it is over; empty for an alarm that never ends by itself.
+        Text when the alarm has cleared; empty for an alarm that never clears by itself.
     worse
-        Severity in the worse case that ``meaning`` names, if there is one.
+        Severity in the more serious case that ``meaning`` describes, if there is one.
     """
 
     name: str
@@ -72,16 +72,16 @@ class AlarmKind:
     worse: Severity | None = None
 
     def line(self, **fields: object) -> str:
-        """Return the whole text: what is wrong, what happens by itself, what to do."""
+        """Return the whole text: what is wrong, what happens automatically, what to do."""
         return f"{once(self.text.format(**fields))}. {self.consequence} {self.remedy}"
 
     def raised(self, subject: str = "", *, worse: bool = False, **fields: object) -> Alarm:
-        """Return the alarm about a subject; ``fields`` complete its text."""
+        """Return the active alarm for a subject; ``fields`` complete its text."""
         severity = self.worse if worse and self.worse is not None else self.severity
         return Alarm(self.name, subject, severity, self.line(subject=subject, **fields))
 
     def ended(self, subject: str = "", **fields: object) -> Alarm:
-        """Return the message that the alarm about a subject is over."""
+        """Return the message that clears the alarm for a subject."""
         text = (self.over or "{subject} {name}: over").format(
             subject=subject, name=self.name, **fields
         )

@@ -1,4 +1,4 @@
-"""The parts of a row of the safety table."""
+"""The components of a row of the safety table."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ UNKNOWN_TIME = 1e8
 
 
 class Act(IntEnum):
-    """The acts, from weak to strong; the strongest wins."""
+    """The safety actions in ascending order; the strongest takes precedence."""
 
     ALARM = 0
     REFUSE_NEW = 1
@@ -21,7 +21,7 @@ class Act(IntEnum):
 
     @property
     def text(self) -> str:
-        """The act in words."""
+        """The action in words."""
         return _ACT_TEXTS[self]
 
 
@@ -43,7 +43,7 @@ class Scope(IntEnum):
 
 
 class Severity(StrEnum):
-    """Severity of an alarm or event; the same word on the wire, in the store and on the page."""
+    """Severity of an alarm or event; the same word in messages, in the store and on the page."""
 
     INFO = "info"
     WARNING = "warning"
@@ -52,23 +52,23 @@ class Severity(StrEnum):
 
     @property
     def rank(self) -> int:
-        """Rank from 0, the least serious."""
+        """Rank from 0, the least severe."""
         return tuple(Severity).index(self)
 
     @classmethod
     def read(cls, word: str) -> "Severity":
-        """Return the severity that another program names.
+        """Return the severity that another program specified.
 
-        Upper case is accepted. An unknown word counts as `ALARM`: no alarm is lost because of its
-        severity.
+        Upper case is accepted. An unknown word counts as `ALARM`, so that no alarm is lost because
+        of its severity.
         """
         return next((severity for severity in cls if severity == word.lower()), cls.ALARM)
 
 
 class AcknowledgeRole(IntEnum):
-    """Role that may acknowledge; a higher role may acknowledge for a lower one.
+    """Role that is allowed to acknowledge; a higher role may acknowledge for a lower role.
 
-    The console's engineer acts as supervisor, and people are shown that title.
+    The console's engineer acts as supervisor, and that title is displayed.
     """
 
     OPERATOR = 0
@@ -76,12 +76,12 @@ class AcknowledgeRole(IntEnum):
 
     @property
     def title(self) -> str:
-        """The role as the control room knows it."""
+        """The role as the control room calls it."""
         return "operator" if self is AcknowledgeRole.OPERATOR else "engineer"
 
 
 class Watcher(Enum):
-    """The tier that evaluates a row, or raises an alarm."""
+    """The control tier that evaluates a row, or raises an alarm."""
 
     PLANT = "plant"
     CLUSTER = "cluster"
@@ -90,7 +90,7 @@ class Watcher(Enum):
 
 @dataclass(frozen=True)
 class Reading:
-    """A value in the unit of its row, and its time, monotonic s."""
+    """A value in the unit of its row, and the time of measurement, monotonic s."""
 
     value: float
     at: float
@@ -105,42 +105,43 @@ class Condition:
     name
         Unique name.
     watcher
-        Tier that evaluates it.
+        Control tier that evaluates it.
     reading, unit
         Key of the reading, and its unit: "s", "m/s", "rad", "°C", "share" (1 is 100 %), "count" or
         "yes/no" (1 is yes).
     what, wrong
-        The reading as a noun; what is wrong when the row trips, with ``{value}`` for the reading.
+        The reading as a noun; and what is wrong when the row trips, with ``{value}`` for the
+        reading.
     trips, releases
-        The row trips at ``trips`` or beyond, and may release at ``releases`` or on its safe side.
-        ``trips`` above ``releases`` means that large values are bad.
+        The row trips at ``trips`` or beyond, and may release at ``releases`` or on the safe side of
+        it. ``trips`` above ``releases`` means that high values are unsafe.
     act, scope, severity
-        The act, the part of the plant that it applies to, and the severity.
+        The action, the part of the plant that it applies to, and the severity.
     budget
-        Longest time from the fault to the finished action, s.
+        Maximum time from the fault to the completed action, s.
     then_stow
-        Time from the trip to STOW in place of ``act``, s; infinite for never.
+        Time from the trip until STOW replaces ``act``, s; infinite for never.
     or_stow
-        Whether the plant may order STOW at once where DEFOCUS would not take the beam away.
+        Whether the plant may order STOW at once if DEFOCUS would not move the beam away.
     delay
-        Time that the value must be beyond ``trips``, s.
+        Time for which the value must be beyond ``trips``, s.
     clear_for
-        Time that fresh readings must be safe before release, s.
+        Time for which fresh readings must be safe before release, s.
     stale_after
-        Age from which a reading counts as its worst case, s; not used with ``ages``.
+        Age above which a reading counts as the worst case, s; not used with ``ages``.
     ages
-        Whether the reading is an age or a silence, which grows until the next reading.
+        Whether the reading is an age or a silence, which increases until the next reading.
     role
-        Role that must acknowledge; None if the row does not latch.
+        Role required to acknowledge; None if the row does not latch.
     waiver
-        Role that may end a row that does not latch although its cause has not gone; None: nobody.
+        Role that may release a non-latching row whose cause persists; None: nobody.
     release
-        Condition of its end, in words.
+        Condition for its release, in words.
     remedy
-        What the operator should do: a sentence.
+        What the operator should do: one sentence.
     site
-        Lowest and highest ``trips`` that a plant may set, in the reading's unit; None: no number of
-        the row is a plant's. See `limits`.
+        Lowest and highest ``trips`` that a plant may set, in the unit of the reading; None: the
+        plant file may not change any limit of the row. See `limits`.
     """
 
     name: str
@@ -196,17 +197,17 @@ class Condition:
 
     @property
     def above(self) -> bool:
-        """Whether large values are bad."""
+        """Whether high values are unsafe."""
         return self.trips > self.releases
 
     @property
     def latched(self) -> bool:
-        """Whether it stays until a person acknowledges it."""
+        """Whether the row stays tripped until an operator acknowledges it."""
         return self.role is not None
 
     @property
     def detection(self) -> float:
-        """Longest time from the fault to the trip, s, including the loss of the reading itself."""
+        """Maximum time from the fault to the trip, s, including loss of the reading itself."""
         return self.delay + (self.trips if self.ages else self.stale_after)
 
     @property
@@ -223,7 +224,7 @@ class Condition:
         return value <= self.releases if self.above else value >= self.releases
 
     def shown(self, value: float) -> str:
-        """Return a value of the reading as people read it."""
+        """Return a value of the reading, formatted for display."""
         match self.unit:
             case "share":
                 return f"{100.0 * value:.3g} %"
@@ -240,16 +241,16 @@ class Condition:
 
     @property
     def limit(self) -> str:
-        """The trip in words, as " (limit 3 s)"; "" for a row of yes or no, or of a count."""
+        """The trip limit in words, as " (limit 3 s)"; "" for a yes/no or count row."""
         return "" if self.unit in ("yes/no", "count") else f" (limit {self.shown(self.trips)})"
 
     def ordered(self, act: Act) -> str:
-        """Return an act by name, as the plant may order it."""
+        """Return an action by name, if the plant may order it."""
         return "DEFOCUS or STOW" if self.or_stow and act is Act.DEFOCUS else act.name
 
     @property
     def consequence(self) -> str:
-        """The automatic action: a sentence."""
+        """The automatic action: one sentence."""
         target = {Scope.HELIOSTAT: "the heliostat", Scope.CLUSTER: "the cluster"}
         whole = target.get(self.scope, "the field")
         text = {

@@ -1,8 +1,8 @@
 """The rows of the safety table.
 
-The numbers are defaults. A plant sets those of a row with ``site`` for its receiver, its mirrors
-and its weather (`limits`); the ranges are ours. The wind limits are common for heliostats of tens
-of square metres; replace them by the maker's.
+The limits are defaults. A plant sets those of a row with ``site`` to suit its receiver, its
+heliostats and its weather (`limits`); the permitted ranges are our own. The wind limits are typical
+of heliostats of tens of square metres; replace them with the manufacturer's.
 """
 
 import math
@@ -31,8 +31,8 @@ def conditions(autonomy: float = 0.0) -> tuple[Condition, ...]:
     Parameters
     ----------
     autonomy
-        Time that clusters may go on without the plant, s. Set it above 0 only where a hard-wired
-        emergency line reaches every cluster.
+        Time for which clusters may continue without the plant, s. Set it above 0 only if a
+        hard-wired emergency line reaches every cluster.
 
     Raises
     ------
@@ -370,5 +370,5 @@ def _mirrors() -> tuple[Condition, ...]:
     )  # fmt: skip
 
 
-#: The table at autonomy 0.
+#: The table with autonomy 0.
 CONDITIONS = conditions()

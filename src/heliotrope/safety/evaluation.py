@@ -1,19 +1,20 @@
-"""The evaluation of the safety table: a pure function of readings, state and time.
+"""Evaluation of the safety table: a pure function of readings, state and time.
 
-The plant, the clusters and the local controllers each watch the rows that name them. A row gives
-the reading that trips it, the value and the delay; the act, its scope and its severity; whether it
-latches and which role must acknowledge it; and when it releases. Nothing here reads a clock or a
-sensor: readings and time (monotonic seconds) are arguments.
+The plant, the clusters and the local controllers each evaluate the rows that name them. A row
+defines the reading that trips it, the limit and the delay; the action, its scope and its severity;
+whether the row latches and which role must acknowledge it; and when it releases. This module reads
+no clock and no sensor: readings and time (monotonic seconds) are arguments.
 
 Rules for every row:
 
-- A reading that is missing, not finite or from the future does not count. The last good one counts
-  until it is older than the row's age; from then on the worst case counts. A reading that is itself
-  an age (a silence) grows by itself.
-- Only fresh readings release a row: a stream that stands still never improves anything.
-- A latched row stays until its cause has gone *and* a person of the row's role or above
-  acknowledges it. An acknowledgement before the cause has gone is refused.
-- The strongest action wins. A released row moves no heliostat: that needs a fresh command.
+- A reading that is missing, not finite or from the future is ignored. The last valid reading counts
+  until it is older than the age limit of the row; after that the worst case counts. A reading that
+  is itself an age (a silence) keeps increasing.
+- Only fresh readings release a row, so a frozen data stream never improves the situation.
+- A latched row stays tripped until its cause has gone *and* an operator with the row's role or a
+  higher role acknowledges it. An acknowledgement before the cause has gone is refused.
+- The strongest action takes precedence. A released row moves no heliostat; motion needs a new
+  The memory of the evaluation: rows, their tracking state, last evaluation time, s.
 """
 
 import math
@@ -76,28 +77,28 @@ class SafetyState:
     tracks: Mapping[Key, Track] = field(default_factory=dict)
 
     def tripped(self) -> tuple[Key, ...]:
-        """Return the rows that are tripped, each with its subject."""
+        """Return the tripped rows, each with its subject."""
         return tuple(key for key, track in self.tracks.items() if track.tripped_at is not None)
 
 
 @dataclass(frozen=True)
 class Action:
-    """The demand of a tripped row.
+    """The action required by a tripped row.
 
     Attributes
     ----------
     act, scope, subject
-        The act and its scope; the name of the cluster or heliostat, "" for the field.
+        The action and its scope; and the name of the cluster or heliostat, "" for the field.
     condition, severity, budget
         Name, severity and budget (s) of the row.
     since
         Time of the trip, monotonic s.
     new
-        Whether it tripped, or became a STOW, in this evaluation.
+        Whether the row tripped, or changed to STOW, in this evaluation.
     waits
         Whether only an acknowledgement is missing.
     text, remedy
-        What is wrong and what happens by itself, and what the operator should do.
+        What is wrong and what happens automatically; and what the operator should do.
     """
 
     act: Act
@@ -121,24 +122,24 @@ class Action:
 def start(
     table: Iterable[Condition], now: float, subjects: Mapping[str, Iterable[str]] | None = None
 ) -> SafetyState:
-    """Return the state before the first evaluation: nothing tripped, nothing seen.
+    """Return the state before the first evaluation, in which no row has tripped.
 
     Parameters
     ----------
     table
         The rows to evaluate, from `conditions` and `watched_by`.
     now
-        Monotonic seconds; the ages of readings that never come count from here.
+        Monotonic seconds; the age of a reading that never arrives counts from this time.
     subjects
-        For a row of scope CLUSTER or HELIOSTAT, by its name: the clusters or heliostats that
-        it is evaluated for. Without them it is evaluated once, for the subject "".
+        By name, for rows of scope CLUSTER or HELIOSTAT: the clusters or heliostats for which to
+        evaluate the row. Without subjects a row is evaluated once, for the subject "".
 
     Raises
     ------
     InputError
-        If ``now`` is not finite, or a name stands twice in the table.
+        If ``now`` is not finite, or a name occurs twice in the table.
     UnknownNameError
-        If ``subjects`` names a row that is not in the table.
+        Return the state with a row evaluated only for some subjects and those that trip it.
     """
     rows = tuple(table)
     if not math.isfinite(now):
@@ -158,12 +159,12 @@ def start(
 def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetyState:
     """Return the state with a row evaluated for some subjects and those that it trips for.
 
-    Made for rows about heliostats, few of which ever need evaluating.
+    For rows about heliostats, of which only a few ever need evaluation.
 
     Parameters
     ----------
     state
-        State from `start` or the last evaluation.
+        State from `start` or from the last evaluation.
     name
         Name of the row.
     subjects
@@ -183,8 +184,8 @@ def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetySt
 def recalled(state: SafetyState, keys: Iterable[Key]) -> SafetyState:
     """Return the state with rows tripped as before a restart, each with its subject.
 
-    They release as all rows do: by fresh readings, and an acknowledgement where they wait for one.
-    A row that is no longer in the table is left out.
+    They release like all rows, through fresh readings and, where required, an acknowledgement. A
+    row that is no longer in the table is left out.
     """
     known = {row.name: row for row in state.table}
     tripped = {
@@ -198,18 +199,18 @@ def recalled(state: SafetyState, keys: Iterable[Key]) -> SafetyState:
 def evaluate(
     readings: Mapping[Key, Reading], state: SafetyState, now: float
 ) -> tuple[SafetyState, list[Action]]:
-    """Return the next state and every action demanded now, the strongest first.
+    """Return the next state and every action required now, the strongest first.
 
     Parameters
     ----------
     readings
-        By name of the reading and subject. The reading of subject "" serves where a
-        subject has none of its own.
+        By reading name and subject. A reading with subject "" is used for subjects that have no
+        reading of their own.
     state
-        State from `start` or the last evaluation.
+        State from `start` or from the last evaluation.
     now
-        Monotonic seconds. A time before the last one is a broken clock: DEFOCUS of the
-        field is demanded, and nothing ages or releases.
+        Monotonic seconds. A time before the last evaluation indicates a faulty clock: a field-wide
+        DEFOCUS is required, and no row ages or releases.
     """
     actions: list[Action] = []
     time = now
@@ -366,16 +367,16 @@ def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) 
 def acknowledge(
     state: SafetyState, condition: str, who: str, role: AcknowledgeRole, subject: str = ""
 ) -> tuple[SafetyState, str | None]:
-    """Return the state after a person's acknowledgement, and the reason of a refusal or None.
+    """Return the state after an operator's acknowledgement, and the reason if refused, or None.
 
     Parameters
     ----------
     state
-        After the last evaluation.
+        State after the last evaluation.
     condition, subject
-        The row, and the cluster or heliostat that it is about.
+        The row, and the cluster or heliostat that it concerns.
     who, role
-        The person's name, for the record, and role.
+        The operator's name, for the record, and role.
     """
     rows = {row.name: row for row in state.table}
     row, track = rows.get(condition), state.tracks.get((condition, subject))
@@ -411,7 +412,7 @@ def _remains(row: Condition, track: Track, now: float) -> str:
 
 
 def decision(actions: Iterable[Action], cluster: str = "", heliostat: str = "") -> Act | None:
-    """Return the strongest act that applies to a heliostat of a cluster; None if there is none.
+    """Return the strongest action that applies to a heliostat in a cluster; None if none does.
 
     An action without a subject applies to everything that the evaluating tier commands.
     """
@@ -421,5 +422,5 @@ def decision(actions: Iterable[Action], cluster: str = "", heliostat: str = "") 
 
 
 def watched_by(table: Iterable[Condition], watcher: Watcher) -> tuple[Condition, ...]:
-    """Return the rows that a tier evaluates."""
+    """Return the rows that a control tier evaluates."""
     return tuple(row for row in table if row.watcher is watcher)

@@ -1,4 +1,4 @@
-"""A bound on how many heliostats join the receiver: a token bucket without a clock."""
+"""A limit on how many heliostats join the receiver: a token bucket without a clock."""
 
 import math
 from dataclasses import dataclass, replace
@@ -8,18 +8,18 @@ from heliotrope.errors import InputError
 
 @dataclass(frozen=True)
 class JoinLimiter:
-    """The bound on the rate at which heliostats join the receiver.
+    """A limit on the rate at which heliostats join the receiver.
 
     In any span of T seconds at most ``burst + rate · T`` heliostats join.
 
     Attributes
     ----------
     rate
-        Heliostats a second, 0 or more.
+        Heliostats per second, 0 or more.
     burst
-        Heliostats at once after a rest, a whole number from 1.
+        Number of heliostats that may join at once after a pause, an integer of at least 1.
     tokens, at
-        Heliostats that may join at the monotonic time ``at``, s. A new limiter is empty.
+        Number of heliostats that may join at the monotonic time ``at``, s. A new limiter is empty.
     """
 
     rate: float
@@ -34,10 +34,10 @@ class JoinLimiter:
             raise InputError(f"joining burst {self.burst} must be a whole number from 1")
 
     def admit(self, wanted: int, now: float) -> tuple["JoinLimiter", int]:
-        """Return the limiter afterwards and how many of ``wanted`` heliostats may join now.
+        """Return the updated limiter, and how many of ``wanted`` heliostats may join now.
 
-        A clock that stands still, goes back or is not a number grants no tokens; one that jumps
-        ahead fills the bucket to its burst at most.
+        A clock that stops, runs backwards or is not a number grants no tokens; a clock that jumps
+        ahead fills the bucket at most to its burst size.
         """
         at = self.at
         tokens = self.tokens

@@ -1,9 +1,9 @@
-"""Limits of a site: the numbers of the safety table that a plant sets for itself.
+"""Site limits: the limits of the safety table that a plant sets for itself.
 
-A plant file, and for its own rows a cluster file, gives them by condition, each key with its unit:
-``[safety.wind_gust_stow] trips_m_s = 18``. `limited` checks them and returns the table with them. A
-number that would loosen an invariant (how soon a fault is noticed, how soon a beam is off) is
-refused, and so is every number of a row that rests on leases or on people's orders
+A plant file, or for its own rows a cluster file, sets limits by condition, with the unit in each
+key: ``[safety.wind_gust_stow] trips_m_s = 18``. `limited` checks them and returns the table with
+these limits. A limit that would weaken an invariant (how soon a fault is detected, how soon a beam
+is off) is rejected, and so is every limit of a row that depends on leases or on operator orders
 (`Condition.site` is None).
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 from heliotrope.errors import InputError
 from heliotrope.safety.condition import Act, Condition
 
-#: Numbers by condition and key, as a file gives them.
+#: Limits by condition and key, as in a file.
 Limits = Mapping[str, Mapping[str, float]]
 #: Ends of the keys of `trips` and `releases` by the unit of the reading, and their size in it.
 _UNITS: dict[str, dict[str, float]] = {
@@ -73,7 +73,7 @@ class Setting:
 
 
 def settings_of(row: Condition) -> dict[str, Setting]:
-    """Return the numbers of a row that a plant may set, by key; none if the row has no range."""
+    """Return the limits of a row that a plant may set, by key; empty if the row has no range."""
     if row.site is None:
         return {}
     settings: list[Setting] = []
@@ -102,8 +102,8 @@ def limited(table: Iterable[Condition], limits: Limits) -> tuple[Condition, ...]
     Raises
     ------
     InputError
-        An unknown row or key, a number out of its range, one that no file may set, or rows that
-        contradict themselves or each other; the text begins with the row and the key.
+        If a row or key is unknown, a limit is out of its range or may not be set by a file, or rows
+        contradict themselves or each other; the message begins with the row and the key.
     """
     rows = {row.name: row for row in table}
     for name, row_limits in limits.items():
@@ -115,7 +115,7 @@ def limited(table: Iterable[Condition], limits: Limits) -> tuple[Condition, ...]
 
 
 def numbers(table: Iterable[Condition]) -> dict[str, float]:
-    """Return all numbers that plants may set, by condition and key ("wind_gust_stow.trips_m_s")."""
+    """Return all limits that plants may set, by condition and key ("wind_gust_stow.trips_m_s")."""
     return {
         f"{row.name}.{setting.key}": setting.shown(row)
         for row in table
@@ -125,7 +125,7 @@ def numbers(table: Iterable[Condition]) -> dict[str, float]:
 
 
 def differences(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
-    """Return the differences of two results of `numbers`, a line each: old, then new."""
+    """Return the differences between two results of `numbers`, one line each: old, then new."""
     return [
         f"{key}: {before[key]:g} → {value:g}"
         for key, value in after.items()

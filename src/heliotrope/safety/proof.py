@@ -1,8 +1,8 @@
-"""The proof that an emergency order was carried out.
+"""Confirmation that an emergency order was carried out.
 
-It is a proof of reports: of states and step counts. Only the flux on the receiver is measured after
-the order, where a sensor feeds it, and that shows the field, not a single mirror. What has shown
-earlier that mirrors follow their drives is said beside it.
+It is based on reports, that is, on states and step counts. The only quantity measured after the
+order is the flux on the receiver, if a sensor supplies it; the flux reflects the whole field, not a
+single heliostat. Earlier evidence that mirrors follow their drives is reported alongside.
 """
 
 import math
@@ -14,19 +14,19 @@ from enum import Enum
 from heliotrope.errors import InputError
 from heliotrope.safety.condition import Reading
 
-#: Longest time from the order to the last acknowledgement, to beams off the receiver, and to
-#: stow, s.
+#: Maximum time from the order to the last acknowledgement, to beams off the receiver, and to stow,
+#: s.
 ORDER_BUDGET, DEFOCUS_BUDGET, STOW_BUDGET = 1.0, 30.0, 300.0
 #: Limit of the flux on the receiver after a defocus, as a share of the nominal.
 FLUX_LIMIT = 0.10
 #: A flux reading older than this (s) proves nothing.
 FLUX_AGE = 5.0
-#: Sensor of the flux on the receiver, as a share of its nominal value.
+#: Sensor of the flux on the receiver, as a fraction of its nominal value.
 FLUX_READING = "receiver_flux_nominal"
 
 
 class FluxProof(Enum):
-    """The statement of a proof about the flux on the receiver; the value is its text."""
+    """What is known about the flux on the receiver; the value is the display text."""
 
     #: No sensor feeds it: the proof rests on what each heliostat reports.
     NOT_MEASURED = "flux on the receiver not measured"
@@ -48,21 +48,22 @@ class ProofReport:
     Attributes
     ----------
     unacknowledged, not_done
-        Heliostats that have not acknowledged the order, and that have not carried it out; sorted.
+        Heliostats that have not acknowledged the order, and heliostats that have not carried it
+        out; sorted.
     late
-        Heliostats that missed the deadline for either, sorted.
+        Heliostats that missed either deadline, sorted.
     flux
-        Whether the flux is proven to be below its limit.
+        Whether the flux is confirmed to be below its limit.
     complete
-        Whether every heliostat has acknowledged and is done, and the flux is proven or is not
-        measured.
+        Whether every heliostat has acknowledged and completed the order, and the flux is confirmed
+        or not measured.
     unknown
-        What is known of each heliostat of which nothing can show that it is done.
+        What is known about each heliostat whose completion nothing can confirm.
     followed
-        Number of the heliostats that are done whose mirrors were seen to follow their drives
-        earlier today, by what showed it.
+        Number of heliostats that have completed the order and whose mirrors were observed to follow
+        their drives earlier today, by kind of evidence.
     believed
-        Those that are done by their reports alone, sorted.
+        Heliostats whose completion rests on their own reports alone, sorted.
     """
 
     unacknowledged: tuple[str, ...]
@@ -87,7 +88,7 @@ class ProofReport:
 
     @property
     def basis(self) -> str:
-        """The measured and the believed parts of the proof, in one line."""
+        """The measured and the reported parts of the confirmation, in one line."""
         parts = [self.flux.value]
         if self.flux is not FluxProof.BELOW and (self.complete or self.believed or self.followed):
             parts[0] += ", so this is believed: a stalled drive reports the same"
@@ -99,7 +100,7 @@ class ProofReport:
         return "; ".join(parts)
 
     def with_evidence(self, done: Iterable[str], shown: Mapping[str, str]) -> "ProofReport":
-        """Return the report with what showed today that mirrors follow, by heliostat.
+        """Return the report with today's evidence that mirrors follow their drives, by heliostat.
 
         ``done`` are the heliostats that have carried out the order.
         """
@@ -118,7 +119,7 @@ def _first(names: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class Proof:
-    """The record of one DEFOCUS or STOW order: every heliostat has acknowledged it or is named.
+    """The record of one DEFOCUS or STOW order, which names every heliostat that has not obeyed.
 
     Attributes
     ----------
@@ -129,13 +130,13 @@ class Proof:
     nodes
         Heliostats that must obey.
     acknowledged, done
-        Time at which each of them acknowledged the order and carried it out, s.
+        Time at which each heliostat acknowledged the order, and time at which it carried it out, s.
     flux
-        Last reading of the flux after the order, as a share of the nominal.
+        Last flux reading after the order, as a fraction of the nominal flux.
     flux_measured
-        Whether a sensor feeds the flux.
+        Whether a sensor supplies the flux.
     refused
-        Number of reports that prove nothing: from other heliostats, or from before the order.
+        Number of reports that confirm nothing: from other heliostats, or from before the order.
     """
 
     order: str
@@ -157,12 +158,12 @@ class Proof:
     def of(
         cls, order: str, nodes: Iterable[str], now: float, *, flux_measured: bool = True
     ) -> "Proof":
-        """Return the proof of an order given to ``nodes`` at ``now``; nothing is proven yet."""
+        """Return the record of an order given to ``nodes`` at ``now``; nothing is confirmed yet."""
         return cls(order, now, frozenset(nodes), flux_measured=flux_measured)
 
     @property
     def budget(self) -> float:
-        """Longest time from the order to the finished action, s."""
+        """Maximum time from the order to the completed action, s."""
         return DEFOCUS_BUDGET if self.order == "DEFOCUS" else STOW_BUDGET
 
     def with_news(
@@ -171,9 +172,10 @@ class Proof:
         acknowledged: Mapping[str, float] | None = None,
         done: Mapping[str, float] | None = None,
     ) -> "Proof":
-        """Return the proof with reports of heliostats, each with its time, s.
+        """Return the record updated with reports from heliostats, each with its time, s.
 
-        Only the first report of a heliostat counts. One that it is done acknowledges the order too.
+        Only the first report of a heliostat counts. A report of completion also acknowledges the
+        order.
         """
         orders, ends = dict(acknowledged or {}), dict(done or {})
         taken = {node: at for node, at in orders.items() if self._counts(node, at)}
@@ -187,12 +189,12 @@ class Proof:
         )
 
     def without(self, nodes: Iterable[str]) -> "Proof":
-        """Return the proof without what some heliostats had done: it holds no longer."""
+        """Return the record after revoking the completion of some heliostats."""
         undone = frozenset(nodes)
         return replace(self, done={n: at for n, at in self.done.items() if n not in undone})
 
     def with_flux(self, share: float, at: float) -> "Proof":
-        """Return the proof with a flux reading, as a share of the nominal."""
+        """Return the record updated with a flux reading, as a fraction of the nominal flux."""
         newer = self.flux is None or at > self.flux.at
         if not (math.isfinite(share) and at >= self.ordered_at and newer):
             return replace(self, refused=self.refused + 1)
@@ -202,7 +204,7 @@ class Proof:
         return node in self.nodes and math.isfinite(at) and at >= self.ordered_at
 
     def report(self, now: float) -> ProofReport:
-        """Return the progress at ``now``, with the heliostats that are late."""
+        """Return the progress at ``now``, including the heliostats that are late."""
         silent = self.nodes - set(self.acknowledged)
         open_ = self.nodes - set(self.done)
         late = {n for n, at in self.acknowledged.items() if at - self.ordered_at > ORDER_BUDGET}
@@ -232,12 +234,12 @@ class Proof:
 
 
 def proof_readings(proof: Proof | None, now: float) -> dict[tuple[str, str], Reading]:
-    """Return the readings that the safety table takes from a proof; None: no emergency.
+    """Return the safety-table readings derived from a proof; None: no emergency.
 
-    ``nodes_unacknowledged`` is 0 until the deadline of the acknowledgements, then the number of
-    heliostats that have not acknowledged. ``flux_after_emergency`` is 0 until the deadline of the
-    defocus, then the flux as a share of the nominal, or 1 if its sensor is silent; it stays 0
-    where no sensor feeds it.
+    ``nodes_unacknowledged`` is 0 until the acknowledgement deadline, then the number of heliostats
+    that have not acknowledged. ``flux_after_emergency`` is 0 until the defocus deadline, then the
+    flux as a fraction of the nominal flux, or 1 if its sensor is silent; it stays 0 if no sensor
+    supplies it.
     """
     silent, flux = 0.0, 0.0
     if proof is not None:

@@ -1,9 +1,9 @@
-"""The records of a plant: a database of records and people, and an archive of telemetry.
+"""The records of a plant: a database of records and accounts, and a telemetry archive.
 
-`Records` is the protocol of a plant's records; module ``keeper`` has `Keeper`, which
-keeps them in SQLite or PostgreSQL. Modules ``backup``, ``export`` and ``people`` work on the same
-database; ``telemetry`` writes the archive and ``telemetry_query`` answers questions about it in
-SQL. These modules need the extra ``store``; the names below do not.
+`Records` is the protocol for a plant's records; `Keeper`, in module ``keeper``, stores them in
+SQLite or PostgreSQL. Modules ``backup``, ``export`` and ``people`` work on the same database;
+``telemetry`` writes the archive and ``telemetry_query`` runs SQL queries on it. These modules need
+the extra ``store``; the names below do not.
 
 Begin with `Records` and `Event`.
 """

@@ -1,8 +1,8 @@
-"""Rows of the tables from records, and records from rows.
+"""Conversion of records to table rows, and back.
 
-Names say which field belongs to which column, and the types of the columns convert the values (see
-`tables`). Two kinds of record have functions of their own, because one record is many rows:
-sightings, and the sightings behind a calibration.
+Fields and columns are matched by name, and the column types convert the values (see `tables`). Two
+kinds of record have their own functions because one record spans many rows: sightings, and the
+sightings behind a calibration.
 """
 
 from collections.abc import Mapping, Sequence

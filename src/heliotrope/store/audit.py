@@ -1,4 +1,4 @@
-"""The audit's table: one record for each accepted command, begun and then ended."""
+"""The audit table: one record per accepted command, written at acceptance and completed later."""
 
 from collections.abc import Iterable, Mapping
 

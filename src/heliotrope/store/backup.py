@@ -1,15 +1,17 @@
-"""Backup and restore: one consistent state of everything, taken while the plant runs.
+"""Backup and restore: one consistent snapshot of everything, taken while the plant runs.
 
-A backup is a folder: ``store.sqlite`` (of a store in PostgreSQL too, so each kind can be restored
-into the other), the telemetry if wanted, and ``manifest.json`` with the checksum of every file;
-``manifest.sig`` is the manifest's signature, if a key was given. It is there whole or not at all. A
-restore needs an empty place: nothing is ever overwritten.
+A backup is a folder: ``store.sqlite`` (also for a store in PostgreSQL, so that each kind can be
+restored into the other), the telemetry if requested, and ``manifest.json`` with the checksum of
+every file; ``manifest.sig`` is the signature of the manifest, if a key was specified. A backup is
+written completely or not at all. A restore needs an empty destination and never overwrites
+anything.
 
-The store in a backup knows that it is one, however it comes to a plant: it holds a lock on the
-tower, and none of its assigned points counts as taken. What has been locked or assigned since it
-was made is not in it, so a person confirms both before a heliostat leaves stow. Nor does it let
-anybody in: it has no session and no token, and the codes of second factors that were shown by then
-are used up. A restore does the same again for its own time, and is recorded in the store.
+The store in a backup is marked as such, however it reaches a plant: it holds a lock on the tower,
+and none of its assigned points counts as confirmed. Locks and assignments made after the backup are
+missing from it, so an operator confirms both before a heliostat leaves stow. Nobody can sign in
+with it either: it contains no session and no token, and the second-factor codes shown up to that
+time are marked as used. A restore repeats this for the time of the restore, and is recorded in the
+store.
 """
 
 import hashlib

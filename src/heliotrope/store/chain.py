@@ -1,14 +1,16 @@
-"""Hash chains over events, audit and accounts: what was altered or removed no longer fits.
+"""Hash chains over events, audit and accounts, which reveal altered or removed records.
 
-Each link has the SHA-256 of the content of a record and of the digest before it. An event has one
-link; a record of the audit has two, when it is accepted and when it has its result; an account or
-token has one for each change, with its state before and after. The one writer makes them in the
-transaction of the record, so they cost no further sync, and a killed plant leaves chains that fit.
+Each link contains the SHA-256 of a record's content and of the previous digest. An event has one
+link; an audit record has two, one at acceptance and one with its result; an account or token has
+one per change, with its state before and after. The single writer creates the links in the
+transaction of the record, so they cost no further sync, and a plant that is killed leaves
+consistent chains.
 
-Whoever can write the database can make all digests anew, or remove the newest records. So the
-heads (`heads`) go to another machine, and `verify` compares them. Old events leave: what remains of
-them is the anchor, number and digest of the last that has left. A head of that event is compared
-with it; one of an older event can be compared with nothing.
+Anyone who can write to the database can recompute all digests, or remove the newest records. The
+heads (`heads`) are therefore stored on another computer, and `verify` compares them. Old events are
+removed; what remains of them is the anchor, the number and digest of the last event removed. A
+stored head of that event is compared with the anchor; a head of an older event can no longer be
+compared.
 """
 
 import hashlib

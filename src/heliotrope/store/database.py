@@ -1,8 +1,8 @@
-"""A database: SQLite in a folder, or PostgreSQL by URL; opened, locked, brought up to date.
+"""A database: SQLite in a folder, or PostgreSQL by URL; opened, locked and migrated.
 
-One process at a time writes (the plant); others may read meanwhile. SQLite runs in WAL mode, and
-every commit is synced to the disk. Its one writing connection is also the only one that moves the
-log into the file.
+Only one process at a time writes (the plant); others may read concurrently. SQLite runs in WAL
+mode, and every commit is synced to disk. The single writing connection is also the only one that
+checkpoints the log.
 """
 
 import fcntl

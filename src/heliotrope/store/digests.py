@@ -1,4 +1,4 @@
-"""Digests of hash chains and their heads; they need no database."""
+"""Digests of hash chains and their heads; this module needs no database."""
 
 import hashlib
 import json

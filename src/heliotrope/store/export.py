@@ -1,9 +1,9 @@
-"""Every step of the calibrations as CSV: sightings, their beam errors, and the parameters learnt.
+"""Every calibration step as CSV: sightings, their beam errors, and the learnt parameters.
 
-One folder for each heliostat, as Malan kept them to find faults: ``sightings.csv`` (which
-`calibration.sighting_table` reads), ``residuals.csv``
-(of each version's new sightings, before and after), ``versions.csv``, ``parameters.csv`` and
-``covariance.csv``; and ``heliostats.csv`` beside them.
+One folder per heliostat, like the records that Malan used for troubleshooting: ``sightings.csv``
+(which `calibration.sighting_table` reads), ``residuals.csv`` (for the new sightings of each
+version, before and after), ``versions.csv``, ``parameters.csv`` and ``covariance.csv``; and
+``heliostats.csv`` beside the folders.
 """
 
 import csv

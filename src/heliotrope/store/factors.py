@@ -1,7 +1,8 @@
-"""Second factors of accounts: codes of an authenticator (TOTP, RFC 6238) and recovery codes.
+"""Second factors of accounts: authenticator codes (TOTP, RFC 6238) and recovery codes.
 
-No secret is in the database. That of an account is derived from a key file, which no backup has,
-and from the account's name and a random word; recovery codes are kept as SHA-256.
+The database contains no secret. The secret of an account is derived from a key file, which is not
+part of any backup, and from the account name and a random word; recovery codes are stored as
+SHA-256.
 """
 
 import base64

@@ -1,4 +1,4 @@
-"""The journal: events, alarms and commands of the store in one list, searched."""
+"""The journal: events, alarms and commands from the store in one searchable list."""
 
 from datetime import UTC, datetime
 from typing import Any

@@ -1,8 +1,8 @@
-"""The keeper: `Records` in a database, with the one writer behind it.
+"""The keeper: stores `Records` in a database through a single writer.
 
-The keeper numbers each record when it accepts it, so the caller knows the numbers of sightings
-before they are written, and a row that is written twice is there once. Only one process has a store
-open for writing.
+The keeper numbers each record on acceptance, so the caller knows the numbers of sightings before
+they are written, and a record written twice is stored once. Only one process can open a store for
+writing.
 """
 
 import asyncio

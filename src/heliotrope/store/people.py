@@ -1,8 +1,8 @@
-"""People: accounts with their roles, sessions that expire, tokens for programs.
+"""Accounts with their roles, sessions that expire, and tokens for programs.
 
-The caller hashes passwords (argon2); only the hash is kept here. Secrets of sessions and tokens are
-made here from 32 random bytes, and only their SHA-256 is kept, so nobody who reads the database can
-use them. Times are POSIX seconds and always arguments.
+The caller hashes passwords (argon2), and only the hash is stored. Session and token secrets are
+created here from 32 random bytes, and only their SHA-256 is stored, so reading the database does
+not reveal usable secrets. Times are POSIX seconds and always arguments.
 """
 
 import hashlib

@@ -1,7 +1,7 @@
-"""Removing everything that a plant keeps, before its machine leaves service.
+"""Removes everything that a plant stores, before its computer is decommissioned.
 
-Files are overwritten once before they are removed. That is no proof on its own: flash memory and
-file systems that copy on write keep old blocks, so encrypt the disk, or destroy it.
+Files are overwritten once before they are removed. This is no guarantee by itself, because flash
+memory and copy-on-write file systems keep old blocks; encrypt the disk, or destroy it.
 """
 
 import os

@@ -1,8 +1,8 @@
-"""The records of a plant, and the protocol of a place that keeps them.
+"""The records of a plant, and the protocol for storing them.
 
 Times are POSIX seconds (UTC) unless stated otherwise. A record is accepted at once and written in
-the background; `Records.confirm` waits until all earlier records are safe. Only confirmed records
-are sure to survive a crash.
+the background; `Records.confirm` waits until all earlier records are safely stored. Only confirmed
+records are guaranteed to survive a crash.
 
 ::
 
@@ -31,7 +31,7 @@ SEVERITIES = tuple(Severity)
 
 
 class StoreError(HeliotropeError):
-    """A record that could not be kept, or a store that cannot be used."""
+    """A record that could not be stored, or a store that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class KeptSightings:
     identities
         Numbers of the sightings, unique for all time, (M,).
     names
-        Names of the heliostats that the rows of ``sightings`` point to.
+        Names of the heliostats to which the indices in ``sightings`` refer.
     sightings
-        The sightings by time.
+        The sightings in order of time.
     kinds, targets, campaigns
-        One word for each sighting, "" for none, (M,).
+        One word per sighting, "" if not set, (M,).
     """
 
     identities: Identities
@@ -61,7 +61,7 @@ class KeptSightings:
         return len(self.identities)
 
     def of(self, heliostat: str) -> Sightings:
-        """Return the sightings of one heliostat, renumbered to 0; none if its name is unknown."""
+        """Return the sightings of one heliostat, renumbered to 0; empty if its name is unknown."""
         row = self.names.index(heliostat) if heliostat in self.names else len(self.names)
         return self.sightings.of(row)
 
@@ -81,11 +81,11 @@ class Event:
     severity
         One of `SEVERITIES`.
     heliostat
-        Heliostat that it concerns; "" for none.
+        Heliostat concerned; "" for none.
     values
-        Figures by name.
+        Numeric details by name.
     number
-        Rises for all time; 0 before it is recorded.
+        Increases for all time; 0 before it is recorded.
     """
 
     at: float
@@ -99,20 +99,20 @@ class Event:
 
 @dataclass(frozen=True)
 class AlarmEntry:
-    """An alarm, from its beginning to its end and acknowledgement.
+    """An alarm, from raising to clearing and acknowledgement.
 
     Attributes
     ----------
     condition, subject
-        Condition, and the object it concerns; together they identify a standing alarm.
+        Condition, and the object that it concerns; together they identify an active alarm.
     severity, text
-        Severity, and one line.
+        Severity, and one-line text.
     raised, cleared, acknowledged
         POSIX s; None if not yet.
     acknowledged_by
-        Person; "" for nobody.
+        Operator who acknowledged it; "" if not acknowledged.
     number
-        Rises for all time.
+        Increases for all time.
     """
 
     condition: str
@@ -127,7 +127,7 @@ class AlarmEntry:
 
 
 class Kind(StrEnum):
-    """The kind of place that a person locks."""
+    """The kind of object that an operator can lock."""
 
     HELIOSTAT = "heliostat"
     TARGET = "target"
@@ -137,17 +137,17 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Lockout:
-    """One person's lock on a heliostat, a target, a receiver or the tower.
+    """One operator's lock on a heliostat, a target, a receiver or the tower.
 
     Attributes
     ----------
     kind, name
-        What is locked; the tower's name is "tower".
+        What is locked; the name of the tower is "tower".
     who, reason
-        Person who locked it, and why.
+        Operator who applied the lock, and why.
     since, until
-        When, and the time at which it is expected back, POSIX s; NaN if none was given. It stands
-        after that time too, until `Records.unhold`.
+        Time of locking, and expected return to service, POSIX s; NaN if not specified. The lock
+        remains beyond that time, until `Records.unhold`.
     """
 
     kind: Kind
@@ -159,7 +159,7 @@ class Lockout:
 
     @property
     def text(self) -> str:
-        """One line: reason, person, since, expected back."""
+        """One line: reason, operator, since when, expected return."""
         back = f", expected back {_time(self.until)}" if math.isfinite(self.until) else ""
         return f"{self.reason} ({self.who}, since {_time(self.since)}{back})"
 
@@ -170,18 +170,18 @@ def _time(at: float) -> str:
 
 @dataclass(frozen=True)
 class PlannedVisit:
-    """A visit that the schedule plans.
+    """A calibration visit that the schedule plans.
 
     Attributes
     ----------
     heliostat, target
         Names.
     at
-        Expected beginning, POSIX s.
+        Expected start, POSIX s.
     gain
         Expected reduction of the tracking error over the year, rad; NaN if unknown.
     reason
-        Why it is due, for people.
+        Why it is due, for display.
     """
 
     heliostat: str
@@ -193,7 +193,7 @@ class PlannedVisit:
 
 @dataclass(frozen=True)
 class VisitEntry:
-    """A measurement made or attempted: what was expected, and what came out.
+    """A calibration visit made or attempted: what was expected, and what resulted.
 
     Attributes
     ----------
@@ -202,21 +202,21 @@ class VisitEntry:
     outcome
         Outcome of the attempt.
     text
-        The outcome for people, one line.
+        The outcome for display, one line.
     gain
         Gain that the schedule expected.
     sigma_before, sigma_expected, sigma_after
-        Predicted standard deviation of the normal, rad: before, as planned, and after.
+        Predicted standard deviation of the normal, rad: before the visit, as planned, and after.
     error_before, error_after
         Beam error over the sightings, rad RMS.
     sightings
         Number of sightings.
     version
-        Version of the resulting calibration; 0 for none.
+        Version of the resulting calibration; 0 if none.
     campaign
         Name of its campaign; "" for none.
     number
-        Rises for all time; 0 before it is recorded.
+        Increases for all time; 0 before it is recorded.
     """
 
     heliostat: str
@@ -253,9 +253,9 @@ class CampaignEntry:
     begun, finished
         POSIX s; ``finished`` is None while it runs.
     model, note
-        Model of the parameters, and remarks.
+        Model of the parameters, and notes.
     expected, found
-        Figures by name: the prediction and the result.
+        Numeric results by name: the prediction and the outcome.
     """
 
     name: str
@@ -412,7 +412,7 @@ class PlantFigures:
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """One accepted command, as `plant.orders.audit.Record`; times are ISO 8601."""
+    """One accepted command, like `plant.orders.audit.Record`; times are ISO 8601."""
 
     identity: str
     who: str
@@ -501,27 +501,27 @@ Fact = (
 
 
 class Records(Protocol):
-    """Where a plant keeps its records.
+    """Storage for the records of a plant.
 
-    Methods that begin with ``record_`` return at once, because the event loop never waits for a
-    disk; they raise `StoreError` if too many records wait already. Reading shows what has been
-    written: `confirm` first to see the latest records. Holds are the exception: they take effect at
-    once.
+    Methods that begin with ``record_`` return at once, because the event loop must not wait for a
+    disk; they raise `StoreError` if too many records are already waiting. Reads return what has
+    been written, so call `confirm` first to see the latest records. Locks are the exception,
+    because they take effect at once.
     """
 
     @property
     def problem(self) -> str:
-        """Why records cannot be written now, as the text of an alarm; empty while they can."""
+        """Why records cannot be written now, as the text of an alarm; empty if they can."""
         ...
 
     @property
     def refused(self) -> str:
-        """The last record that was refused for its content; empty without one."""
+        """The last record rejected because of its content; empty if there is none."""
         ...
 
     @property
     def refused_count(self) -> int:
-        """Number of records that were refused for their content."""
+        """Number of records rejected because of their content."""
         ...
 
     def record_sightings(
@@ -533,7 +533,7 @@ class Records(Protocol):
         target: str = "",
         campaign: str = "",
     ) -> Identities:
-        """Record sightings, whose rows point to ``names``; return their numbers, (M,)."""
+        """Record sightings, whose indices refer to ``names``; return their numbers, (M,)."""
         ...
 
     def record_calibration(self, *records: HeliostatCalibration) -> None:
@@ -541,7 +541,7 @@ class Records(Protocol):
         ...
 
     def record(self, fact: Fact) -> None:
-        """Record a fact; those with a time or name as their key replace the one of that key."""
+        """Record a fact; one keyed by time or name replaces the earlier one with that key."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -549,18 +549,18 @@ class Records(Protocol):
         ...
 
     def record_alarm(self, alarm: Alarm, at: float) -> None:
-        """Record that an alarm stands since a time, POSIX s, or (not active) that it is over.
+        """Record that an alarm was raised at a time, POSIX s, or (not active) that it cleared.
 
-        A severity that is not known counts as an alarm: none is lost because of its severity.
+        An unknown severity counts as an alarm, so that no alarm is lost because of its severity.
         """
         ...
 
     def record_acknowledgement(self, condition: str, subject: str, person: str, at: float) -> None:
-        """Record that a person acknowledged an alarm."""
+        """Record that an operator acknowledged an alarm."""
         ...
 
     def hold(self, holds: Sequence[Lockout]) -> None:
-        """Keep locks; a person's new lock replaces their own one before."""
+        """Store locks; an operator's new lock replaces that operator's earlier one."""
         ...
 
     def unhold(self, holds: Sequence[Lockout], person: str, at: float) -> None:
@@ -568,19 +568,19 @@ class Records(Protocol):
         ...
 
     def holds(self) -> tuple[Lockout, ...]:
-        """Return the locks that stand."""
+        """Return the active locks."""
         ...
 
     def exchange_limits(self, numbers: Mapping[str, float]) -> dict[str, float]:
-        """Keep the numbers of the safety table in force; return those of the run before, or {}."""
+        """Store the safety-table limits in force; return those of the previous run, or {}."""
         ...
 
     def emergency(self) -> str:
-        """Return the document about the emergency in force; empty without one."""
+        """Return the document about the emergency in force; empty if there is none."""
         ...
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document about the emergency in force; empty: it has ended."""
+        """Replace the document about the emergency in force; empty: the emergency has ended."""
         ...
 
     def waiting_changes(self) -> str:
@@ -592,12 +592,12 @@ class Records(Protocol):
         ...
 
     async def confirm(self) -> None:
-        """Wait until all earlier records are safe.
+        """Wait until all earlier records are safely stored.
 
         Raises
         ------
         StoreError
-            If an attempt to write failed; the records wait and are tried again.
+            If an attempt to write failed; the records stay queued and are retried.
         """
         ...
 
@@ -609,7 +609,7 @@ class Records(Protocol):
         until: float = float("inf"),
         campaign: str = "",
     ) -> KeptSightings:
-        """Return sightings by time: of some heliostats (None: all), of one campaign if given."""
+        """Return sightings by time, for some heliostats (None: all) and one campaign if given."""
         ...
 
     def latest_calibrations(
@@ -621,19 +621,19 @@ class Records(Protocol):
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
         """Return all versions of one heliostat, the oldest first.
 
-        The sightings behind each are in the order of their numbers. What a sighting missed by is
-        kept for the version that begins to use it; it is NaN in those that go on.
+        The sightings behind each version are in the order of their numbers. The residual of a
+        sighting is stored with the version that first uses it; it is NaN in later versions.
         """
         ...
 
     def figures(self, since: float, until: float) -> list[PlantFigures]:
-        """Return the figures of the plant from a time to before another, oldest first."""
+        """Return the plant's time series from a start time to before an end time, oldest first."""
         ...
 
     def visits(
         self, limit: int = 100, heliostat: str = "", *, since: float = 0.0, until: float = 1e11
     ) -> list[VisitEntry]:
-        """Return the measurements that finished within a time, the latest first."""
+        """Return the calibration visits that finished within a time span, the latest first."""
         ...
 
     def campaigns(self) -> list[CampaignEntry]:
@@ -641,19 +641,19 @@ class Records(Protocol):
         ...
 
     def flights(self) -> list[FlightEntry]:
-        """Return the flights, the first taken first."""
+        """Return the drone flights, in order of import."""
         ...
 
     def learnings(self) -> list[LearningEntry]:
-        """Return the latest learned hyperparameters of each group."""
+        """Return the latest learnt hyperparameters of each group."""
         ...
 
     def timetables(self) -> list[TimetableRecord]:
-        """Return the timetables that persons have put in force, the last first."""
+        """Return the timetables that operators have activated, the latest first."""
         ...
 
     def outlooks(self, since: float) -> list[Outlook]:
-        """Return the predictions made since a time, oldest first."""
+        """Return the predictions made since a given time, oldest first."""
         ...
 
     def events(
@@ -664,7 +664,7 @@ class Records(Protocol):
         severity: Severity = Severity.INFO,
         before: int = 0,
     ) -> list[Event]:
-        """Return events of at least a severity, the latest first; before a number if given."""
+        """Return events of at least a given severity, latest first; before a number if given."""
         ...
 
     def alarms(
@@ -675,16 +675,16 @@ class Records(Protocol):
         since: float = 0.0,
         until: float = 1e11,
     ) -> list[AlarmEntry]:
-        """Return alarms that were active within a time, the latest first.
+        """Return alarms that were active within a time span, the latest first.
 
-        With standing, without those over and acknowledged.
+        With ``standing``, alarms that are both cleared and acknowledged are left out.
         """
         ...
 
     def journal(self, query: JournalQuery) -> list[JournalEntry]:
-        """Return events, alarms and commands that a query asks for, the latest first."""
+        """Return the events, alarms and commands that match a query, the latest first."""
         ...
 
     def close(self) -> None:
-        """Write the records that wait, and close."""
+        """Write the waiting records, and close."""
         ...

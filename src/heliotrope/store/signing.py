@@ -1,7 +1,7 @@
-"""Signatures of backups: Ed25519, with a private key that stays out of every backup.
+"""Backup signatures: Ed25519, with a private key that is never part of a backup.
 
-The private key is a PEM file (PKCS 8) of mode 600; its public half is FILE.pub in the same folder,
-and belongs on the machine that restores.
+The private key is a PEM file (PKCS 8) with mode 600; its public key is FILE.pub in the same folder,
+and must be copied to the computer that restores.
 """
 
 import base64

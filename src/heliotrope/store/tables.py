@@ -1,10 +1,10 @@
-"""The tables of the database, for SQLite and PostgreSQL alike, and the types of their columns.
+"""The database tables, for both SQLite and PostgreSQL, and their column types.
 
-Times are POSIX seconds (UTC), angles rad, lengths m. The one process that writes numbers the rows
-(see `keeper`), so a row that is written twice is there once.
+Times are POSIX seconds (UTC), angles rad, lengths m. The single writing process numbers the rows
+(see `keeper`), so a row written twice is stored once.
 
-A column has the name of the field that it keeps, or that name as its ``key``. Its type converts the
-value: a record's field goes in and comes out as it is (see `_rows`).
+A column has the name of the field that it stores, or that name as its ``key``. Its type converts
+the value, so a field is read back exactly as it was written (see `_rows`).
 """
 
 import math

@@ -1,14 +1,15 @@
 """Telemetry: the history of every heliostat, day by day, in Parquet.
 
-The archive has one folder for each day (UTC) with its segments: ``0001.parquet``, ``0002.parquet``,
-… and, while it is written, ``0003.part``, a stream of Arrow batches. A part is readable up to its
-last whole batch whatever happened to its writer; when it is long enough, when its day is over, and
-at the next start, it becomes a Parquet file: written beside, synced, renamed. A row is written when
-it differs from the heliostat's last one, and every keyframe holds all rows, so the field at any
-instant follows from the rows of one keyframe interval before it.
+The archive has one folder per day (UTC) with its segments: ``0001.parquet``, ``0002.parquet``, …
+and, while it is being written, ``0003.part``, a stream of Arrow batches. A part is readable up to
+its last complete batch whatever happened to its writer. When it is long enough, when its day has
+ended, and at the next start, it is converted to a Parquet file: written under a temporary name,
+synced and renamed. A row is written when it differs from the last row of its heliostat, and every
+keyframe contains all rows, so the state of the field at any time follows from the rows of the
+preceding keyframe interval.
 
 Columns: ``time``, ``heliostat``, ``state``, ``fault``, ``flags``, ``primary`` and ``secondary``
-(counts), ``age`` (s, of the values at that time). `telemetry_query` answers questions in SQL.
+(counts), ``age`` (s, of the values at that time). `telemetry_query` runs SQL queries.
 """
 
 import os

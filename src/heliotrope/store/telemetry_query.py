@@ -1,7 +1,7 @@
-"""SQL queries of the telemetry archive, by DuckDB; read-only.
+"""SQL queries on the telemetry archive, by DuckDB; read-only.
 
-The table is called ``telemetry``; `telemetry` lists its columns; times are UTC without a zone. The
-current day is included up to its last whole batch.
+The table is called ``telemetry``; `telemetry` lists its columns; times are UTC without a time zone.
+The current day is included up to its last complete batch.
 """
 
 from collections.abc import Sequence

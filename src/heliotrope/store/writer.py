@@ -1,10 +1,10 @@
-"""One writing thread behind a bounded queue, with one commit for everything that waits.
+"""One writing thread behind a bounded queue, with one commit for everything that is waiting.
 
-A caller puts a piece of work into the queue and continues. The thread takes everything in the
-queue, runs it in one transaction, and only then answers the callers. If the database fails (disk
-full, read-only, server gone) nothing is lost and the queue is kept: the thread tries again, and
-`Writer.problem` gives the reason. A piece of work that the database refuses for its own content
-(not for the state of the disk) is dropped, reported in `Writer.refused`, and holds up nothing else.
+A caller queues a job and continues. The thread takes all queued jobs, runs them in one transaction,
+and only then notifies the callers. If the database fails (disk full, read-only, server down)
+nothing is lost and the queue is kept: the thread retries, and `Writer.problem` states the reason. A
+job that the database rejects because of its content (not because of the disk) is dropped and
+reported in `Writer.refused`, and does not hold up other jobs.
 """
 
 import threading

@@ -1,8 +1,9 @@
-"""The sun: its position as angles and as a vector, and when it rises and sets.
+"""The sun: its position as angles and as a vector, and sunrise and sunset.
 
-Begin with `vector` (or `position` for the angles); `events` and `daylight` give the times of a day.
-These take any number of times, which `unix_seconds` reads. `vector_and_rate`, `fast_vector` and
-`broadcast_values` follow the sun of one site second by second, as cluster controllers broadcast it.
+Begin with `vector` (or `position` for the angles); `events` and `daylight` return the times of a
+day. These functions accept any number of times, in any form that `unix_seconds` reads.
+`vector_and_rate`, `fast_vector` and `broadcast_values` follow the sun at one site second by second,
+as cluster controllers broadcast it.
 """
 
 from heliotrope.sun.broadcast import (

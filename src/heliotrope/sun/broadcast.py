@@ -1,8 +1,9 @@
-"""The sun of one site second by second, as cluster controllers broadcast it.
+"""The sun vector at one site, second by second, as cluster controllers broadcast it.
 
-SPA is evaluated every 10 s and interpolated by a cubic. With four knots 10 s apart the cubic is off
-by (ωh)⁴·3/128, less than 1e-13 (ω = 7.3e-5 rad/s); refraction near the horizon changes faster and
-adds less than a nanoradian. All clusters of one site in one process share the knots.
+SPA is evaluated every 10 s and interpolated by a cubic. With four knots 10 s apart the
+interpolation error is (ωh)⁴·3/128, less than 1e-13 (ω = 7.3e-5 rad/s); refraction near the horizon
+changes faster and adds less than a nanoradian. All clusters of one site within a process share the
+knots.
 """
 
 import functools
@@ -19,8 +20,8 @@ _BLOCK = 60
 _UNIT, _RATE = float(1 << 30), float(1 << 28)
 _LARGEST_RATE = 32767
 
-#: Upward component of the sun vector below which none is broadcast. SPA's apparent sun jumps by
-#: 10 mrad at -0.0045, and a local controller accepts none below -0.02.
+#: Upward component of the sun vector below which no vector is broadcast. SPA's apparent sun jumps
+#: by 10 mrad at -0.0045, and a local controller rejects any below -0.02.
 LOWEST_BROADCAST = -0.003
 
 Vector = tuple[float, float, float]
@@ -34,14 +35,14 @@ def _knots(site: Site, block: int) -> tuple[Vector, ...]:
 
 
 def vector_and_rate(utc_s: float, site: Site) -> tuple[Vector, Vector]:
-    """Return the direction to the apparent sun (ENU, unit) and its rate in 1/s.
+    """Return the direction to the apparent sun (ENU, unit vector) and its rate in 1/s.
 
     Parameters
     ----------
     utc_s
         POSIX seconds.
     site
-        Place and air.
+        Location and atmosphere.
     """
     place = utc_s / STEP
     step = math.floor(place)
@@ -78,7 +79,7 @@ def fast_vector(utc_s: float, site: Site) -> FloatArray:
 
 
 def broadcast_values(second: int, utc_s: float, site: Site) -> tuple[int, ...] | None:
-    """Return the numbers of a SUN message, or None while the sun is below `LOWEST_BROADCAST`.
+    """Return the fields of a SUN message, or None while the sun is below `LOWEST_BROADCAST`.
 
     Parameters
     ----------
@@ -87,7 +88,7 @@ def broadcast_values(second: int, utc_s: float, site: Site) -> tuple[int, ...] |
     utc_s
         The same instant in POSIX seconds.
     site
-        Place and air.
+        Location and atmosphere.
     """
     direction, rate = vector_and_rate(utc_s, site)
     if direction[2] < LOWEST_BROADCAST:

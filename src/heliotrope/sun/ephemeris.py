@@ -1,12 +1,11 @@
-"""The position of the sun, as angles and as a vector, and when it rises and sets.
+"""The position of the sun, as angles and as a vector, and the times of sunrise and sunset.
 
-Positions come from NREL's solar position algorithm (Reda & Andreas 2004, "SPA") as
-pvlib implements it, with the pressure and temperature of the site. *True* means
-without the atmosphere, *apparent* with its refraction: the sun as a mirror sees it.
-Refraction lifts the sun by 1.5 mrad at 10° of elevation and by 0.3 mrad at 45°, so
-mirrors track the apparent sun.
+Positions come from NREL's solar position algorithm (Reda & Andreas 2004, "SPA") as implemented in
+pvlib, with the pressure and temperature of the site. *True* means without the atmosphere,
+*apparent* with atmospheric refraction, that is, the sun as a mirror sees it. Refraction lifts the
+sun by 1.5 mrad at 10° of elevation and by 0.3 mrad at 45°, so heliostats track the apparent sun.
 
-Times carry a time zone or they are refused; inside they are unix seconds (UTC).
+Times must carry a time zone; internally they are Unix seconds (UTC).
 """
 
 from collections.abc import Sequence
@@ -31,12 +30,12 @@ if TYPE_CHECKING:
     import pandas as pd
     from pvlib.location import Location
 
-#: Accepted as times: an aware datetime, an ISO 8601 text with an offset or Z, unix
-#: seconds (UTC), a list or an array of these, or a time-zone aware pandas index or column.
+#: Accepted forms of time: an aware datetime, an ISO 8601 text with an offset or Z, Unix seconds
+#: (UTC), a list or an array of these, or a time-zone-aware pandas index or column.
 Times: TypeAlias = datetime | Sequence[datetime] | npt.ArrayLike
 
-#: True elevation of the sun's centre at rise and set by convention: 34′ of refraction
-#: and 16′ of the sun's radius below the horizon, so that the upper limb touches it.
+#: True elevation of the sun's centre at sunrise and sunset by convention: 34′ of refraction and 16′
+#: of solar radius below the horizon, so that the upper limb touches the horizon.
 UPPER_LIMB = float(np.radians(-0.8333))
 
 # SPA switches refraction off where the sun's centre stands lower than this, in degrees.
@@ -55,31 +54,31 @@ _CHUNK = 16384
 
 @dataclass(frozen=True)
 class Site:
-    """A place on Earth and its air.
+    """A location on Earth and its atmosphere.
 
     Parameters
     ----------
     latitude_deg
-        North positive, −90 to 90 (WGS84).
+        Latitude, positive north, −90 to 90 (WGS84).
     longitude_deg
-        East positive, −180 to 180.
+        Longitude, positive east, −180 to 180.
     height
-        Above the ellipsoid in m, −500 to 9000.
+        Height above the ellipsoid in m, −500 to 9000.
     pressure
         Air pressure at the site (not reduced to sea level) in Pa, 30,000 to 120,000;
         None takes the standard atmosphere at ``height``.
     temperature_c
         Air temperature in °C, −90 to 60.
     name
-        Shown to people; nothing depends on it.
+        Display name; nothing depends on it.
     delta_t
-        TT − UT1 in s, −8000 to 8000; None takes pvlib's polynomials by year and month
-        (Espenak & Meeus), which were 5 s too high in 2025: 1 µrad of sun.
+        TT − UT1 in s, −8000 to 8000; None takes pvlib's polynomials by year and month (Espenak &
+        Meeus), which were 5 s too high in 2025, an error of 1 µrad in sun position.
 
     Raises
     ------
     InputError
-        If a number is missing, not finite or out of its range.
+        If a number is missing, not finite or out of range.
     """
 
     latitude_deg: float
@@ -103,7 +102,7 @@ class Site:
 
     @classmethod
     def from_pvlib(cls, location: "Location") -> Self:
-        """Return the site of a pvlib ``Location``: latitude, longitude, altitude and name."""
+        """Return the site of a pvlib ``Location``: its latitude, longitude, altitude and name."""
         return cls(
             float(location.latitude),
             float(location.longitude),
@@ -113,7 +112,7 @@ class Site:
 
     @property
     def label(self) -> str:
-        """The site as a message names it."""
+        """The site as named in messages."""
         return f"site {self.name!r}" if self.name else "site"
 
     @property
@@ -123,7 +122,7 @@ class Site:
 
     @property
     def air_pressure(self) -> float:
-        """``pressure``, or that of the standard atmosphere at ``height``, in Pa."""
+        """``pressure``, or the pressure of the standard atmosphere at ``height``, in Pa."""
         if self.pressure is not None:
             return self.pressure
         from pvlib.atmosphere import alt2pres
@@ -152,7 +151,7 @@ _SITE_LIMITS = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SunPosition(Value, Framed):
-    """The position of the sun; the shape (...) is that of the times.
+    """The position of the sun; (...) is the shape of the times.
 
     Attributes
     ----------
@@ -161,11 +160,11 @@ class SunPosition(Value, Framed):
     azimuth
         Clockwise from north in [0, 2π), shape (...), rad.
     elevation
-        Apparent (refracted) elevation of the sun's centre, shape (...), rad. Below a
-        true elevation of −0.8334° it is the true one: SPA switches refraction off
-        there, and the elevation jumps by 0.6°.
+        Apparent (refracted) elevation of the sun's centre, shape (...), rad. Below a true elevation
+        of −0.8334° it equals the true elevation, because SPA switches refraction off there; the
+        elevation jumps by 0.6° at that point.
     true_elevation
-        Without the atmosphere, shape (...), rad.
+        Elevation without the atmosphere, shape (...), rad.
     vector
         Unit vectors to the apparent sun, ENU, shape (..., 3).
     true_vector
@@ -211,20 +210,21 @@ class SunPosition(Value, Framed):
 
 @dataclass(frozen=True)
 class SunEvents:
-    """Rise, culmination and set of one solar day, in UTC.
+    """Sunrise, culmination and sunset of one solar day, in UTC.
 
     Attributes
     ----------
     sunrise, sunset
-        None where the sun does not cross the given elevation: both in a polar night,
-        at least one in a polar day (its first and last day have one).
+        None where the sun does not cross the given elevation: both are None in a polar night, and
+        at least one on a polar day (the first and the last polar day of the season have one
+        crossing).
     culmination
-        Time at which the sun crosses the meridian on its upper side.
+        Time of the sun's upper transit of the meridian.
     culmination_elevation
-        Apparent elevation then, rad.
+        Apparent elevation at culmination, rad.
     kind
-        "polar night": below the given elevation at culmination; "normal": it rises and
-        sets; "polar day": any other.
+        "polar night": the sun culminates below the given elevation; "normal": it rises and sets;
+        "polar day": any other case.
     """
 
     sunrise: datetime | None
@@ -242,28 +242,27 @@ def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition
     times
         Times of any shape (...); see `Times`. Numbers are unix seconds (UTC).
     site
-        Place, pressure and temperature.
+        Location, pressure and temperature.
     algorithm
-        "spa"; or "grena2008", Malan's choice, as a cross-check for the years 2003 to 2022:
-        ±0.0027° (47 µrad) by its author, found against SPA.
+        "spa"; or "grena2008", the algorithm that Malan used, as a cross-check for the years 2003 to
+        2022: ±0.0027° (47 µrad) according to its author, confirmed against SPA.
 
     Raises
     ------
     TimeError
-        If a time has no time zone, is not a time, or lies outside the years −2000 to
-        6000 (−1999 to 3000 without ``Site.delta_t``).
+        If a time has no time zone, is not a time, or lies outside the years −2000 to 6000 (−1999 to
+        3000 without ``Site.delta_t``).
     InputError
-        If ``algorithm`` is Grena's of 2008 and a time lies outside its years.
+        If ``algorithm`` is "grena2008" and a time lies outside its years.
     UnknownNameError
-        If ``algorithm`` is any other.
+        If ``algorithm`` is unknown.
 
     Notes
     -----
-    Source: Reda & Andreas (2004), equations 4 to 47; refraction is their equation 42
-    with the pressure and temperature of the site. Accuracy: ±5 µrad (0.0003°) by the
-    authors, ±5 µrad against IAU 2006/2000A (ERFA) for 2020 to 2035, refraction
-    and UT1 − UTC (below 0.9 s, 65 µrad) apart. Refraction close to the horizon varies
-    with the weather by more than 1 mrad.
+    Source: Reda & Andreas (2004), equations 4 to 47; refraction follows their equation 42 with the
+    pressure and temperature of the site. Accuracy: ±5 µrad (0.0003°) according to the authors, ±5
+    µrad against IAU 2006/2000A (ERFA) for 2020 to 2035, excluding refraction and UT1 − UTC (below
+    0.9 s, 65 µrad). Refraction close to the horizon varies with the weather by more than 1 mrad.
     """
     if algorithm not in ALGORITHMS:
         raise UnknownNameError("sun algorithm", str(algorithm), ALGORITHMS)
@@ -292,9 +291,9 @@ def vector(times: Times, site: Site, *, apparent: bool = True) -> FloatArray:
     Parameters
     ----------
     times, site
-        As for `position`, with its errors and accuracy.
+        As for `position`, which also states the errors and the accuracy.
     apparent
-        Include refraction, as mirrors see the sun.
+        Whether to include refraction, as mirrors see the sun.
     """
     sun = position(times, site)
     return sun.vector if apparent else sun.true_vector
@@ -308,16 +307,15 @@ def events(
     Parameters
     ----------
     day
-        Date of local mean solar time, that is by longitude and not by any civil time
-        zone; a date or an ISO text. The day is the 12 hours before and after the
-        culmination.
+        Date in local mean solar time, which follows the longitude and not a civil time zone; a date
+        or an ISO text. The day is the 12 hours before and after the culmination.
     site
-        Place, pressure and temperature.
+        Location, pressure and temperature.
     elevation
-        Elevation of the sun's centre when it rises and sets, rad. By default the convention for
+        Elevation of the sun's centre at sunrise and sunset, rad. The default is the convention for
         the upper limb, −0.8333° of true elevation.
     apparent
-        Whether ``elevation`` is apparent. It must then not be negative, because the
+        Whether ``elevation`` is apparent. An apparent elevation must not be negative, because the
         apparent elevation jumps below the horizon (see `SunPosition`).
 
     Raises
@@ -329,9 +327,9 @@ def events(
 
     Notes
     -----
-    At sunrise and sunset `position` gives the requested elevation to 0.1 µrad, which is
-    2 ms where the sun climbs by 11° an hour. The weather's refraction makes a real
-    sunrise uncertain by a minute.
+    At sunrise and sunset `position` returns the requested elevation to 0.1 µrad, which is 2 ms
+    where the sun climbs by 11° an hour. Because refraction varies with the weather, the time of a
+    real sunrise is uncertain by a minute.
     """
     from scipy.interpolate import CubicSpline
 
@@ -364,10 +362,10 @@ def events(
 
 
 def solar_day(time: datetime, site: Site) -> date:
-    """Return the day of local mean solar time that an aware time falls on.
+    """Return the day in local mean solar time that an aware time falls on.
 
-    It is the day that people at the site call today, whatever the zone of ``time``: a California
-    afternoon is tomorrow in UTC.
+    This is the day that people at the site call today, whatever the zone of ``time``; a California
+    afternoon, for example, may already be tomorrow in UTC.
 
     Raises
     ------
@@ -392,19 +390,19 @@ def daylight(
     Parameters
     ----------
     day
-        Date of local mean solar time. The day is the 12 hours before and after mean
-        noon, so that days follow each other without gap or overlap.
+        Date in local mean solar time. The day is the 12 hours before and after mean noon, so that
+        days follow each other without gap or overlap.
     site
-        Place, pressure and temperature.
+        Location, pressure and temperature.
     every
-        Step, 0.1 s to a day. Times are whole multiples of it since 1970, so that two
-        sites or two days share one grid.
+        Step, 0.1 s to a day. Times are whole multiples of the step since 1970, so that two sites or
+        two days share one grid.
     min_elevation
         Lowest apparent elevation to keep, rad.
 
     Returns
     -------
-    Index of aware times, empty in a polar night; `position` takes it as it is.
+    Index of aware times, empty in a polar night; it can be passed to `position` directly.
 
     Raises
     ------
@@ -484,12 +482,12 @@ def _delta_t(seconds: FloatArray, site: Site) -> FloatArray:
 
 
 def check_site(site: object) -> None:
-    """Refuse anything but a `Site`.
+    """Reject anything but a `Site`.
 
     Raises
     ------
     InputError
-        If it is something else, such as a pvlib Location.
+        If ``site`` is something else, such as a pvlib Location.
     """
     if not isinstance(site, Site):
         raise InputError(
@@ -559,19 +557,19 @@ def _utc(seconds: float) -> datetime:
 
 
 def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
-    """Return times as unix seconds (UTC) of the same shape: the one reader of times.
+    """Return times as Unix seconds (UTC) of the same shape; every time is read here.
 
     Parameters
     ----------
     times
-        Of any shape (...); see `Times`. Numbers are unix seconds (UTC).
+        Of any shape (...); see `Times`. Numbers are Unix seconds (UTC).
     unknown
-        Whether a NaN may stand for a time that is not known; NaT never may.
+        Whether NaN may stand for an unknown time; NaT is never accepted.
 
     Raises
     ------
     TimeError
-        A value that is not a time, or has no time zone, by its place.
+        If a value is not a time, or has no time zone; the message gives its position.
     """
     if isinstance(times, np.ndarray) and times.dtype.kind == "f":
         seconds = as_float(times)  # without loading pandas

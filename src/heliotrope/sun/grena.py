@@ -1,9 +1,9 @@
-"""Grena's algorithm of 2008, Malan's choice: a cross-check of the sun for 2003 to 2022.
+"""Grena's 2008 algorithm, which Malan used: a cross-check of the sun position for 2003 to 2022.
 
 Source: R. Grena, "An algorithm for the computation of the solar position", Solar Energy 82 (2008)
-462-470. Its text was not at hand; the numbers are those of the program that the paper prints, as
-two public reprints give them alike. What vouches for them is the author's accuracy, 0.0027°, which
-a test finds against SPA over all twenty years.
+462-470. The paper itself was not available; the constants are those of the program printed in it,
+which two public reprints reproduce identically. A test confirms the author's accuracy, 0.0027°,
+against SPA over all twenty years.
 """
 
 import numpy as np

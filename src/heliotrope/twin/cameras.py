@@ -1,9 +1,9 @@
 """Cameras of a simulated plant, which see the beams on its targets.
 
-Both fit the port `plant.ports.Cameras`. `ExactCamera` gives the true centroid with noise of a
-known covariance. `RenderedCamera` draws the frame with all light that is on the target at that
-moment, whichever mirrors it comes from, and reads it as photographs of a real plant are read.
-Neither knows more about the measured heliostat than a real camera could.
+Both implement the port `plant.ports.Cameras`. `ExactCamera` returns the true centroid with noise of
+known covariance. `RenderedCamera` renders the frame with all light that is on the target at that
+time, whichever heliostats it comes from, and evaluates it like photographs of a real plant. Neither
+knows more about the measured heliostat than a real camera could.
 """
 
 import asyncio

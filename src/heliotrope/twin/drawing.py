@@ -1,7 +1,7 @@
-"""Photographs of a simulated field, drawn in a process beside the plant.
+"""Photographs of a simulated field, rendered in a process beside the plant.
 
-A photograph of a hundred beams takes a second of a processor. Drawn in the process of the plant and
-its field it would wait for their event loop, and they for it.
+A photograph of a hundred beams takes a second of CPU time. If it were rendered in the process of
+the plant and its field, it would compete with their event loop.
 """
 
 import multiprocessing

@@ -1,4 +1,4 @@
-"""Command records on a simulated disk, which may be full and which survives the plant."""
+"""Command records on a simulated disk, which may be full and which outlives the plant program."""
 
 import asyncio
 from collections import deque

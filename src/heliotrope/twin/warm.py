@@ -1,7 +1,7 @@
 """Compile the kernels of the simulated field and of its photographs; see `heliotrope.warm`.
 
-``python -m heliotrope.twin.warm`` does it once after an installation: some three seconds, after
-``heliotrope.warm``.
+Run ``python -m heliotrope.twin.warm`` once after an installation, after ``heliotrope.warm``; it
+takes some three seconds.
 """
 
 

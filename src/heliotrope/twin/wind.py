@@ -1,10 +1,10 @@
-"""Wind over a field: turbulence and passing gusts, and the rotation of mirrors under them.
+"""Wind over a field: turbulence and passing gusts, and how they deflect the mirrors.
 
-The wind is a function of place and time, so single boards and a vectorised field feel the same
-wind. Turbulence is frozen and carried along by the mean wind (Taylor): a sum of waves whose
-spectrum at one place is von Kármán's. Gusts are fronts of the shape (1 − cos)/2, one drawn for each
-window of time. A mirror turns in proportion to the dynamic pressure, as a flat plate does: towards
-standing broadside to the wind.
+The wind is a function of position and time, so single boards and a vectorised field experience the
+same wind. Turbulence is frozen and carried along by the mean wind (Taylor): a sum of waves whose
+spectrum at one point is von Kármán's. Gusts are fronts of the shape (1 − cos)/2, one drawn for each
+time window. A mirror rotates in proportion to the dynamic pressure, as a flat plate does, towards
+the position broadside to the wind.
 """
 
 from dataclasses import dataclass

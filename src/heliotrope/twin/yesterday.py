@@ -1,14 +1,14 @@
 """Yesterday's calibrations of a simulated field: what its plant would have measured and fitted.
 
-A simulated plant may begin in its second day of commissioning. Here the first day is made in a
-second, without running it: the true mirrors throw the beams of yesterday's suns on the targets,
-centroids have the noise that the visits state, and the plant's estimator fits all mirrors at once.
-The errors of these calibrations are therefore those that their covariances predict, if the true
-mirrors differ from the plant file as the priors say.
+A simulated plant may begin on its second day of commissioning. This module creates the first day in
+a second, without running it: the true heliostats send beams to the targets for yesterday's sun
+positions, centroids have the noise that the visits state, and the plant's estimator fits all
+heliostats at once. The errors of these calibrations are therefore those that their covariances
+predict, provided that the true heliostats differ from the plant file as the priors say.
 
-The mirrors nearest to a target are visited first, as the schedule does in a new field: a search for
-a beam takes least time there. When all have been visited once, the first of them are visited again.
-Drives do not drift overnight, though the plant allows for it.
+The heliostats nearest to a target are visited first, as in the schedule for a new field, because a
+search for a beam takes the least time there. When all have been visited once, the first of them are
+visited again. Drives do not drift overnight, although the plant allows for drift.
 """
 
 from collections.abc import Mapping, Sequence

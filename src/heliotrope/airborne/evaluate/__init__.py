@@ -1,8 +1,8 @@
-"""The evaluation of a drone's photographs: orientations of mirrors, report and sightings.
+"""Evaluation of a drone's photographs: mirror orientations, report and sightings.
 
-Begin with `evaluate_flight`, which leads from the folder of photographs to the result; its
-docstring lists the steps. `write_result` writes the result to files. Each step can be called
-by itself: `read_many`, `evaluate`, `measure_field`, `to_sightings`.
+Begin with `evaluate_flight`, which processes a folder of photographs to the result; its docstring
+lists the steps. `write_result` writes the result to files. Each step can also be called separately:
+`read_many`, `evaluate`, `measure_field`, `to_sightings`.
 """
 
 from heliotrope.airborne.evaluate.budget import Budget

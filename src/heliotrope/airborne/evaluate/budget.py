@@ -1,23 +1,24 @@
-r"""The error budget of an orientation: its shared part, and the part that averages over points.
+r"""The error budget of an orientation: its systematic part, and the part that averages out.
 
-An error of a point's lines of sight to lamp and camera turns its measured normal. With s and t the
-unit vectors from the mirror to the two, v their bisector, and δ the displacement of the mirror
-relative to the drone,
+An error in the lines of sight from a point to the lamp and the camera rotates the measured normal
+of that point. Let s and t be the unit vectors from the mirror to the two, v their bisector, and δ
+the displacement of the mirror relative to the drone. Then
 
 $$ δv = -\frac{I - v v^T}{|s + t|}
 \left(\frac{I - s s^T}{d_s} + \frac{I - t t^T}{d_t}\right) δ $$
 
-which with the lamp beside the camera is δ across the line of sight over the distance. An error
-common to all points of a mirror turns its orientation by as much, however many there are:
+which, with the lamp beside the camera, is the component of δ across the line of sight divided by
+the distance. An error common to all points of a mirror rotates its orientation by that amount,
+however many points there are:
 
 - the surveyed position of the heliostat,
-- its kinematics: the vertex in this pose compared with the model's,
-- the absolute position of the RTK base, unless the heliostats themselves revealed it,
-- the offset of the lamp from the camera, which moves one of the two lines only.
+- its kinematics, that is, the vertex in this pose compared with the model,
+- the absolute position of the RTK base, unless it was estimated from the heliostats themselves,
+- the offset of the lamp from the camera, which affects only one of the two lines.
 
-Errors that differ from point to point average out, and show in the scatter of the differences: the
-detected position of the reflection on the mirror, each photograph's own RTK error, and the slope
-deviations if no map is known.
+Errors that differ from point to point average out, and appear in the scatter of the differences:
+the detected position of the reflection on the mirror, the RTK error of each photograph, and the
+slope deviations if no map is known.
 """
 
 from dataclasses import dataclass, fields
@@ -31,17 +32,16 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors
 
 @dataclass(frozen=True)
 class Budget:
-    """Standard deviations per axis of a flight's common errors, m.
+    """Standard deviations per axis of the errors common to a flight, m.
 
     Attributes
     ----------
     position
         Surveyed position of the heliostat.
     kinematics
-        Vertex in a pose, relative to the position and the nominal mechanism.
+        Vertex in a pose, relative to the surveyed position and the nominal mechanism.
     rtk
-        Common offset of all drone positions; its remainder if it was estimated from the
-        heliostats.
+        Common offset of all drone positions; its remainder if it was estimated from the heliostats.
     lamp
         Offset of the lamp from the camera.
     """
@@ -58,7 +58,7 @@ class Budget:
                 raise InputError(f"budget: {f.name} {value} m must be 0 or more")
 
     def parts(self, distance: npt.ArrayLike) -> dict[str, FloatArray]:
-        """Return the rotation by each cause at distances (...), rad per axis, (...)."""
+        """Return the rotation caused by each error at distances (...), rad per axis, (...)."""
         d = as_float(distance)
         return {
             "position": self.position / d,
@@ -80,17 +80,17 @@ class Budget:
         axes: npt.ArrayLike,
         place: npt.ArrayLike | None = None,
     ) -> FloatArray:
-        """Return the covariance along two axes of the error that N points share, (2, 2), rad².
+        """Return the covariance along two axes of the error common to N points, (2, 2), rad².
 
         Parameters
         ----------
         point, camera, led
             ENU metres, (N, 3).
         axes
-            Two unit axes across the mirror's normal, (2, 3).
+            Two unit axes perpendicular to the mirror normal, (2, 3).
         place
             Covariance of the mirror's position relative to the drone, m², (3, 3), if a bundle
-            adjustment found it. It replaces ``position``, ``kinematics`` and ``rtk``.
+            adjustment estimated it. It replaces ``position``, ``kinematics`` and ``rtk``.
         """
         both, lamp = lever(point, camera, led, axes)
         known = (self.position**2 + self.kinematics**2 + self.rtk**2) * np.eye(3)

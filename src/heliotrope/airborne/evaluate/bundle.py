@@ -1,26 +1,26 @@
-r"""Exterior orientation of a flight's photographs, from all of them together.
+r"""Exterior orientation of all photographs of a flight, from a joint bundle adjustment.
 
-The corners of the mirrors are marks at nearly known positions. The unknowns are, for each
+The mirror corners are marks at approximately known positions. The unknowns are: for each
 photograph, a rotation φ of the camera and the error t of its RTK position; the offset b common to
-all positions; for each mirror in each pose the error δ of its vertex, a rotation ψ, and the error g
-of its apparent width and height, relative; and for each heliostat flown in several poses the error
-d of its surveyed position. A corner c of a mirror (vertex v, rotation M) is seen from the recorded
-position p at
+all positions; for each mirror in each pose, the error δ of its vertex, a rotation ψ, and the
+relative error g of its apparent width and height; and for each heliostat measured in several poses,
+the error d of its surveyed position. A corner c of a mirror (vertex v, rotation M) is seen from the
+recorded position p at
 
 $$ X = (R e^{[φ]})^T (v + d + δ + M e^{[ψ]} (c + g c) - (p - b + t)) $$
 
-in camera axes, at (X/Z, Y/Z) without distortion. Without g, a shadow beside the edges of all
-mirrors, which shifts them by a tenth of a pixel, would move the camera by a decimetre: mirrors that
-look smaller would be taken to be farther away.
+in camera axes, at (X/Z, Y/Z) without distortion. Without g, a shadow along the edges of all mirrors
+that shifts the edges by a tenth of a pixel would move the camera by a decimetre, because mirrors
+that look smaller would be assumed to be farther away.
 
-From one place, the camera's attitude absorbs a shift of all mirrors: survey errors leave an error
-in b of several times their mean. From several sides the two are told apart, so flights over
-the same heliostats go into one adjustment.
+Seen from one place only, a shift of all mirrors is absorbed by the camera attitude, and survey
+errors leave an error in b of several times their mean. Views from several sides separate the two,
+so flights over the same heliostats go into one adjustment.
 
-All unknowns have priors: RTK's own deviation, the survey's, the commands'; that of φ is wide. The
-normal equations (Gauss-Newton, with Huber's weights beyond 2.5 standard deviations) are sparse and
-are solved as such by SuperLU, which also gives the covariances; a least-squares driver without the
-normal matrix would not.
+All unknowns have priors: the stated RTK deviation, that of the survey and that of the commands; the
+prior of φ is wide. The normal equations (Gauss-Newton, with Huber weights beyond 2.5 standard
+deviations) are sparse and are solved as such by SuperLU, which also provides the covariances; a
+least-squares driver without the normal matrix would not.
 
 Derivatives, with [X]_× for the matrix of the cross product:
 $∂X/∂φ = [X]_×$, $∂X/∂t = -R^T = -∂X/∂b$, $∂X/∂δ = ∂X/∂d = R^T$,
@@ -86,15 +86,15 @@ class Priors:
     Attributes
     ----------
     offset
-        RTK's common offset, m.
+        Common RTK offset, m.
     position
-        Surveyed position of a heliostat, each axis, m; the same in all poses.
+        Surveyed position of a heliostat, per axis, m; the same in all poses.
     kinematics
-        Vertex of a mirror in one pose, relative to that, m.
+        Vertex of a mirror in one pose, relative to the surveyed position, m.
     turn
         Rotation of a mirror about each of its axes, rad.
     growth
-        Relative error of an outline's apparent width and height.
+        Relative error of the apparent width and height of an outline.
     """
 
     offset: float = 1.0

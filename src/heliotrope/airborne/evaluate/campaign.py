@@ -1,7 +1,7 @@
 """Flights over the same heliostats in different poses, evaluated together.
 
-The survey errors of the heliostats and RTK's common offset are the same in all flights. From one
-position the images hardly tell the two apart (`heliotrope.airborne.evaluate.bundle`), so
+The survey errors of the heliostats and the common RTK offset are the same in all flights. Images
+from a single position can hardly separate the two (`heliotrope.airborne.evaluate.bundle`), so
 flights that share heliostats go through one adjustment, in groups that fit into memory.
 """
 
@@ -26,17 +26,18 @@ MOST_CORNERS = 200_000
 
 @dataclass(frozen=True)
 class Campaign:
-    """Result of the flights of a campaign.
+    """Result of the flights in a campaign.
 
     Attributes
     ----------
     flights
         Results in the order given; None for a flight without a result.
     problems
-        For each flight, a line for each photograph that was not used, or why it has no result.
+        For each flight, a message for each photograph that was not used, or why the flight has no
+        result.
     offset, offset_covariance
-        RTK's common offset, recorded less true, m, (3,), and its covariance, m², (3, 3): mean of
-        all groups, weighted by their accuracy.
+        Common RTK offset, recorded minus true, m, (3,), and its covariance, m², (3, 3): mean of all
+        groups, weighted by their accuracy.
     groups
         Number of adjustments.
     """
@@ -61,7 +62,7 @@ class Campaign:
         return f"common offset of RTK, recorded less true: {', '.join(parts)} mm"
 
     def warnings(self, prior: float) -> list[str]:
-        """Return a line if the offset is far larger than its prior standard deviation, m."""
+        """Return a warning if the offset is far larger than its prior standard deviation, m."""
         size = float(np.abs(self.offset).max())
         if size <= 3.0 * prior:
             return []
@@ -74,7 +75,7 @@ class Campaign:
 
 
 def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = None) -> Campaign:
-    """Return the reflections of all flights; a flight without a result does not stop the others.
+    """Return the reflections of all flights; a flight without a result does not stop the rest.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
     Raises
     ------
     InputError
-        If no flight gives a reflection.
+        If no flight yields a reflection.
     """
     evaluations: list[FlightEvaluation | None] = [None] * len(flights)
     problems = [tuple(flight.unused()) for flight in flights]

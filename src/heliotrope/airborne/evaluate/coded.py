@@ -1,4 +1,4 @@
-"""Coded targets found in photographs: their numbers by OpenCV, their corners by edges."""
+"""Detection of coded targets in photographs: numbers by OpenCV, corners by edge fits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
-"""Detection in one photograph: mirrors as bright patches, their outlines, the lamp's spots.
+"""Detection in one photograph: mirrors as bright patches, their outlines, lamp reflections.
 
-Readings are converted to light by the inverse of sRGB's curve before anything is measured;
+Pixel values are converted to light by the inverse of the sRGB curve before anything is measured;
 otherwise edges and spots would be displaced.
 """
 

@@ -1,7 +1,7 @@
-"""Small drawings as SVG: a report of a flight holds hundreds, each drawn in a few milliseconds.
+"""Small SVG drawings, each made in a few milliseconds; a flight report contains hundreds.
 
 Matplotlib needs 0.4 s for one such picture, most of it for text. Here the browser sets the text,
-and every point can show what it is.
+and every point can have a tooltip.
 """
 
 from collections.abc import Mapping, Sequence

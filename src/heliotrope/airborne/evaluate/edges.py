@@ -1,17 +1,17 @@
-r"""Where edges of mirrors cross profiles of light, whatever lies beside the mirrors.
+r"""Positions of mirror edges in brightness profiles, whatever lies beside the mirrors.
 
-Beside a mirror lies its shadow, or grass in the sun, or both within the blur of the lens. The slope
-of a profile is then no measure of the place of the edge: rendered mirrors with a narrow shadow
-below were 0.1 px too short, all of them on the same side, and the camera seemed to stand 0.06 m
-beside its place, 150 m away. What is seen inside the edge is hardly touched by that. So
+Beside a mirror there may be its shadow, or sunlit grass, or both within the blur of the lens. The
+slope of a profile then does not indicate the position of the edge: rendered mirrors with a narrow
+shadow below appeared 0.1 px too short, all on the same side, and the camera position was wrong by
+0.06 m at a distance of 150 m. The profile inside the edge is hardly affected. Therefore
 
 $$ p(x) = L - A\,Φ\!\left(\frac{x - x_0}{s}\right) $$
 
-is fitted: L is the light of the mirror, A the contrast to what adjoins it, x₀ the edge. If most
-edges of a photograph lie before even ground, the whole profile counts, otherwise only the part up
-to `_OUTSIDE` beyond the edge; that has four times the noise, which averages out over mirrors
-and photographs, as shadows do not. The blur s is the same for all edges of a direction in a
-photograph: a single profile could not tell it from A.
+is fitted, where L is the light of the mirror, A the contrast to what adjoins it, and x₀ the edge.
+If most edges in a photograph lie in front of uniform ground, the whole profile is used, otherwise
+only the part up to `_OUTSIDE` beyond the edge. That part has four times the noise, but noise
+averages out over mirrors and photographs, whereas shadows do not. The blur s is the same for all
+edges of one direction in a photograph, because a single profile could not separate it from A.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
-"""One pose of a field evaluated: what photographs show becomes reflections on mirrors.
+"""Evaluates one pose of a field: what photographs show becomes reflections on mirrors.
 
-All photographs together give the exterior orientation of each and RTK's common offset
-(`heliotrope.airborne.evaluate.bundle`). Then the ray of each spot is intersected with its
-mirror (`heliotrope.airborne.evaluate.rays`). In a night without moon no corner is seen, and
-`heliotrope.airborne.evaluate.night` takes the place of the bundle adjustment.
+All photographs together determine the exterior orientation of each photograph and the common RTK
+offset (`heliotrope.airborne.evaluate.bundle`). Then the ray of each spot is intersected with its
+mirror (`heliotrope.airborne.evaluate.rays`). In a moonless night no corner is visible, and
+`heliotrope.airborne.evaluate.night` replaces the bundle adjustment.
 """
 
 from collections.abc import Sequence
@@ -32,27 +32,27 @@ _AGREE = 1.15
 
 @dataclass(frozen=True)
 class FlightEvaluation:
-    """Result of the photographs of a pose.
+    """Result from the photographs of a pose.
 
     Attributes
     ----------
     photos
-        Those used, with the exterior orientation that was found.
+        Photographs used, with the estimated exterior orientation.
     recorded
-        The same, as recorded by the drone.
+        The same photographs, as recorded by the drone.
     seen
-        What each shows.
+        What each photograph shows.
     adjusted
         The bundle adjustment.
     stand
-        The mirrors, as their corners show them.
+        The mirrors, as determined from their corners.
     place_covariance
         Covariance of each mirror's position relative to the drone, m², (N, 3, 3): shared by all its
         reflections.
     reflections
-        One row for each spot on a mirror; ``photo`` counts the photographs used.
+        One record per spot on a mirror; ``photo`` counts the photographs used.
     problems
-        A line for each photograph that was not used.
+        A message for each photograph that was not used.
     """
 
     photos: tuple[Photo, ...]
@@ -86,11 +86,11 @@ def evaluate(
     stand
         The mirrors in their expected poses.
     shape
-        Gives the surface of a mirror's row; slopes do not matter here.
+        Function that returns the surface of a mirror by index; slopes do not matter here.
     priors
         Prior standard deviations of the bundle adjustment.
     owner
-        Row of each mirror's heliostat, if some heliostats stand in several poses
+        Heliostat index of each mirror, if some heliostats are present in several poses
         (`heliotrope.airborne.evaluate.bundle.adjust`).
 
     Raises

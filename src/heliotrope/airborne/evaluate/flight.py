@@ -1,4 +1,4 @@
-"""The evaluation of a drone's flight, from its folder of photographs to sightings."""
+"""Evaluates a drone flight, from its folder of photographs to sightings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,7 +39,7 @@ class FlightResult:
     Attributes
     ----------
     data
-        Photographs and commanded mirrors.
+        Photographs, and mirrors as commanded.
     evaluation
         Exterior orientations, and reflections.
     measured
@@ -51,11 +51,11 @@ class FlightResult:
     measured: MeasuredFlight
 
     def label(self, name: str) -> str:
-        """Return a name within this flight as a name within the campaign."""
+        """Return the campaign-wide name for a name within this flight."""
         return f"{self.data.name}/{name}" if self.data.name else name
 
     def sightings(self) -> Sightings | None:
-        """Return one sighting of each orientation, heliostats as rows of the plant."""
+        """Return one sighting per orientation, with heliostats as plant indices."""
         if not self.measured.found.found:
             return None
         times = [p.time.timestamp() for p in self.evaluation.photos if p.time is not None]
@@ -79,13 +79,13 @@ class CampaignResult:
     data
         All flights that could be opened.
     campaign
-        RTK's common offset, and the outcome of each flight.
+        Common RTK offset, and the outcome of each flight.
     flights
-        Those with a result.
+        The flights with a result.
     not_used
-        A line for each flight and photograph that was not used.
+        A message for each flight and photograph that was not used.
     warnings
-        A line for each slope map that is missing, and if RTK's offset is implausible.
+        A message for each missing slope map, and one if the RTK offset is implausible.
     """
 
     plant: Plant
@@ -104,7 +104,7 @@ class CampaignResult:
 
     @property
     def impossible(self) -> tuple[str, ...]:
-        """A line for each sighting that cannot have happened."""
+        """A message for each sighting that is physically impossible."""
         sightings, reasons = self._judged
         if sightings is None:
             return ()
@@ -120,7 +120,7 @@ class CampaignResult:
         return sightings, judge_in(self.plant, sightings).reasons
 
     def orientation_rows(self) -> list[dict[str, Any]]:
-        """Return one record for each orientation, its systematic part split by cause."""
+        """Return one record per orientation, with its systematic part split by cause."""
         return [row for f in self.flights for row in f.measured.rows(f.data.name)]
 
     def orientation_warnings(self) -> list[tuple[str, str]]:
@@ -175,18 +175,18 @@ def evaluate_flight(
     client: "Client | None" = None,
     progress: Progress | None = None,
 ) -> CampaignResult:
-    """Return the orientations of a flight's mirrors, from the folder of its photographs.
+    """Return the mirror orientations from a flight's folder of photographs.
 
-    A folder of such folders is a campaign: its flights are evaluated together. The steps, in
+    A folder of such folders is a campaign, whose flights are evaluated together. The steps, in
     order:
 
     1. ``folder.open_flights``: photographs, camera and commands become a ``FlightData``.
-    2. ``reading.read_many``: each photograph is read, and what it shows is a ``PhotoReading``.
+    2. ``reading.read_many``: each photograph is evaluated to a ``PhotoReading``.
        ``reading.read_photo``, ``detection.find_patches``, ``identification.identify``,
        ``detection.find_outlines``, ``detection.find_spots``.
-    3. ``campaign.evaluate_campaign``: flights that share heliostats go together.
+    3. ``campaign.evaluate_campaign``: flights that share heliostats are evaluated together.
     4. ``evaluation.evaluate``: one adjustment, and its ``FlightEvaluation``.
-    5. ``bundle.adjust``: all corners give the exterior orientations and RTK's offset.
+    5. ``bundle.adjust``: all corners together yield the exterior orientations and the RTK offset.
     6. ``rays.spot_reflections``: spots become ``Reflections`` on mirrors.
     7. ``orientation.measure_field``: reflections become ``Orientations`` with their accuracy.
        ``orientation.measure``.
@@ -204,20 +204,20 @@ def evaluate_flight(
     priors
         Prior standard deviations.
     axis
-        What the optical axis of a mirror is: the mean in
+        What the optical axis of a mirror means: the mean in
         `heliotrope.airborne.evaluate.orientation.measure`.
     matches
-        Table of mirrors that a person has named in photographs
+        Table of mirrors that a user has identified in photographs
         (`heliotrope.airborne.evaluate.matching.read_matches`).
     keep, processes, client
         See `heliotrope.airborne.evaluate.reading.read_many`.
     progress
-        Called with the name of the step, and the numbers of photographs done and in all.
+        Called with the name of the step, and the numbers of photographs (done, total).
 
     Raises
     ------
     InputError
-        If no flight can be used or none gives a reflection.
+        If no flight can be used or none yields a reflection.
     """
     opened, unusable, warnings = open_flights(
         Path(folder),

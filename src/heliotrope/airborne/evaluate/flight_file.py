@@ -1,11 +1,11 @@
-"""A campaign as the file that a plant takes: orientations with the errors that they share.
+"""A campaign as a file for the plant: orientations with the errors that they share.
 
-The position of a mirror relative to the drone is wrong in parts. One is the same for all mirrors of
-a bundle adjustment (the remainder of RTK's offset, and half of an error of the lamp's offset), one
-grows with the distance from the middle of the photographs (the focal length), one is the same in
-all poses of a mirror (the survey), and only the rest is a pose's own (kinematics). A fit that takes
-them all for a pose's own trusts many mirrors too much; see
-`heliotrope.calibration.fit.common`.
+The error in a mirror's position relative to the drone has several parts. One is common to all
+mirrors of a bundle adjustment (the remainder of the RTK offset, and half of an error in the lamp
+offset), one grows with the distance from the middle of the photographs (the focal length), one is
+common to all poses of a mirror (the survey), and only the remainder belongs to a single pose
+(kinematics). A fit that treats all parts as independent between poses trusts many mirrors too much;
+see `heliotrope.calibration.fit.common`.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The folder of a flight: photographs, camera and commands, beside the plant they belong to."""
+"""The folder of a flight: photographs, camera and commands, for a given plant."""
 
 import re
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from heliotrope.geometry import FloatArray
 
 @dataclass(frozen=True)
 class FlightData:
-    """One flight: P photographs of N mirrors that stand still.
+    """One flight: P photographs of N stationary mirrors.
 
     Attributes
     ----------
@@ -34,15 +34,15 @@ class FlightData:
     stand
         The mirrors, as commanded.
     heliostat
-        Their rows in the plant, (N,).
+        Their indices in the plant, (N,).
     counts
         Counts of their drives, (N, D).
     shapes
-        Their surfaces, (N,), with slope maps where there are any.
+        Their surfaces, (N,), with slope maps if available.
     problems
-        A line for each photograph that cannot be used.
+        A message for each photograph that cannot be used.
     seen
-        What the photographs show, (P,), once they have been read.
+        What the photographs show, (P,), once they have been evaluated.
     """
 
     name: str
@@ -61,16 +61,16 @@ class FlightData:
 
     @property
     def corners(self) -> int:
-        """Number of corners that its photographs show."""
+        """Number of corners visible in its photographs."""
         return sum(int(np.isfinite(s.corners).all(axis=-1).sum()) for s in self.seen)
 
     @property
     def dark(self) -> bool:
-        """Whether its photographs show the lamp but no mirror edge: it is evaluated alone."""
+        """Whether its photographs show the lamp but no mirror edge; it is then evaluated alone."""
         return not self.corners and any(s.has_lights for s in self.seen)
 
     def unused(self) -> list[str]:
-        """Return a line for each photograph that was read but cannot be used."""
+        """Return a message for each photograph that was evaluated but cannot be used."""
         if self.dark:
             return [s.why_unused() for s in self.seen if s.problem]
         lines = [s.why_unused() for s in self.seen if not s.has_corners]
@@ -90,10 +90,10 @@ def open_flights(
     slopes: Path | None = None,
     focal: float = np.inf,
 ) -> tuple[list[FlightData], list[str], list[str]]:
-    """Return the flights of a folder in the order of their names.
+    """Return the flights in a folder in the order of their names.
 
-    A folder with photographs is one flight. A folder of such folders is a campaign: each flight
-    has a ``camera.toml`` and a ``commands.csv`` of its own, or shares those of the campaign. Of a
+    A folder with photographs is one flight. A folder of such folders is a campaign, in which each
+    flight has its own ``camera.toml`` and ``commands.csv`` or shares those of the campaign. From a
     shared table, flight ``C-P`` takes the commands of cluster C and calibration point P.
 
     Parameters
@@ -105,21 +105,22 @@ def open_flights(
     camera, commands
         Files to use instead of ``camera.toml`` and ``commands.csv``.
     cluster, point
-        Rows of the commands to use for a single flight; "" for all.
+        Cluster and point whose commands to use for a single flight; "" for all.
     slopes
-        Folder of slope maps, NAME.npz or NAME.csv, or of deflectometry in PAINT's form, NAME.h5.
+        Folder of slope maps, NAME.npz or NAME.csv, or of deflectometry files in PAINT's format,
+        NAME.h5.
     focal
         Focal length of the facets, m; inf if flat.
 
     Returns
     -------
-    The flights, a line for each flight that cannot be used, and a line for each heliostat
+    The flights, a message for each flight that cannot be used, and a message for each heliostat
     without a slope map.
 
     Raises
     ------
     InputError
-        If no flight can be used, or no slope map is there.
+        If no flight can be used, or no slope map exists.
     """
     surfaces = _Surfaces(plant, slopes, focal)
     inside = [] if _has_photos(folder) or not folder.is_dir() else sorted(folder.iterdir())

@@ -1,14 +1,14 @@
-"""Which mirror is which: the field is projected into a photograph and matched with its patches.
+"""Identifies mirrors: the field is projected into a photograph and matched with its patches.
 
-The position of a photograph is known to centimetres, its attitude to a degree or so, so only a
-small rotation is unknown. It is found by votes: each pair of a patch and an expected mirror votes
-for the shift between the two, for a number of turns about the line of sight. The best few shifts
-are refined by Wahba's problem on the pairs that then lie close. The winner has most mirrors lying
-closest and fewest mirrors and patches left over. If another solution that names the mirrors
-differently is nearly as good, none is trusted.
+The position of a photograph is known to centimetres and its attitude to about a degree, so only a
+small rotation is unknown. It is found by voting: each pair of a patch and an expected mirror votes
+for the shift between the two, at several rotations about the line of sight. The best few shifts are
+refined by solving Wahba's problem on the pairs that are then close together. The solution with the
+most close matches and the fewest unmatched mirrors and patches wins. If another solution that
+identifies the mirrors differently is nearly as good, neither is trusted.
 
-In a night without moon only the lamp can be seen. A mirror that stands as commanded shows it at
-the foot of the perpendicular from the drone, so these feet are matched with the spots instead.
+In a moonless night only the lamp is visible. A mirror in its commanded pose shows the lamp at the
+foot of the perpendicular from the drone, so these points are matched with the spots instead.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,9 @@
-"""Mirrors that a person names in photographs which the program cannot identify by itself.
+"""Mirrors identified by a user in photographs that the program cannot match by itself.
 
-HelioPoint improves the camera's attitude "using automatic or manual feature matching". A table says
-where in a photograph some mirrors, or their corners, are seen. These places give the attitude by
-Wahba's problem, and it takes the place of the gimbal's: the photograph is then read as the others
-are, from an attitude that needs no search.
+HelioPoint improves the camera attitude "using automatic or manual feature matching". A table lists
+where in a photograph some mirrors, or their corners, are visible. These positions determine the
+attitude by Wahba's problem, which replaces that of the gimbal. The photograph is then evaluated
+like all others, but from an attitude that needs no search.
 """
 
 from collections.abc import Sequence

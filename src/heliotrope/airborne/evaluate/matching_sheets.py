@@ -1,7 +1,8 @@
-"""Photographs with numbered outlines, from which a person names mirrors.
+"""Photographs with numbered outlines, in which a user identifies mirrors.
 
-Each picture shows possible mirrors, numbered, and the heliostats where the recorded position and
-gimbal put them. A table beside them has a row for each number, without a name.
+Each picture shows possible mirrors, numbered, and the heliostats at the positions expected from the
+recorded position and gimbal angles. A table beside the pictures has a row for each number, with an
+empty name.
 """
 
 import csv

@@ -1,14 +1,14 @@
-r"""A flight in a night without moon, when only the lamp can be seen on the mirrors.
+r"""A flight in a moonless night, when only the lamp is visible in the mirrors.
 
-A reflection on a flat mirror is seen along the mirror's normal, wherever on the mirror it lies. So
-the spots of all photographs show how mirrors and photographs are turned relative to each other,
-but not how all of them are turned together, for which there are no corners. That common turn
-is chosen such that the mirrors stand as commanded on average. With N mirrors that deviate by σ
-from their commands, it is known to
+A reflection on a flat mirror is seen along the mirror normal, wherever on the mirror it lies. The
+spots in all photographs therefore determine the rotations of mirrors and photographs relative to
+each other, but not the rotation of all of them together, for which corners would be needed. That
+common rotation is chosen such that, on average, the mirrors have their commanded orientations. With
+N mirrors that deviate by σ from their commands, it is known to
 
 $$ C_ω = σ^2 \Big( \sum_i (I - n_i n_i^T) \Big)^{-1} $$
 
-that is to about σ/√N, which is part of the standard deviation of every orientation.
+that is, to about σ/√N, which is included in the standard deviation of every orientation.
 """
 
 from collections.abc import Sequence

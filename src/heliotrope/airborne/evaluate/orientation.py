@@ -1,17 +1,18 @@
 r"""The orientation of mirrors from reflections of the drone's lamp.
 
-Each reflection measures one normal: the bisector of the directions to lamp and camera. The
-mirror's shape gives the normal expected at that point. The small rotation ω, about the
-concentrator's own x and y axes, that turns the expected normal n into the measured one v is
+Each reflection measures one normal, the bisector of the directions to the lamp and the camera. The
+shape of the mirror determines the normal expected at that point. The small rotation ω, about the
+concentrator's own x and y axes, from the expected normal n to the measured normal v is
 
 $$ ω = \frac{n × v}{|n × v|} \arcsin |n × v| $$
 
-The orientation is corrected by the mean of all ω, over the points or over the mirror's area. As
-the points move on the mirror with the orientation, that is done twice; then outliers are rejected
-(Rosner's test of each component), and the last mean is the result. The remaining ω at each point,
-its *angular difference*, carries all information on accuracy and on the facets.
+The orientation is corrected by the mean of all ω, over the points or over the mirror area. Because
+the points move on the mirror with the orientation, this is done twice; then outliers are rejected
+(Rosner's test of each component), and the final mean is the result. The remaining ω at each point,
+its *angular difference*, contains all information on accuracy and on the facets.
 
-Two rounds, the test and a last mean are HelioPoint's procedure; the mean over the area is ours.
+Two rounds, the test and a final mean are HelioPoint's procedure; the mean over the area is our own
+addition.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -88,37 +89,37 @@ class Orientation:
     vertex
         ENU metres, (3,).
     correction
-        rotX and rotY, rad: rotation from the expected orientation about the mirror's own axes,
-        (2,).
+        rotX and rotY, rad: rotation from the expected to the measured orientation about the
+        mirror's own axes, (2,).
     reflections
         The n reflections, outliers included.
     point
-        Their positions, ENU metres, (n, 3).
+        Positions of their camera, ENU metres, (n, 3).
     outlier
         (n,).
     weight
-        Weight of each point in the mean, adding up to 1; 0 for outliers, (n,).
+        Weight of each point in the mean, with sum 1; 0 for outliers, (n,).
     difference
-        Angular difference of each point from the result, rotX and rotY, rad, (n, 2).
+        Angular difference between each point and the result, rotX and rotY, rad, (n, 2).
     sigma
         Standard deviation of the differences without outliers, rad, (2,).
     sigma_plain
         σ_mean as σ/√n, rad, (2,).
     sigma_mean
-        σ_mean with the slope deviations treated as the fixed field they are, rad, (2,); of fewer
-        than 8 points see `heliotrope.airborne.evaluate.statistics.few_sigma`.
+        σ_mean with the slope deviations treated as a fixed field, rad, (2,); for fewer than 8
+        points see `heliotrope.airborne.evaluate.statistics.few_sigma`.
     systematic
         Error common to all points, rad, (2,).
     normality
-        p of Shapiro and Wilk's test, (2,).
+        p-value of the Shapiro-Wilk test, (2,).
     facets
-        One for each facet.
+        Results for each facet.
     distance
-        Mean, from mirror to camera, m.
+        Mean distance from mirror to camera, m.
     mean
-        The mean that was used.
+        Kind of mean that was used.
     warnings
-        One line each.
+        Warnings, one line each.
     """
 
     heliostat: int
@@ -177,7 +178,7 @@ class Orientations:
     found
         Orientations that could be measured, in the order of the heliostats.
     left_out
-        For each other heliostat that was to be measured, its name and the reason.
+        Name and reason for each requested heliostat that could not be measured.
     """
 
     names: tuple[str, ...]
@@ -185,7 +186,7 @@ class Orientations:
     left_out: Mapping[str, str]
 
     def of(self, name: str) -> Orientation | None:
-        """Return the orientation of heliostat ``name``, None if it was not measured."""
+        """Return the orientation of heliostat ``name``, or None if it was not measured."""
         return next((o for o in self.found if self.names[o.heliostat] == name), None)
 
 
@@ -228,7 +229,7 @@ def turned(R: npt.ArrayLike, rot: npt.ArrayLike) -> FloatArray:
 
 
 def rotation_between(R: npt.ArrayLike, other: npt.ArrayLike) -> FloatArray:
-    """Return rotX, rotY and rotZ, rad, (3,), that turn orientation ``R`` into ``other``.
+    """Return rotX, rotY and rotZ, rad, (3,), that rotate orientation ``R`` into ``other``.
 
     They are the components of a single rotation, along R's own axes.
     """
@@ -263,28 +264,29 @@ def measure(
     rotation, vertex
         Expected orientation (3, 3) and vertex, ENU metres, (3,).
     pivot
-        Point about which the mirror turns, from the vertex in concentrator coordinates, m, (3,).
+        Point about which the mirror rotates, relative to the vertex in concentrator coordinates, m,
+        (3,).
     slopes
-        Whether to use the slope map, if the mirror has one.
+        Whether to use the slope map, if available.
     budget
-        Errors common to all points; the default budget if None.
+        Errors common to all points; None: the default budget.
     place
         Covariance of the mirror's position relative to the drone, m², (3, 3), see
         `Budget.covariance`.
     mean
-        "area", weighted to represent the whole mirror, or "plain", equal weights, as in
-        HelioPoint. Without a slope map the plain mean is worse: points crowd where the surface
-        is flat.
+        "area", weighted to represent the whole mirror, or "plain", equal weights, as in HelioPoint.
+        Without a slope map the plain mean is worse, because points cluster where the surface is
+        flat.
     scatter
-        Standard deviation of one difference as known before, rad: the σ of few reflections leans
-        on it. By default HelioPoint's, with or without a slope map.
+        Prior standard deviation of one difference, rad, which stabilises σ if there are few
+        reflections. By default HelioPoint's value, with or without a slope map.
     alpha, rounds
-        Probability of a false alarm of the test for outliers, and number of corrections before it.
+        False-alarm probability of the outlier test, and number of corrections before it.
 
     Raises
     ------
     InputError
-        If there are no reflections, or they are of several heliostats or of facets that the
+        If there are no reflections, or they belong to several heliostats or to facets that the
         mirror does not have.
     """
     own = _checked(reflections, shape)
@@ -332,9 +334,9 @@ def measure_field(
     names
         Names of the N heliostats.
     shape
-        Gives the mirror of a row.
+        Function that returns the mirror at an index.
     rotation, vertex
-        Expected, (N, 3, 3) and (N, 3).
+        Expected orientations (N, 3, 3) and vertices (N, 3).
     slopes, budget, mean
         See `measure`.
     places
@@ -342,8 +344,8 @@ def measure_field(
 
     Notes
     -----
-    A heliostat that cannot be measured is listed with the reason; the others continue. Where a
-    mirror has few reflections, its σ leans on the scatter of the well measured mirrors.
+    A heliostat that cannot be measured is listed with the reason, and the rest continue. For
+    mirrors with few reflections, σ is stabilised by the scatter of the well-measured mirrors.
     """
     turns, feet = as_float(rotation), as_float(vertex)
     covariances = None if places is None else as_float(places)

@@ -1,12 +1,11 @@
-r"""Where photographs of coded targets were taken, from the images alone.
+r"""Camera positions for photographs of coded targets, from the images alone.
 
-A bundle adjustment with free points: the unknowns are the turn φ and the position p of each
-photograph, each corner X of each target, and what the camera file states wrongly (focal lengths,
-principal point, distortion). A corner is seen at OpenCV's projection of
-$(R e^{[φ]})^T (X - p)$. Images do not tell where the whole lies, how it is turned, or how
-large it is: RTK gives that, loosely. `compared` then fits the result into RTK's positions by a
-similarity, as HelioPoint's appendix A does, and what is left are the errors of RTK and of the
-photogrammetry.
+A bundle adjustment with free points. The unknowns are the rotation φ and the position p of each
+photograph, each corner X of each target, and the errors of the camera file (focal lengths,
+principal point, distortion). A corner is seen at OpenCV's projection of $(R e^{[φ]})^T (X - p)$.
+Images do not determine the position, rotation and scale of the whole, so RTK positions constrain
+these loosely. `compared` then fits the result to the RTK positions by a similarity transform, as in
+HelioPoint's appendix A; the residuals are the errors of RTK and of the photogrammetry.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Pictures of a flight: the points and differences of one heliostat, and a map of the field."""
+"""Plots of a flight: the points and differences of one heliostat, and a map of the field."""
 
 from typing import TYPE_CHECKING
 

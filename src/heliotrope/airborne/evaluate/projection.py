@@ -1,12 +1,12 @@
-"""Which mirror is which where they overlap: the known field is laid over the photograph.
+"""Identifies overlapping mirrors by registering a drawing of the known field to the photograph.
 
-From a low drone mirrors merge into one bright shape with no separate patches, so
-`heliotrope.airborne.evaluate.identification` has nothing to vote with. But that shape is known: the
-mirrors are drawn as the recorded position and gimbal let expect them, nearer ones over those
-behind, and the drawing is moved and turned over the photograph until both correlate best (OpenCV's
-``matchTemplate``, then ``findTransformECC``: Evangelidis and Psarakis 2008, IEEE Transactions on
-Pattern Analysis and Machine Intelligence 30, 1858). If the drawing fits nearly as well elsewhere,
-no place is trusted.
+Seen from a low drone, mirrors merge into one bright shape without separate patches, so
+`heliotrope.airborne.evaluate.identification` has nothing to vote with. But that shape is
+predictable: the mirrors are drawn as expected from the recorded position and gimbal angles, with
+nearer mirrors in front, and the drawing is shifted and rotated over the photograph until the two
+correlate best (OpenCV's ``matchTemplate``, then ``findTransformECC``: Evangelidis and Psarakis
+2008, IEEE Transactions on Pattern Analysis and Machine Intelligence 30, 1858). If the drawing fits
+nearly as well elsewhere, no position is trusted.
 """
 
 from dataclasses import dataclass

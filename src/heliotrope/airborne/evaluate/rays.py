@@ -1,4 +1,4 @@
-"""Spots to reflections: the ray of each spot is intersected with the surface of its mirror."""
+"""From spots to reflections: the ray of each spot is intersected with its mirror surface."""
 
 from collections.abc import Callable, Sequence
 

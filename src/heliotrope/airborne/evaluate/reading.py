@@ -1,7 +1,8 @@
-"""Reading photographs: which mirrors each one shows, their corners, and the lamp's spots on them.
+"""Reads photographs: which mirrors each one shows, their corners, and the lamp spots on them.
 
-Results are undistorted image coordinates, X/Z and Y/Z in camera axes, so that no later step needs
-the image. A photograph that cannot be used is reported with the reason; it raises nothing.
+Results are undistorted image coordinates, X/Z and Y/Z in camera axes, so that later steps do not
+need the image. A photograph that cannot be used is reported with the reason; no exception is
+raised.
 """
 
 import hashlib
@@ -82,26 +83,26 @@ class PhotoReading:
     name
         Name of the photograph.
     problem
-        Why nothing in it is trusted; empty if it is usable. Begins with a keyword: nothing,
+        Why the photograph cannot be used; empty if it can. Begins with a keyword: nothing,
         wrong_field, ambiguous, overexposed, small, unreadable.
     rotation
-        Camera axes to ENU, from its mirrors alone, (3, 3).
+        Camera axes to ENU, estimated from the mirrors alone, (3, 3).
     mirror
-        Rows of the mirrors in it, (M,).
+        Indices of the visible mirrors, (M,).
     corners
-        Undistorted coordinates in the order of the outline, NaN where not found, (M, 4, 2).
+        Undistorted corner coordinates in the order of the outline, NaN if not found, (M, 4, 2).
     corner_sigma
-        Standard deviation of a corner in each direction, (M,).
+        Standard deviation of a corner per direction, (M,).
     spot_mirror
-        Row of each spot's mirror, (S,).
+        Mirror index of each spot, (S,).
     spot, spot_sigma
-        Undistorted coordinates, (S, 2), and their standard deviation in each direction, (S,).
+        Undistorted coordinates, (S, 2), and their standard deviation per direction, (S,).
     flux
         Flux of each spot, full scale times pixels, (S,).
     clipped
         Clipped pixels of each spot, (S,).
     notes
-        For each mirror why it gives no spot or no outline; empty if it gives both, (M,).
+        For each mirror, why it yields no spot or no outline; empty if it yields both, (M,).
     """
 
     name: str
@@ -119,21 +120,21 @@ class PhotoReading:
 
     @property
     def has_corners(self) -> bool:
-        """Whether it shows a corner of a mirror."""
+        """Whether the photograph shows a corner of a mirror."""
         return not self.problem and bool(np.isfinite(self.corners).any())
 
     @property
     def has_lights(self) -> bool:
-        """Whether it shows the lamp."""
+        """Whether the photograph shows the lamp."""
         return not self.problem and len(self.spot) > 0
 
     @property
     def nameable(self) -> bool:
-        """Whether it shows mirrors, perhaps, but which ones is unknown: a person may see it."""
+        """Whether the photograph may show mirrors that only a user could identify."""
         return self.problem.startswith(_NAMEABLE)
 
     def why_unused(self) -> str:
-        """Return a line with the reason why its corners cannot be used; empty if they can."""
+        """Return the reason why its corners cannot be used; empty if they can."""
         if self.has_corners:
             return ""
         if self.nameable:
@@ -141,7 +142,7 @@ class PhotoReading:
         return f"{self.name}: {self.problem or 'outline: no mirror edges could be measured'}"
 
     def save(self, path: Path) -> None:
-        """Write it as ``.npz``, completely or not at all."""
+        """Write the reading as ``.npz``, completely or not at all."""
         from heliotrope.files.text import write_file
 
         values = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
@@ -149,7 +150,7 @@ class PhotoReading:
 
     @classmethod
     def load(cls, path: Path) -> "PhotoReading":
-        """Return a reading from the file that `save` wrote."""
+        """Return a reading from a file written by `save`."""
         values: dict[str, Any] = dict(
             read_arrays(path, "a stored reading", [f.name for f in fields(cls)])
         )
@@ -167,7 +168,7 @@ class PhotoReading:
 
 
 def read_photo(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoReading:
-    """Return the reading of a photograph's file.
+    """Return the reading of a photograph file.
 
     Parameters
     ----------
@@ -426,14 +427,14 @@ def read_many(
     stand
         All mirrors in their expected poses.
     processes
-        Number of processes on this machine.
+        Number of processes on this computer.
     client
-        Client of a dask scheduler, used instead of processes.
+        Client of a dask scheduler, used instead of local processes.
     keep
-        Folder that keeps the result of each photograph. A photograph whose file, camera and
-        field are unchanged is not read again, so an interrupted run continues where it stopped.
+        Folder that stores the result for each photograph. A photograph whose file, camera and field
+        are unchanged is not evaluated again, so an interrupted run continues where it stopped.
     progress
-        Called with (done, all).
+        Called with the numbers of photographs (done, total).
     """
     readings: dict[int, PhotoReading] = {}
     if keep is not None:

@@ -1,8 +1,8 @@
-"""Orientations compared with a reference: tables 3 to 5 of HelioPoint.
+"""Compares orientations with a reference: tables 3 to 5 of HelioPoint.
 
-A reference is the normal of a heliostat in the same pose by another method (deflectometry, QDec-H).
-The same reflections are evaluated with the ideal surface and, where a slope map is there, with the
-measured one; slopes that are not known shift the first.
+A reference is the normal of a heliostat in the same pose, measured by another method
+(deflectometry, QDec-H). The same reflections are evaluated with the ideal surface and, if a slope
+map exists, with the measured surface; unknown slopes bias the first result.
 """
 
 from collections.abc import Sequence
@@ -116,12 +116,12 @@ def offset_from(reference: FloatArray, orientation: Orientation) -> FloatArray:
 
 
 def compare(flights: Sequence[FlightResult], reference: Reference) -> tuple[Compared, ...]:
-    """Return the heliostats of flights that have a reference, in the order of the flights.
+    """Return the heliostats that have a reference, in the order of the flights.
 
     Raises
     ------
     InputError
-        If none has one.
+        If no heliostat has a reference.
     """
     compared = []
     for flight in flights:

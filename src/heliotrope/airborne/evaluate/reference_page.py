@@ -1,4 +1,4 @@
-"""The page and the table of orientations beside a reference."""
+"""The page and the table that compare orientations with a reference."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""Reflections of the drone's lamp, as found in the images: the table of a flight.
+"""Reflections of the drone's lamp found in the images: the reflection table of a flight.
 
-One row is one reflection in one photograph. The orientations of the mirrors are computed from this
-table; nothing else of the images is needed.
+One record is one reflection in one photograph. The mirror orientations are computed from this table
+alone; the images are no longer needed.
 """
 
 from collections.abc import Sequence
@@ -29,11 +29,11 @@ class Reflections:
     Attributes
     ----------
     photo
-        Number of the photograph, (N,).
+        Index of the photograph, (N,).
     heliostat
-        Row of the heliostat in a list of names kept separately, (N,).
+        Index of the heliostat in a separate list of names, (N,).
     facet
-        (N,).
+        Facet index, (N,).
     x, y
         Position on the mirror, m in concentrator coordinates, (N,).
     camera, led
@@ -60,14 +60,14 @@ class Reflections:
         return np.stack([self.x, self.y], axis=-1)
 
     def take(self, rows: npt.ArrayLike) -> "Reflections":
-        """Return the reflections at ``rows`` (indices or a mask), in that order."""
+        """Return the reflections at indices ``rows`` (or a mask), in that order."""
         index = np.asarray(rows)
         # NumPy makes an empty list an array of floats.
         index = index if index.size else index.astype(np.intp)
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def of(self, heliostat: int) -> "Reflections":
-        """Return the reflections of one heliostat; its row number is kept."""
+        """Return the reflections of one heliostat; its index is kept."""
         return self.take(np.flatnonzero(self.heliostat == heliostat))
 
 
@@ -121,7 +121,7 @@ def reflections(
 
 
 def join(parts: Sequence[Reflections]) -> Reflections:
-    """Return several tables as one, in the order given; no parts give an empty table."""
+    """Join several tables, in the order given; without parts the table is empty."""
     if not parts:
         return reflections([], [], [], np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3)), [])
     return Reflections(
@@ -137,7 +137,7 @@ def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]
     Raises
     ------
     InputError
-        If the suffix is neither, or a row has no name in ``names``.
+        If the suffix is neither of the two, or an index has no name in ``names``.
     """
     import pandas as pd
 
@@ -164,7 +164,7 @@ def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]
 
 
 def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflections, list[str]]:
-    """Return the reflections of a file and a line for each row that was left out.
+    """Return the reflections in a file, and a message for each row that was left out.
 
     Raises
     ------

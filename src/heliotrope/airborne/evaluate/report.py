@@ -1,4 +1,4 @@
-"""The report of flights: one self-contained page, and tables for other programs."""
+"""The flight report: one self-contained page, and tables for other programs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -55,9 +55,9 @@ def write_result(
     page: bool = True,
     progress: Progress | None = None,
 ) -> None:
-    """Write the reflections, sightings and orientations of evaluated flights into a folder.
+    """Write the reflections, sightings and orientations of evaluated flights to a folder.
 
-    ``reflections.csv`` (of a campaign ``reflections-FLIGHT.csv``), ``sightings.csv`` for the
+    ``reflections.csv`` (for a campaign ``reflections-FLIGHT.csv``), ``sightings.csv`` for the
     calibration, ``flight.json`` for a running plant, and the report of `write_campaign_report`.
 
     Parameters
@@ -65,11 +65,11 @@ def write_result(
     result
         Result of `heliotrope.airborne.evaluate.flight.evaluate_flight`.
     folder
-        Created if it does not exist.
+        Folder, created if it does not exist.
     page
-        Whether to write the page with its pictures; otherwise only ``orientations.csv``.
+        Whether to write the page with its plots; otherwise only ``orientations.csv``.
     progress
-        Called with (done, all) after each picture.
+        Called with the numbers of plots (done, total) after each plot.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for flight in result.flights:
@@ -103,26 +103,26 @@ def write_flight_report(
     notes: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Path:
-    """Write the page and the tables of one flight; returns the page's path.
+    """Write the page and the tables of one flight, and return the path of the page.
 
-    ``index.html`` (with all pictures), ``orientations``, ``facets``, ``flights`` and
-    ``differences`` as ``.csv`` and ``.parquet``, and ``reflections.parquet``.
+    ``index.html`` (with all plots), ``orientations``, ``facets``, ``flights`` and ``differences``
+    as ``.csv`` and ``.parquet``, and ``reflections.parquet``.
 
     Parameters
     ----------
     found, shape, position, budget, places
         See `heliotrope.airborne.evaluate.tables.MeasuredFlight`.
     folder
-        Created if it does not exist.
+        Folder, created if it does not exist.
     notes
-        Lines for the top of the page, such as unusable photographs and the offset of RTK.
+        Lines for the top of the page, such as unusable photographs and the RTK offset.
     progress
-        Called with (done, all) after each picture.
+        Called with the numbers of plots (done, total) after each plot.
 
     Raises
     ------
     InputError
-        If the positions are not those of N heliostats.
+        If there are not N positions, one per heliostat.
     """
     known = None if places is None else as_float(places)
     flown = MeasuredFlight("", found, shape, as_float(position), budget, known)
@@ -136,19 +136,19 @@ def write_campaign_report(
     notes: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Path:
-    """Write the page and the tables of several flights, as `write_flight_report`.
+    """Write the page and the tables of several flights, like `write_flight_report`.
 
     Parameters
     ----------
     flights
-        Flights with different names.
+        Flights, each with a different name.
     folder, notes, progress
         See `write_flight_report`.
 
     Raises
     ------
     InputError
-        If there is no flight, or two have the same name.
+        If there is no flight, or two flights have the same name.
     """
     names = [f.name.replace("/", "-") for f in flights]
     if not names or len(set(names)) < len(names):

@@ -1,7 +1,8 @@
-"""RTK positions compared with photogrammetry, after appendix A of HelioPoint.
+"""RTK positions compared with photogrammetry, following appendix A of HelioPoint.
 
-The paper's flight photographs coded targets on the ground (`check_rtk_by_targets`). Any flight over
-the field shows mirrors, whose edges are good to millimetres only (`check_rtk`, ours).
+In the paper, a flight photographs coded targets on the ground (`check_rtk_by_targets`). Any flight
+over the field shows mirrors, but their edges are accurate only to millimetres (`check_rtk`, our own
+method).
 """
 
 from collections.abc import Sequence
@@ -25,27 +26,27 @@ _TRIALS, _CHI2_95 = 4001, 3.841
 
 @dataclass(frozen=True)
 class RtkCheck:
-    """Positions by RTK against those by photogrammetry.
+    """RTK positions compared with those from photogrammetry.
 
     Attributes
     ----------
     names
         Names of the photographs.
     difference
-        RTK less photogrammetry, east, north, up, m, (P, 3).
+        RTK minus photogrammetry, east, north, up, m, (P, 3).
     mean, mean_sigma
-        Offset common to all positions and its standard deviation, from the adjustment, m, (3,);
-        NaN by coded targets, whose places are not known.
+        Offset common to all positions and its standard deviation, from the adjustment, m, (3,); NaN
+        with coded targets, whose positions are unknown.
     covariance
-        Covariance of a single difference about the mean, m², (3, 3): that of RTK and of
-        photogrammetry together.
+        Covariance of a single difference about the mean, m², (3, 3), from RTK and photogrammetry
+        together.
     photogrammetry
         Mean standard deviation of the photogrammetric positions relative to each other, m, (3,).
     rtk
-        Standard deviation of a single position by RTK alone, m, (3,); 0 where photogrammetry
+        Standard deviation of a single position from RTK alone, m, (3,); 0 if photogrammetry
         explains the whole difference.
     rtk_range
-        Its 95 % interval, lower and upper end, m, (2, 3).
+        Its 95 % interval, lower and upper bound, m, (2, 3).
     """
 
     names: tuple[str, ...]
@@ -70,10 +71,10 @@ def check_rtk(
     stand: MirrorPoses,
     priors: Priors | None = None,
 ) -> tuple[RtkCheck, tuple[str, ...]]:
-    """Return how RTK positions scatter about those from the images alone.
+    """Return the scatter of RTK positions about those from the images alone.
 
-    The adjustment runs twice: as usual, for the common offset, and with positions free to a
-    metre, for the error of each photograph.
+    The adjustment runs twice: in the usual form, for the common offset, and with positions free
+    within a metre, for the error of each photograph.
 
     Raises
     ------

@@ -1,13 +1,13 @@
-r"""Orientations measured by a drone, as sightings for the calibration.
+r"""Orientations measured by a drone, converted to sightings for the calibration.
 
-The rays of a sighting meet at the mirror's vertex; a reflection lies anywhere on the mirror, on a
-facet that is canted. Both rays are therefore moved to the vertex and turned by the rotation from
-the normal measured at the point to the normal that the whole mirror has if this point is right.
-The distances stay the same, and bisector and lever are those of the reflection.
+The rays of a sighting meet at the mirror vertex, but a reflection may lie anywhere on the mirror,
+on a canted facet. Both rays are therefore moved to the vertex and rotated from the normal measured
+at the point to the normal that the whole mirror would have if this point were right. The distances
+stay the same, and bisector and lever arm are those of the reflection.
 
-Unmapped slope deviations turn a mirror, as seen by the drone, alike in all poses. The centroid of
-a mirror's image on a target represents the mean over the whole mirror instead. In a fit of both,
-that turn is an additional unknown (`fit_together`).
+Unmapped slope deviations make a mirror appear rotated, to the drone, by the same angle in all
+poses. The centroid of a mirror's image on a target, in contrast, represents the mean over the whole
+mirror. In a joint fit, that rotation is an additional unknown (`fit_together`).
 """
 
 from collections.abc import Mapping
@@ -46,7 +46,7 @@ def to_sightings(
     per: Per = "reflection",
     systematic: bool = True,
 ) -> Sightings:
-    """Return the sightings of one pose of a field.
+    """Return the sightings from one pose of a field.
 
     Parameters
     ----------
@@ -57,23 +57,24 @@ def to_sightings(
     time
         See `heliotrope.sun.Times`, () or (N,); NaN: unknown.
     per
-        "reflection" makes a sighting of each reflection that is not an outlier, "orientation" of
-        each orientation.
+        "reflection" creates a sighting per reflection that is not an outlier, "orientation" one per
+        orientation.
     systematic
-        Whether σ includes the error common to all points of a mirror. Leave it out if the fit
-        estimates the positions, which are the larger part of it.
+        Whether σ includes the error common to all points of a mirror. Exclude it if the fit
+        estimates the positions, which cause the larger part of that error.
 
     Returns
     -------
     Sightings whose σ gives all sightings of an orientation together the weight of σ_tot (or
-    σ_mean), however many they are; single reflections share it as in the mean over the mirror.
-    Both ways give the same fit, and single reflections let it find its own outliers.
+    σ_mean), however many there are; single reflections share it as in the mean over the mirror.
+    Both choices of ``per`` give the same fit, and single reflections allow the fit to find its own
+    outliers.
 
     Raises
     ------
     InputError
-        If there is no orientation, the counts are not those of N heliostats, or ``per`` is
-        neither word.
+        If there is no orientation, the counts are not those of N heliostats, or ``per`` has another
+        value.
     """
     if per not in ("reflection", "orientation"):
         raise InputError(f"to_sightings: per={per!r}; give 'reflection' or 'orientation'")
@@ -137,20 +138,20 @@ def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool
 
 @dataclass(frozen=True)
 class Together:
-    """A joint fit of drone sightings and others.
+    """A joint fit of drone sightings and other sightings.
 
     Attributes
     ----------
     calibration
-        Calibration of N heliostats. Its covariance accounts for the unknown turn.
+        Calibration of N heliostats. Its covariance accounts for the unknown rotation.
     turn
-        Turn by which the drone sees a mirror rotated in all poses, about the concentrator's x and y
-        axes, rad, (N, 2).
+        Rotation by which each mirror appears turned to the drone in all poses, about the
+        concentrator's x and y axes, rad, (N, 2).
     turn_covariance
-        rad², (N, 2, 2).
+        Its covariance, rad², (N, 2, 2).
     noise
-        Scatter of the poses beside the turn, in units of the drone sightings' sigma, (N,); 1
-        with too few poses to estimate it.
+        Scatter of the poses apart from the rotation, in units of the drone sightings' sigma, (N,);
+        1 if there are too few poses to estimate it.
     """
 
     calibration: FieldFit
@@ -167,21 +168,21 @@ def fit_together(
     *,
     priors: Mapping[str, npt.ArrayLike] | None = None,
 ) -> Together:
-    """Return a joint fit of drone sightings and others, for mirrors without slope maps.
+    """Fit drone sightings and others jointly, for mirrors without slope maps.
 
-    A turn of each mirror common to all its poses is an additional unknown. Its prior is as wide as
-    the stated standard deviation of the drone sightings (half of their sigma, which is the
-    beam's), and their remaining error is their scatter about a fit of their own. Losses are
-    squares: remove outliers before.
+    A rotation of each mirror common to all its poses is an additional unknown. Its prior is as wide
+    as the stated standard deviation of the drone sightings (half of their sigma, which refers to
+    the beam), and their remaining error is estimated from their scatter about a separate fit. The
+    loss is quadratic, so outliers must be removed beforehand.
 
     Parameters
     ----------
     mechanism
         Nominal mechanisms, batch shape (N,).
     others
-        Camera-target sightings: a centroid represents the mean over the whole mirror.
+        Camera-target sightings, in which a centroid represents the mean over the whole mirror.
     flights
-        One for each orientation (``per="orientation"``), without the systematic part.
+        One per orientation (``per="orientation"``), without the systematic part.
     model, priors
         See `heliotrope.calibration.fit.estimator.fit`.
 
@@ -192,9 +193,9 @@ def fit_together(
 
     Notes
     -----
-    Simulated (4 facets, slopes 0.8 mrad, 5 camera-target and 15 drone sightings, 24 mirrors):
-    normals elsewhere are predicted to 0.77 mrad from the first alone, 0.16 from the second, 0.16
-    from both in `estimator.fit`, and 0.08 from this function.
+    In simulation (4 facets, slopes 0.8 mrad, 5 camera-target and 15 drone sightings, 24 mirrors),
+    normals in other poses are predicted to 0.77 mrad from the camera-target sightings alone, 0.16
+    from the drone sightings alone, 0.16 from both in `estimator.fit`, and 0.08 by this function.
     """
     alone = fit(mechanism, flights, model, priors=priors, loss="square", adapt_scale=False)
     count = len(mechanism)

@@ -1,18 +1,18 @@
-r"""Outliers, normality, and the accuracy of a mean over points of a mirror.
+r"""Outliers, normality, and the accuracy of a mean over points on a mirror.
 
-The plain figure, σ/√n, treats the differences at n points as independent draws. They are not: the
-slope deviations of a mirror are one fixed, smooth field, and points spread over it average it
-better than chance would. The error of the mean over points, relative to the mean over the
-mirror V, is, with the covariance C of the field,
+The plain estimate, σ/√n, treats the differences at n points as independent samples. They are not
+independent, because the slope deviations of a mirror are one fixed, smooth field, and points spread
+over the field average it better than random samples would. With the covariance C of the field, the
+error of the mean over the points relative to the mean over the mirror V is
 
 $$ σ_E^2 = \bar C(x, x) - 2 \bar C(x, V) + \bar C(V, V) + τ^2 / n $$
 
 (the extension variance: Matheron 1963, Economic Geology 58, 1246; Chilès & Delfiner 2012,
-*Geostatistics*, section 2.6) with τ the noise of one point. The field is taken as Gaussian with
-Matérn's covariance of smoothness 3/2, the same on all facets and independent between them, so that
-canting errors are part of it. Variance, correlation length and noise are estimated from the
+*Geostatistics*, section 2.6), where τ is the noise of one point. The field is modelled as Gaussian
+with a Matérn covariance of smoothness 3/2, the same on all facets and independent between facets,
+so that canting errors are included. Variance, correlation length and noise are estimated from the
 differences by restricted maximum likelihood, averaged over all lengths and noise ratios by their
-likelihood, since one mirror says little about either.
+likelihood, since one mirror contains little information on either.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Tables of a flight: one record for each heliostat, facet, reflection and flight."""
+"""Tables of a flight: one record per heliostat, facet, reflection and flight."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -20,7 +20,7 @@ _AXES = ("x", "y")
 
 @dataclass(frozen=True)
 class MeasuredFlight:
-    """Orientations of one flight (one pose of the mirrors), and the data used to measure them.
+    """Orientations from one flight (one pose of the mirrors), and the data used to measure them.
 
     Attributes
     ----------
@@ -29,11 +29,11 @@ class MeasuredFlight:
     found
         Orientations of the N heliostats.
     shape
-        Gives the mirror of a row.
+        Function that returns the mirror at an index.
     position
         Positions of the heliostats, ENU metres, (N, 3).
     budget
-        If given, the systematic part is split by cause.
+        If specified, the systematic part is split by cause.
     places
         Covariances of the mirrors' positions relative to the drone, m², (N, 3, 3), or None.
     """
@@ -53,11 +53,11 @@ class MeasuredFlight:
             )
 
     def rows(self, flight: str = "") -> list[dict[str, Any]]:
-        """Return one record for each heliostat, with the flight's name if it is given."""
+        """Return one record per heliostat, with the name of the flight if it has one."""
         return orientation_rows(self.found, self.budget, flight, self.places)
 
     def label(self, o: Orientation) -> str:
-        """Return the name of an orientation's heliostat, with the flight's name if it has one."""
+        """Return the heliostat name of an orientation, with the flight's name if it has one."""
         name = self.found.names[o.heliostat]
         return f"{self.name}/{name}" if self.name else name
 

@@ -1,7 +1,7 @@
-"""Plans of a drone's campaign: clusters, poses, hover patterns, sorties and waypoint files.
+"""Plans drone campaigns: clusters, poses, hover patterns, sorties and waypoint files.
 
-Begin with `plan_flight`, which takes a plant and `PlanSettings`, and write its plan
-with `write_plan`. `heliotrope.airborne.plan.waypoints` writes waypoint files,
+Begin with `plan_flight`, which takes a plant and `PlanSettings`, and write its plan with
+`write_plan`. `heliotrope.airborne.plan.waypoints` writes waypoint files, and
 `heliotrope.airborne.plan.flight_map` draws a map.
 """
 

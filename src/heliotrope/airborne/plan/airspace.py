@@ -1,6 +1,6 @@
 """Airspace: where a drone may fly, and routes around obstacles.
 
-Distances and containment on the ground are computed by shapely; heights are clipped here.
+Horizontal distances and containment are computed with shapely; heights are clipped in this module.
 """
 
 from dataclasses import dataclass, field
@@ -37,12 +37,12 @@ _TOUCH = 1e-3
 
 @dataclass(frozen=True)
 class KeepOut:
-    """A volume that no drone enters: everything near a polygon, between two heights.
+    """A volume that no drone may enter: everything near a polygon, between two heights.
 
     Attributes
     ----------
     name
-        Shown to people.
+        Display name.
     corners
         Corners of the polygon, in order, ENU metres east and north, (V, 2); a single corner with a
         radius is a cylinder.
@@ -118,7 +118,7 @@ class KeepOut:
 
 
 def tower(plant: Plant, clearance: float = 10.0) -> tuple[KeepOut, ...]:
-    """Return a cylinder for each receiver and target, from the ground to ``clearance`` m above."""
+    """Return a keep-out cylinder for each receiver and target, from the ground to above it."""
     volumes = []
     surfaces: list[Receiver | Target] = [*plant.receivers, *plant.targets]
     for surface in surfaces:
@@ -141,17 +141,17 @@ class Airspace:
     Attributes
     ----------
     keep_outs
-        Volumes to stay out of.
+        Volumes that drones must avoid.
     fence
-        Polygon to stay inside, ENU metres east and north, (V, 2); None for no fence.
+        Polygon in which drones must stay, ENU metres east and north, (V, 2); None for no fence.
     min_height, max_height
-        Least and greatest height above ground while measuring and in transit, m. Aviation law
-        limits the upper one, to 120 m in the European Union's open category.
+        Minimum and maximum height above ground while measuring and in transit, m. Aviation law
+        limits the maximum, to 120 m in the European Union's open category.
     margin
-        Distance to all keep-outs, m.
+        Margin to all keep-outs, m.
     ground
-        Points of known ground height, ENU metres, (N, 3); the nearest one counts. Without
-        any, the ground is level at 0.
+        Points of known ground height, ENU metres, (N, 3); the nearest point counts. Without points
+        the ground is level at 0.
     """
 
     keep_outs: tuple[KeepOut, ...] = ()
@@ -248,10 +248,10 @@ class Airspace:
         return np.asarray(shapely.covers(fence, legs) & clear)
 
     def route(self, a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray | None:
-        """Return the points between ``a`` and ``b`` on a short free route, (M, 3).
+        """Return the intermediate points on a short free route from ``a`` to ``b``, (M, 3).
 
-        None if there is no route. The route is straight where that is free. Otherwise it runs
-        around the corners of keep-outs at one height: that of the higher end, or above a keep-out.
+        None if there is no route. The route is straight if that is free. Otherwise it runs around
+        the corners of keep-outs at a constant height: that of the higher end, or above a keep-out.
         """
         start, stop = as_float(a), as_float(b)
         if self.free_legs(start[None], stop[None])[0]:

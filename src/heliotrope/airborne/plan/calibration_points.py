@@ -1,8 +1,8 @@
-"""Calibration points of a flight: the directions from which clusters of mirrors are measured.
+"""Calibration points of a flight: the directions from which clusters of heliostats are measured.
 
-A direction is one pose of each mirror of the cluster. Directions are chosen as sightings on a
-target are planned: those that together tell most about the mechanism. HelioPoint takes the
-calibration points from the operator of the plant; this choice is ours.
+Each direction requires one pose of every heliostat in the cluster. Directions are chosen like
+sightings on a target, as the set that is most informative about the mechanism. HelioPoint takes the
+calibration points from the plant operator; this selection is our own.
 """
 
 from collections.abc import Mapping
@@ -44,21 +44,21 @@ class PointSelection:
     Attributes
     ----------
     points
-        Per heliostat; more than the model has unknowns.
+        Per heliostat; more than the unknowns of the model.
     criterion
         "d": most information; "v": smallest beam error over the year.
     sigma
-        Standard deviation of a measured normal that all its reflections share, in each of two
-        directions, rad.
+        Standard deviation of a measured normal common to all its reflections, per direction, rad.
     scatter
-        Standard deviation of the normal that one reflection shows, rad: the slope deviations.
+        Standard deviation of the normal measured by one reflection, rad, which is due to the slope
+        deviations.
     least
-        Fewest reflections of the median mirror in a direction that is flown.
+        Minimum number of reflections on the median mirror for a direction to be flown.
     min_elevation, max_elevation
-        Least and greatest elevation of the drone as seen from the cluster, rad. At low ones mirrors
-        hide each other.
+        Minimum and maximum elevation of the drone as seen from the cluster, rad. At low elevations
+        mirrors hide each other.
     share
-        Least share of a cluster's mirrors that must be able to face the drone.
+        Minimum fraction of a cluster's heliostats that must be able to face the drone.
     priors
         Standard deviations to use instead of the parameter table's, by name.
     """
@@ -89,7 +89,7 @@ class PointSelection:
             raise InputError(f"share {self.share}: give a number above 0, up to 1")
 
     def check(self, names: tuple[str, ...], model: str) -> None:
-        """Refuse points that do not outnumber a model's unknowns."""
+        """Raise an error unless the points outnumber the unknowns of a model."""
         if self.points <= len(names):
             raise InputError(
                 f"{self.points} calibration points: the model {model} has {len(names)} unknowns; "

@@ -1,8 +1,8 @@
 """Clusters: heliostats that are measured from one hover pattern.
 
-Clusters have equal areas of ground and are as round as that allows, as HelioPoint asks for: they
-are the cells of a power diagram (Aurenhammer, Hoffmann & Aronov 1998: among all partitions into
-given areas its cells have the smallest sum of squared distances from their centres).
+Clusters have equal ground areas and are as compact as that allows, as HelioPoint requires: they are
+the cells of a power diagram (Aurenhammer, Hoffmann & Aronov 1998: among all partitions into given
+areas, its cells have the smallest sum of squared distances from their centres).
 """
 
 from dataclasses import dataclass
@@ -36,12 +36,12 @@ class HeliostatClusters:
     center
         Mean position, ENU metres, (K, 3).
     area
-        Ground that the heliostats stand on, m², (K,).
+        Ground area occupied by the heliostats, m², (K,).
     radius
         Largest horizontal distance of a heliostat from the centre, m, (K,).
     roundness
-        Mean squared distance from the centre of a disc of the same area, over that of the
-        heliostats, (K,): 1 for a disc, 0.95 for a square, 0.6 for an oblong of 1:3.
+        Mean squared distance from the centre for a disk of the same area, divided by that of the
+        heliostats, (K,): 1 for a disk, 0.95 for a square, 0.6 for a rectangle of 1:3.
     """
 
     of: npt.NDArray[np.intp]
@@ -54,7 +54,7 @@ class HeliostatClusters:
         return len(self.center)
 
     def rows(self, cluster: int) -> npt.NDArray[np.intp]:
-        """Return the rows of the heliostats of one cluster."""
+        """Return the indices of the heliostats in one cluster."""
         return np.flatnonzero(self.of == cluster)
 
 

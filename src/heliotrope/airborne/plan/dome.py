@@ -1,8 +1,8 @@
-"""The dome flight of HelioPoint's appendix A: photographs of coded targets from a hemisphere.
+"""The dome flight in HelioPoint's appendix A: photographs of coded targets from a hemisphere.
 
-Photogrammetry needs rays that cross at wide angles, from all sides and several heights; every
-photograph looks at the middle of the targets. The paper shows such a flight (figure 7) and states
-neither its radius nor the numbers; those here are ours.
+Photogrammetry needs rays that intersect at wide angles, from all sides and several heights; every
+photograph is aimed at the middle of the targets. The paper shows such a flight (figure 7) but
+states neither its radius nor the number of photographs; the values here are our own.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""Flights: the order in which stations are flown, from which take-off, and how long it takes.
+"""Flights: the order of the stations, take-off places and duration.
 
-A station is one cluster in one pose: a hover pattern. While a drone flies the stations of some
-clusters, the mirrors of the others move to their next pose. So clusters are flown in groups: the
-whole group in one pose, then in the next.
+A station is one cluster in one pose, measured with one hover pattern. While a drone flies the
+stations of some clusters, the heliostats of the other clusters move to their next pose. Clusters
+are therefore flown in groups: the whole group in one pose, then in the next.
 """
 
 from collections.abc import Sequence
@@ -34,15 +34,15 @@ class Craft:
     Attributes
     ----------
     count
-        Drones flying at the same time.
+        Number of drones flying at the same time.
     speed
         Speed between stations, m/s, up to 15.
     acceleration
-        m/s².
+        Acceleration, m/s².
     photo
         Time to come to rest at a hover point and take a photograph, s.
     endurance
-        Time from take-off to landing on one battery, without its reserve, s.
+        Time from take-off to landing on one battery, excluding its reserve, s.
     change
         Time from landing to the next take-off, s.
     """
@@ -73,7 +73,7 @@ class Craft:
         return 2.0 * float(np.sqrt(length / self.acceleration))
 
     def way(self, points: FloatArray) -> float:
-        """Return the duration of a route through points (M, 3), stopping at each, s."""
+        """Return the duration of a route through points (M, 3) with a stop at each, s."""
         return sum(self.time(float(d)) for d in np.linalg.norm(np.diff(points, axis=0), axis=-1))
 
 
@@ -84,11 +84,11 @@ class HoverStation:
     Attributes
     ----------
     cluster, point
-        Rows of the cluster and of its calibration point.
+        Indices of the cluster and of its calibration point.
     pattern
         The hover points.
     travel
-        Time that the mirrors need from the previous pose, s; 0 for the first.
+        Time that the heliostats need to move from the previous pose, s; 0 for the first.
     """
 
     cluster: int
@@ -141,13 +141,13 @@ class Sortie:
     Attributes
     ----------
     drone, number
-        Numbers from 0; ``number`` counts the sorties of the drone.
+        Indices from 0; ``number`` counts the sorties of the drone.
     start, end
         Take-off and landing, s since the start of the campaign.
     home
         Place of take-off and landing, ENU metres, (3,).
     visits
-        Visits in the order flown.
+        Stations in the order flown.
     back
         Points between the last hover point and the landing, ENU metres, (M, 3).
     """
@@ -478,12 +478,12 @@ def separation(sorties: Sequence[Sortie], stations: Sequence[HoverStation], craf
 
 @dataclass(frozen=True)
 class CameraTarget:
-    """Duration of the same campaign with camera and target.
+    """Duration of the same measurements if made by a camera at a target.
 
     Attributes
     ----------
     hours
-        Hours of sun, h.
+        Total hours of sun, h.
     days, months
         Calendar time.
     sunny
@@ -511,22 +511,22 @@ def camera_target(
     Parameters
     ----------
     site
-        Location and air.
+        Location and atmosphere.
     photographs
-        Heliostats times calibration points.
+        Number of heliostats times calibration points.
     minutes
         Time from one photograph to the next on a target, min.
     targets
-        Each with a camera.
+        Number of targets, each with a camera.
     clear
-        Share of the sunny hours that are clear enough.
+        Fraction of the sunny hours that are clear enough.
     year, min_elevation
-        Year, and lowest usable sun, rad.
+        Year, and lowest usable elevation of the sun, rad.
 
     Raises
     ------
     InputError
-        If a number is not above 0, or the sun is never this high.
+        If a number is not above 0, or the sun never reaches this elevation.
     """
     for name, value in (("minutes", minutes), ("targets", targets), ("clear share", clear)):
         if not (np.isfinite(value) and value > 0.0):

@@ -1,4 +1,4 @@
-"""The files of a flight plan: waypoints of each sortie, commands of the mirrors, and JSON."""
+"""The files of a flight plan: waypoints of each sortie, heliostat commands, and JSON."""
 
 import csv
 import io
@@ -20,7 +20,7 @@ from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, enu_to_geodetic
 from heliotrope.sun import Site
 
-#: Formats of waypoint files; each has a folder of its name.
+#: Formats of waypoint files; each has a folder of the same name.
 FORMATS = ("dji", "qgc", "litchi")
 _SUFFIX = {"dji": ".kmz", "qgc": ".plan", "litchi": ".csv"}
 Progress = Callable[[int, int], None]
@@ -114,20 +114,20 @@ def write_plan(
     aircraft: str = "M3E",
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write plan.json, commands.csv and the waypoint files of all sorties into a folder.
+    """Write plan.json, commands.csv and the waypoint files of all sorties to a folder.
 
     Parameters
     ----------
     plan
         The plan.
     folder
-        Created if it does not exist.
+        Folder, created if it does not exist.
     formats
         Names from `FORMATS`.
     aircraft
-        For DJI's files, see `AIRCRAFT`.
+        Aircraft for DJI's files, see `AIRCRAFT`.
     progress
-        Called with (done, all) sorties.
+        Called with the numbers of sorties (done, total).
 
     Raises
     ------
@@ -333,7 +333,7 @@ def _finite(value: Any) -> Any:
 
 
 def read_airspace(path: str | Path, base: Airspace) -> tuple[Airspace, FloatArray | None]:
-    """Return an airspace from a JSON file, and the home point if it gives one.
+    """Return an airspace from a JSON file, and the home point if the file contains one.
 
     Parameters
     ----------
@@ -343,7 +343,7 @@ def read_airspace(path: str | Path, base: Airspace) -> tuple[Airspace, FloatArra
         ``name`` and either ``polygon`` ([[east, north], …]) or ``centre`` ([east, north]) and
         ``radius_m``, and optionally ``bottom_m`` and ``top_m``.
     base
-        Airspace whose keep-outs are kept, and whose limits apply where the file gives none.
+        Airspace whose keep-outs are kept, and whose limits apply if the file does not set them.
 
     Raises
     ------

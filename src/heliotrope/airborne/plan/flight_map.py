@@ -1,4 +1,4 @@
-"""The map of a flight plan: clusters, stations, routes of the drones, and keep-outs."""
+"""The map of a flight plan: clusters, stations, drone routes, and keep-outs."""
 
 from typing import TYPE_CHECKING
 

@@ -41,22 +41,22 @@ class PlanSettings:
     size
         Diameter of a cluster, m.
     spread
-        Largest angle between an optical axis and its cluster's mean axis, rad: it limits the
-        radius of clusters to distance · tan(spread).
+        Largest angle between an optical axis and the mean axis of its cluster, rad; it limits the
+        cluster radius to distance · tan(spread).
     view
-        Angle of view of the camera across its shorter side, rad: a cluster fits into a
+        Angle of view of the camera across its shorter side, rad, so that a cluster fits into a
         photograph.
     model
-        Error model whose unknowns are to be found; "auto" takes jacks or malan8.
+        Error model whose unknowns are to be estimated; "auto" selects jacks or malan8.
     sampling, selection, craft, airspace
-        Patterns, calibration points, drones, and where they may fly.
+        Patterns, calibration points, drones, and where drones may fly.
     home
-        Place of take-off, ENU metres, (3,); None for a point south of the field.
+        Take-off place, ENU metres, (3,); None for a point south of the field.
     hours_a_day
-        Flying hours a day, h.
+        Flying hours per day, h.
     photo_minutes, clear
-        The same campaign with camera and target, for comparison: time between photographs, min, and
-        the share of the sunny hours that are clear.
+        Parameters of the same campaign with camera and target, for comparison: time between
+        photographs, min, and the fraction of the sunny hours that are clear.
     """
 
     size: float = 100.0
@@ -90,19 +90,19 @@ class FlightPlan:
     plant, settings, mirrors
         The field and the settings.
     clusters
-        K of them.
+        The K clusters.
     labels
         Their names, (K,).
     points
-        Calibration points of each, (K,).
+        Calibration points of each cluster, (K,).
     stations
-        All clusters' poses, cluster by cluster.
+        The poses of all clusters, cluster by cluster.
     sorties
         Sorties of all drones.
     homes
         Take-off place of each drone, ENU metres, (drones, 3).
     separation
-        Least distance of two drones in the air, m.
+        Minimum distance between two airborne drones, m.
     camera_target
         Duration of the same number of poses with camera and target.
     """
@@ -131,7 +131,7 @@ class FlightPlan:
 
     @property
     def airborne(self) -> float:
-        """Flying time of all drones together, s."""
+        """Total flying time of all drones, s."""
         return sum(s.end - s.start for s in self.sorties)
 
     @property
@@ -140,7 +140,7 @@ class FlightPlan:
         return sum(int(k.facing.able.sum()) for k in self.points)
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures of the campaign, for tables and JSON."""
+        """Return the key figures of the campaign, for tables and JSON."""
         radius, able = self.clusters.radius, np.ones(len(self.mirrors), dtype=np.int64)
         for k, look in enumerate(self.points):
             able[self.clusters.rows(k)] = look.facing.able.sum(axis=0)
@@ -192,15 +192,15 @@ def plan_flight(
     plant
         The plant, with its calibrated mechanisms, if any.
     settings
-        Settings; if its airspace has no ground, that of the plant is used.
+        Settings; if the airspace has no ground points, those of the plant are used.
     progress
-        Called with (done, all) clusters.
+        Called with the numbers of clusters (done, total).
 
     Raises
     ------
     InputError
-        If the model has as many unknowns as points or more, or heights, keep-outs, stops or the
-        battery allow no flight.
+        If the model has at least as many unknowns as there are points, or heights, keep-outs, stops
+        or the battery allow no flight.
     """
     all_mirrors = mirrors(plant)
     airspace = settings.airspace

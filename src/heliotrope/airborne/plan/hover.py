@@ -1,15 +1,15 @@
 r"""Hover patterns: drone positions from which the whole of every mirror is sampled.
 
-Lamp and camera are side by side, so a mirror shows the lamp where its normal points at the drone.
-A point of the mirror at height x above its vertex (either direction of the mirror's plane), whose
-normal leans by the slope s(x) from the optical axis, meets a plane across the axis at distance D
-in
+The lamp and the camera are side by side, so a mirror shows the lamp where its normal points at the
+drone. Consider a point of the mirror at height x above its vertex (in either direction of the
+mirror plane), whose normal is tilted by the slope s(x) from the optical axis. The normal meets a
+plane perpendicular to the axis at distance D in
 
 $$ q(x) = x + D \, s(x) + D \, e $$
 
-for a mirror with a pointing error e. All of the mirror is seen by a drone that covers the range of
-x + D s(x), widened by D e on all sides. A facet of focal length f has s = -x / 2f within it, so
-that a step g of the drone moves the reflection by
+for a mirror with a pointing error e. The drone sees all of the mirror if the pattern covers the
+range of x + D s(x), widened by D e on all sides. Within a facet of focal length f, s = -x / 2f, so
+a step g of the drone moves the reflection by
 
 $$ g / |1 - D / 2f| $$
 
@@ -49,11 +49,11 @@ class Sampling:
     samples
         Number of samples on each facet.
     focal
-        Focal length of the facets, m; infinite for flat ones.
+        Focal length of the facets, m; infinite for flat facets.
     led_offset
-        Lamp from the camera, in the camera's axes (right, down, forward), m, (3,).
+        Position of the lamp relative to the camera, in camera axes (right, down, forward), m, (3,).
     least_spacing
-        Least distance between points of the pattern, m; Litchi refuses less than 0.6 m.
+        Minimum distance between points of the pattern, m; Litchi rejects less than 0.6 m.
     camera
         Focal length of the camera, px.
     """

@@ -1,6 +1,6 @@
 """What photographs from a direction will show: visible mirrors, their size, and reflections.
 
-The model of visibility is that of the evaluation (`heliotrope.airborne.visibility`).
+The visibility model is that of the evaluation (`heliotrope.airborne.visibility`).
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The stations of a flight plan (``plan.json``): heliostats, pose, photographs' positions."""
+"""The stations of a flight plan (``plan.json``): heliostats, pose, photograph positions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,14 +14,15 @@ from heliotrope.geometry import FloatArray, as_float
 
 @dataclass(frozen=True)
 class PlannedStation:
-    """One pattern over one cluster in one pose.
+    """One hover pattern over one cluster in one pose.
 
     Attributes
     ----------
     name
-        Cluster and calibration point, such as ``C1-3``: the folder of its photographs.
+        Cluster and calibration point, such as ``C1-3``, which is the name of the photograph folder.
     heliostats
-        Rows in the given list of names, (N,), without those that cannot face the drone there.
+        Indices in the given list of names, (N,), without heliostats that cannot face the drone
+        there.
     counts
         Counts of their drives, (N, D).
     pattern
@@ -45,14 +46,14 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
     path
         ``plan.json`` written by ``heliotrope drone plan``.
     names
-        Names of the heliostats to be measured.
+        Names of the heliostats to measure.
 
     Raises
     ------
     FormatError
-        If it is not such a plan.
+        If the file is not such a plan.
     UnknownNameError
-        If it names other heliostats.
+        If it contains other heliostats.
     """
     root = read_json(path, "a flight plan (plan.json)")
     version = root["format"].text()

@@ -3,7 +3,7 @@
 Formats as published: Litchi Hub's CSV in metres; DJI's Waypoint Markup Language 1.0.2 (Cloud API
 documentation: template.kml and waylines.wpml in a folder ``wpmz``); QGroundControl's plan file
 (developer guide, mission items of MAVLink's common set). In all three, heights are relative to the
-place of take-off.
+take-off place.
 """
 
 import csv
@@ -20,7 +20,7 @@ import shapely
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
 
-#: WPML codes of drone, variant and payload, and the photographs to keep.
+#: WPML codes of drone, variant and payload, and the image types to store.
 AIRCRAFT = {
     "M3E": (77, 0, 66, "visible"), "M3T": (77, 1, 67, "visible"), "M3M": (77, 2, 68, "visible"),
     "M30": (67, 0, 52, "wide"), "M30T": (67, 1, 53, "wide"),
@@ -51,21 +51,21 @@ class Mission:
     latitude_deg, longitude_deg
         WGS84, (W,).
     height
-        Height above the place of take-off, m, (W,).
+        Height above the take-off place, m, (W,).
     yaw_deg
         Heading, clockwise from north in [0, 360), (W,).
     pitch_deg
         Pitch of the gimbal, −90 is straight down, (W,).
     stay
-        Rest before a photograph, s, (W,); 0 where there is none.
+        Hover time before a photograph, s, (W,); 0 if there is no photograph.
     photo
         Whether a photograph is taken, (W,).
     speed
-        m/s.
+        Speed, m/s.
     home
         Latitude and longitude in degrees and height above the ellipsoid in m.
     return_height
-        Height to which the drone climbs before it flies home by itself, m above take-off.
+        Height to which the drone climbs before it returns home automatically, m above take-off.
     """
 
     name: str

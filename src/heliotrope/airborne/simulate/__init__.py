@@ -1,9 +1,9 @@
-"""Simulated flights with their truth: reflections by the law, rendered photographs, and trials.
+"""Simulated flights with ground truth: exact reflections, rendered photographs, and trials.
 
-`fly` simulates a flight. `render_flight` writes its photographs, and
-`reflections_of` gives its reflections without images. `fly_rendered` evaluates the photographs too
-and compares the result with the truth. `trials` measures one mirror again and again, to find how
-many photographs a flight needs.
+`fly` simulates a flight. `render_flight` writes its photographs, and `reflections_of` returns its
+reflections without images. `fly_rendered` also evaluates the photographs and compares the result
+with the ground truth. `trials` measures one mirror repeatedly, to find how many photographs a
+flight needs.
 """
 
 from heliotrope.airborne.simulate.rendered import (

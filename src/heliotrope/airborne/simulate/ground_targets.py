@@ -1,4 +1,4 @@
-"""A simulated dome flight: photographs of coded targets with the truth."""
+"""A simulated dome flight: photographs of coded targets with ground truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

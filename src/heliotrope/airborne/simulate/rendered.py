@@ -1,7 +1,7 @@
-"""A rendered flight beside its truth: photographs used, reflections on the right mirrors, errors.
+"""A rendered flight compared with its ground truth: photographs used, reflections, errors.
 
-`fly_rendered` writes a flight's photographs and evaluates them like real ones; nothing but the
-files, the plant and the lens goes from one to the other.
+`fly_rendered` writes the photographs of a flight and evaluates them like real photographs; only the
+files, the plant and the lens are passed from one step to the other.
 """
 
 from dataclasses import dataclass
@@ -36,18 +36,19 @@ _ELLIPSE = 4.605170185988091
 
 @dataclass(frozen=True)
 class Compared:
-    """A rendered flight beside its truth.
+    """A rendered flight compared with its ground truth.
 
     Attributes
     ----------
     photographs, used
-        Rendered, and evaluated.
+        Number of photographs rendered, and evaluated.
     shown, found, right
-        True reflections on visible parts of mirrors; those found; of them, those on the right one.
+        Number of true reflections on visible parts of mirrors; of those found; and of those found
+        on the right mirror.
     missed
-        Reflections shown and not found, by `KINDS`.
+        Reflections shown but not found, by `KINDS`.
     count
-        Reflections of each of K measured mirrors, (K,).
+        Number of reflections on each of K measured mirrors, (K,).
     error, sigma
         True error and σ_tot of each, rad, rotX and rotY, (K, 2).
     """
@@ -64,12 +65,12 @@ class Compared:
 
     @property
     def identified(self) -> float:
-        """Share of the found reflections that are on the right mirror."""
+        """Fraction of the found reflections that are on the right mirror."""
         return self.right / max(self.found, 1)
 
     @property
     def within(self) -> float:
-        """Share of the errors within the 90 % ellipse of σ_tot."""
+        """Fraction of the errors within the 90 % ellipse of σ_tot."""
         return float(np.mean(np.sum((self.error / self.sigma) ** 2, axis=-1) < _ELLIPSE))
 
 
@@ -82,7 +83,7 @@ def fly_rendered(
     seed: int = 0,
     fewest: int = 1,
 ) -> Compared:
-    """Render a flight into a folder, evaluate it, and return the result beside the truth.
+    """Render a flight into a folder, evaluate it, and compare the result with the ground truth.
 
     Parameters
     ----------
@@ -95,7 +96,7 @@ def fly_rendered(
     conditions, seed
         See `heliotrope.airborne.simulate.rendering.render_flight`.
     fewest
-        Mirrors with fewer reflections are not compared.
+        Minimum number of reflections for a mirror to be compared.
 
     Raises
     ------
@@ -112,7 +113,7 @@ def fly_rendered(
 def compare(
     flight: Flight, exact: Reflections, result: CampaignResult, fewest: int = 1
 ) -> Compared:
-    """Return the only flight of a result beside its truth."""
+    """Compare the only flight in a result with its ground truth."""
     evaluation = result.flights[0].evaluation
     names = {photo.name: k for k, photo in enumerate(flight.taken)}
     number = np.array([names[p.name] for p in evaluation.photos])
@@ -189,9 +190,10 @@ def _kind(i: int, pixels: dict[int, FloatArray], labels: Labels) -> str:
 
 
 def paper_field(rows: int = 6, columns: int = 8) -> Heliostats:
-    """Return mirrors like HelioPoint's: four facets, 3.2 m by 2.5 m together.
+    """Return mirrors like HelioPoint's: four facets, 3.2 m by 2.5 m in total.
 
-    They stand in staggered rows 6 m apart, 4.6 m from each other; the paper states no distances.
+    They stand in staggered rows 6 m apart, 4.6 m from each other; the paper does not state the
+    distances.
     """
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
     east = 4.6 * (grid[:, 0] + 0.5 * (grid[:, 1] % 2) - 0.5 * columns)

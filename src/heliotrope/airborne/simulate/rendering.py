@@ -1,8 +1,9 @@
-"""Photographs of a simulated flight: ground, shadows, mirrors that show the sky, and the lamp.
+"""Renders photographs of a simulated flight: ground, shadows, mirrors reflecting the sky, lamp.
 
-Light is measured in full scale of the sensor. The share of a pixel that a facet covers is exact,
-and the lamp's reflections are at the exact positions of `heliotrope.airborne.mirror`. The blur of
-lens and motion is applied to all of it, then noise, clipping, the curve of sRGB and JPEG.
+Light is measured in full scales of the sensor. The fraction of a pixel that a facet covers is
+exact, and the lamp's reflections are at the exact positions from `heliotrope.airborne.mirror`. Lens
+and motion blur are applied to the whole picture, followed by noise, clipping, the sRGB curve and
+JPEG.
 """
 
 import math
@@ -46,20 +47,20 @@ class Conditions:
     Attributes
     ----------
     sky
-        Light of the sky at 45° of elevation, full scale.
+        Light from the sky at 45° of elevation, full scales.
     ground
-        Mean light of the ground.
+        Mean light from the ground.
     contrast
         Relative standard deviation of the ground's texture.
     sun
         Azimuth and elevation of the sun, rad, for shadows; None for no shadows.
     led
-        Light of the lamp's reflection in a flat mirror with lamp and camera 100 m away: the sum
+        Light of the lamp's reflection in a flat mirror with lamp and camera 100 m away, as the sum
         over its pixels. It decreases with the square of the distance.
     led_spread
-        Standard deviation of its spot on the mirror due to the roughness of the glass, m.
+        Standard deviation of the lamp's spot on the mirror due to the roughness of the glass, m.
     blur
-        Standard deviation of the lens's blur, pixels.
+        Standard deviation of the lens blur, pixels.
     motion
         Motion of the image during the exposure, pixels right and down.
     electrons
@@ -67,12 +68,12 @@ class Conditions:
     read_noise
         Electrons.
     quality
-        Quality of JPEG, 1 to 100.
+        JPEG quality, 1 to 100.
     clouds
-        Relative standard deviation of the sky's light by clouds, which each facet shows as a
-        whole.
+        Relative standard deviation of the sky's light due to clouds; each facet shows a uniform
+        value.
     speed, exposure
-        Speed of the drone to the right, m/s, and exposure, s: the image moves meanwhile.
+        Speed of the drone to the right, m/s, and exposure time, s, during which the image moves.
     """
 
     sky: float = 0.55
@@ -109,7 +110,7 @@ def night(led: float = 6.0) -> Conditions:
 
 
 def dark(led: float = 6.0) -> Conditions:
-    """Return conditions of a night without moon: only the lamp can be seen on the mirrors."""
+    """Return conditions of a moonless night, in which only the lamp is visible in the mirrors."""
     return Conditions(sky=4e-4, ground=1e-4, sun=None, led=led, electrons=2500.0, read_noise=8.0)
 
 
@@ -382,7 +383,7 @@ def write_photo(
     origin: tuple[float, float, float],
     quality: int = 95,
 ) -> None:
-    """Write a JPEG with the drone's records in EXIF and DJI's XMP.
+    """Write a JPEG with the drone's metadata in EXIF and DJI's XMP.
 
     Parameters
     ----------
@@ -393,9 +394,9 @@ def write_photo(
     recorded
         Position, rotation and time as recorded.
     origin
-        Latitude and longitude (degrees) and height (m) of ENU's origin.
+        Latitude and longitude (degrees) and height (m) of the ENU origin.
     quality
-        Quality of JPEG, 1 to 100.
+        JPEG quality, 1 to 100.
     """
     import cv2
 
@@ -435,14 +436,14 @@ def render_flight(
     seed: int = 0,
     progress: Any = None,
 ) -> Reflections:
-    """Write the photographs of a flight with camera and commands; return the true reflections.
+    """Write the photographs, camera and commands of a flight; return the true reflections.
 
     Parameters
     ----------
     flight
         A flight simulated by `heliotrope.airborne.simulate.simulation.fly`.
     folder
-        Created if it does not exist.
+        Folder, created if it does not exist.
     origin
         See `write_photo`.
     conditions
@@ -450,7 +451,7 @@ def render_flight(
     seed
         Seed of the noise.
     progress
-        Called with (done, all) photographs.
+        Called with the numbers of photographs (done, total).
     """
     light = conditions or Conditions()
     place = Path(folder)

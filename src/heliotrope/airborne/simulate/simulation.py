@@ -1,10 +1,10 @@
-"""A simulated flight with its truth: the true poses of the mirrors, and the drone's records.
+"""A simulated flight with its ground truth: the true mirror poses, and the drone's records.
 
-A flight exists in two versions. *True*: mechanisms with imperfections, surveyed
-positions with errors, facets with slope errors, the real positions of the camera. *Recorded*: the
-plant file, the commands, and for each photograph a position from RTK and the angles of a gimbal.
-`fly` makes both; `reflections_of` gives the reflections that an image evaluation would
-find, without images; `heliotrope.airborne.simulate.rendering` draws them.
+A flight exists in two versions. *True*: mechanisms with imperfections, surveyed positions with
+errors, facets with slope errors, the actual camera positions. *Recorded*: the plant file, the
+commands, and for each photograph an RTK position and the gimbal angles. `fly` creates both;
+`reflections_of` returns the reflections that an image evaluation would find, without images;
+`heliotrope.airborne.simulate.rendering` renders the images.
 """
 
 from collections.abc import Mapping
@@ -36,14 +36,14 @@ ADJUSTED: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of records from the truth; the offset is a value.
+    """Standard deviations of the recorded values from the truth; the offset is a value.
 
     Attributes
     ----------
     rtk
         Error of each position east, north, up, independent from photograph to photograph, m, (3,).
     rtk_offset
-        Recorded less true, the same in all photographs, m, (3,).
+        Recorded minus true, the same in all photographs, m, (3,).
     gimbal
         Error of each of three rotations of the camera, rad.
     survey
@@ -57,15 +57,16 @@ class Errors:
     mechanism
         Errors of parameters of the mechanisms, rad.
     kinematics
-        Error of each coordinate of a vertex in one pose, beside those of mechanism and survey, m.
+        Error of each coordinate of a vertex in one pose, in addition to mechanism and survey
+        errors, m.
     canting
-        Error of each component of a facet's normal, rad; their mean over a mirror is 0.
+        Error of each component of a facet normal, rad; the mean over a mirror is 0.
     map_error
         RMS of each component of a slope map's deviation from the mirror, rad.
     lens
-        Displacement of a corner of the frame by what the camera file states wrongly, px.
+        Displacement of a corner of the frame caused by errors in the camera file, px.
     hover
-        Distance of the drone from its planned position along each axis, known to RTK, m.
+        Distance of the drone from its planned position along each axis, which RTK measures, m.
     """
 
     rtk: tuple[float, float, float] = (0.008, 0.008, 0.008)
@@ -108,15 +109,15 @@ class Flight:
     truth
         True poses of the mirrors.
     shapes
-        Their surfaces with slope deviations, N of them.
+        Their surfaces with slope deviations, N in total.
     taken
         Photographs with their true exterior orientation.
     recorded
-        The same, as recorded by the drone.
+        The same photographs, as recorded by the drone.
     known_camera
-        The camera as its file states it.
+        The camera as stated in its file.
     maps
-        Slope maps as measured, (F, H, W, 2) each; None where a mirror has no slope deviations.
+        Slope maps as measured, (F, H, W, 2) each; None for a mirror without slope deviations.
     """
 
     camera: LedCamera
@@ -139,12 +140,12 @@ class Installed:
 
 
 def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
-    """Return the drive counts (N, D) at which all mirrors face one point.
+    """Return the drive counts (N, D) at which all heliostats face one point.
 
     Raises
     ------
     InputError
-        If a heliostat cannot.
+        If a heliostat cannot face the point.
     """
     to = as_vectors(point, "point")
     mechanism = heliostats.calibrated
@@ -174,7 +175,7 @@ def hover_grid(
     focus
         Point that the camera looks at.
     columns, rows
-        Numbers of positions horizontally and along the slope.
+        Number of positions horizontally and along the slope.
     step
         Distance between neighbours, m. Rows are flown back and forth.
     """
@@ -217,20 +218,20 @@ def fly(
     positions
         Planned positions of the photographs, ENU metres, (P, 3).
     focus
-        Point that the camera is to look at, ENU metres, (3,).
+        Point at which the camera is aimed, ENU metres, (3,).
     errors
         Standard deviations; by default those of `Errors`.
     focal
         Focal length of the facets, m; inf if flat.
     start, interval
-        Time of the first photograph, and seconds between two.
+        Time of the first photograph, and interval between photographs, s.
     seed
-        Seed of all randomness.
+        Seed of all random numbers.
     installed
-        True heliostats made by `install`, for several flights over the same
-        ones; ``focal`` is then ignored.
+        True heliostats from `install`, to use the same heliostats in several flights; ``focal`` is
+        then ignored.
     flight
-        Number of this flight among several: its photographs have errors of their own.
+        Index of this flight among several, so that its photographs have their own errors.
     """
     applied = errors or Errors()
     rng = np.random.default_rng(seed)
@@ -299,9 +300,9 @@ def install(
     heliostats
         The whole field, as in the plant file.
     rows
-        Rows of the field.
+        Indices in the field.
     errors, focal, seed
-        See `fly`. A heliostat is the same whichever others are asked for.
+        See `fly`. The truth about a heliostat does not depend on which others are requested.
     """
     index = np.asarray(rows, dtype=np.intp)
     really = _installed(heliostats, errors, np.random.default_rng(seed)).take(index)
@@ -366,9 +367,9 @@ def _photograph(
 
 
 def exact_reflections(flight: Flight) -> Reflections:
-    """Return every reflection of the flight by the exact law, at true positions.
+    """Return every reflection of the flight by the exact law of reflection, at true positions.
 
-    ``sigma`` is 1e-9 m. Obstruction by other mirrors is not considered.
+    ``sigma`` is 1e-9 m. Obstruction by other mirrors is ignored.
     """
     camera = as_float([p.position for p in flight.taken]).reshape(-1, 3)
     led = as_float([p.led_position(flight.camera) for p in flight.taken]).reshape(-1, 3)
@@ -406,9 +407,9 @@ def reflections_of(
     seed
         Seed of that noise.
     corrected
-        Whether RTK's common offset is known and removed, as the evaluation of images does. The
-        camera's attitude, which locates the lamp, is known to 0.1 mrad from the images and taken
-        as true.
+        Whether the common RTK offset is known and removed, as in an evaluation of images. The
+        camera attitude, which determines the lamp position, is known to 0.1 mrad from the images
+        and is assumed to be true.
     """
     applied = errors or Errors()
     exact = exact_reflections(flight)

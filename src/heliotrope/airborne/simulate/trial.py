@@ -1,7 +1,7 @@
-"""Trials of the orientation on simulated reflections: how many photographs, and how accurate.
+"""Trials on simulated reflections: how many photographs a flight needs, and how accurate it is.
 
-One mirror is measured repeatedly, each time with other slope errors, positions and noise. As the
-truth is known, the true error can be compared with the stated one.
+One mirror is measured repeatedly, each time with different slope errors, positions and noise. As
+the truth is known, the true error can be compared with the stated error.
 """
 
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,7 @@ class TrialConditions:
     distance
         Distance from mirror to drone.
     columns, rows
-        Numbers of hover positions, which extend two slope errors beyond the mirror's edge.
+        Number of hover positions, which extend two slope errors beyond the mirror's edge.
     slope, length
         RMS of each component of the slope deviations, and their correlation length.
     rtk
@@ -41,7 +41,7 @@ class TrialConditions:
     pointing
         Rotation of the mirror from the expected orientation.
     lamp
-        Offset from the camera, to the right.
+        Lamp offset from the camera, to the right.
     budget
         Errors common to all points.
     """
@@ -97,9 +97,9 @@ class Trials:
     Attributes
     ----------
     count
-        Points without outliers, (K,).
+        Number of points without outliers, (K,).
     error
-        Error of the mean alone, with the mirror's true position known, (K, 2).
+        Error of the mean alone, with the true position of the mirror known, (K, 2).
     total_error
         Error from all causes, (K, 2).
     sigma_plain, sigma_mean, systematic
@@ -115,13 +115,13 @@ class Trials:
 
     @property
     def coverage(self) -> float:
-        """Share of the total errors within the 90 % interval of σ_tot."""
+        """Fraction of the total errors within the 90 % interval of σ_tot."""
         total = np.hypot(self.sigma_mean, self.systematic)
         return float(np.mean(np.abs(self.total_error) < _NINETY * total))
 
 
 def four_facets() -> MirrorShape:
-    """Return four facets, 3.2 m by 2.5 m together, canted and curved for 200 m."""
+    """Return four facets, 3.2 m by 2.5 m in total, canted and curved for 200 m."""
     return tiled(2, 2, 1.6, 1.25, gap=0.02, focal=200.0)
 
 
@@ -183,11 +183,11 @@ def trials(
     shape
         Mirror as designed; four facets of 1.6 m by 1.25 m if None.
     map_known
-        Whether the evaluation has the mirror's slope map.
+        Whether the evaluation knows the slope map of the mirror.
     mean
         See `heliotrope.airborne.evaluate.orientation.measure`.
     seed
-        Seed of the first trial; the others follow.
+        Seed of the first trial; later trials use the following seeds.
 
     Raises
     ------

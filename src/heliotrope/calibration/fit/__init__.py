@@ -1,9 +1,9 @@
-"""Fits the parameters of mechanisms to sightings.
+"""Fits mechanism parameters to sightings.
 
-`fit` gives the maximum a posteriori parameters of every heliostat with their covariance (a
-`FieldFit`), `fit_common` does so where sightings share errors, and `fit_terms` with own error terms
-of the drives; `linearise` gives the whitened residuals of sightings and their derivatives, from
-which fitting, uncertainty and planning all start.
+`fit` returns the maximum a posteriori parameters of every heliostat with their covariance (a
+`FieldFit`), `fit_common` does so where sightings share errors, and `fit_terms` adds user-defined
+error terms of the drives. `linearise` returns the whitened residuals of sightings and their
+derivatives, on which fitting, uncertainty and planning are all built.
 """
 
 from heliotrope.calibration.fit.common import CommonErrors, CommonFit, fit_common

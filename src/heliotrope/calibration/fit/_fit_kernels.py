@@ -1,9 +1,9 @@
-"""Compiled: the maximum a posteriori fit of one heliostat after another.
+"""Compiled: the maximum a posteriori fit of each heliostat in turn.
 
-Levenberg-Marquardt minimises Σ ρ(|r|²) + |y|², with r the two whitened components of normal minus
-bisector, in parameters scaled by their priors, y = x / σ: then the prior is the unit matrix and the
-damping means the same for a metre and a milliradian. Trials are evaluated with their derivatives,
-because nearly every one is accepted.
+Levenberg-Marquardt minimises Σ ρ(|r|²) + |y|², where r holds the two whitened components of normal
+minus bisector, and y = x / σ are the parameters scaled by their priors. In these units the prior is
+the identity matrix, and damping acts equally on a metre and a milliradian. Every trial step is
+evaluated with its derivatives, because nearly every one is accepted.
 """
 
 import math

@@ -1,14 +1,14 @@
-"""Compiled: the whitened residual of one sighting after another, with its derivative.
+"""Compiled: the whitened residual of each sighting, with its derivative.
 
 With n the normal, b the bisector, f_k the whitened axes and r_k = f_k·(n − b),
 
     dr_k = f_k·dn − g_k·dm,   g_k = (∂b/∂m)ᵀ f_k.
 
 A parameter moves everything beyond its joint as a rigid body, dn = w × n and dm = w × m + d with a
-twist (w, d), or shifts it, w = 0. Hence dr_k = w·q_k − d·g_k with q_k = n × f_k − m × g_k:
-one product of a twist (of the heliostat) and a wrench (q_k, g_k) (of the sighting). Twists are
-taken at zero joint angles. Beyond a driven joint they would turn with it; instead the wrench is
-turned back, so that three wrenches serve all parameters.
+twist (w, d), or translates it, w = 0. Hence dr_k = w·q_k − d·g_k with q_k = n × f_k − m × g_k, the
+product of a twist (from the heliostat) and a wrench (q_k, g_k) (from the sighting). Twists are
+taken at zero joint angles. Beyond a driven joint they would rotate with the joint; instead the
+wrench is rotated back, so that three wrenches serve all parameters.
 """
 
 import math

@@ -1,18 +1,20 @@
-r"""Fits of sightings that have errors in common.
+r"""Fits of sightings that share errors.
 
-All reflections of a flight share the errors of its drone's position and of its lens, and all poses
-of one mirror the turn by its slope deviations. Taken as independent, such errors seem to average
-out over many sightings, and what remains is taken for the mirrors' own. Here they are unknowns: K
-of them, z, shared by all heliostats, and a turn of each mirror, beside the parameters of each.
+All reflections measured in a flight share the errors of the drone's position and of its lens, and
+all poses of one mirror share the apparent rotation caused by its slope deviations. If such errors
+were treated as independent, they would seem to average out over many sightings, and the remainder
+would be attributed to the heliostats. Here the shared errors are unknowns of the fit: K of them, z,
+common to all heliostats, and one rotation per mirror, in addition to the parameters of each
+heliostat.
 
-With H the normal matrix of one heliostat's own unknowns, B its coupling with z and C the covariance
-of z after all heliostats, the own unknowns have the covariance
+Let H be the normal matrix of one heliostat's own unknowns, B its coupling with z, and C the
+covariance of z given all heliostats. The covariance of the own unknowns is then
 
 $$ H^{-1} + H^{-1} B\, C\, B^T H^{-1}, \qquad
    C^{-1} = C_0^{-1} + \sum_i (Z_i - B_i^T H_i^{-1} B_i) $$
 
-(Schur complement). The term of heliostat i in the sum is its `CommonFit.information`: what its own
-sightings reveal of z.
+(Schur complement). The term of heliostat i in the sum is its `CommonFit.information`, the
+information that its own sightings provide about z.
 """
 
 from collections.abc import Mapping
@@ -39,20 +41,20 @@ _NEVER = 1e-9
 
 @dataclass(frozen=True)
 class CommonErrors:
-    """Errors that M sightings of N heliostats have in common, K of them shared by all.
+    """Errors that M sightings of N heliostats have in common; K of them are shared by all.
 
     Attributes
     ----------
     shift
-        Displacement of both ends of each sighting by one unit of each shared error, recorded less
-        true, ENU, m, (M, 3, K). Only ends that are points move.
+        Displacement of both ends of each sighting per unit of each shared error, recorded minus
+        true, ENU, m, (M, 3, K). Only ends that are points are displaced.
     mean, covariance
-        What is known of the shared errors before these sightings, (K,), and (K, K) positive
-        definite.
+        Prior knowledge of the shared errors: mean (K,), and covariance (K, K), positive definite.
     turned
-        Whether a sighting shows its mirror turned, (M,).
+        Whether the slope deviations make the mirror appear rotated in this sighting, (M,).
     turn_sigma
-        Standard deviation of that turn about each of two axes of the mirror, rad, (N,); 0: none.
+        Standard deviation of that rotation about each of two mirror axes, rad, (N,); 0: no
+        rotation.
     """
 
     shift: FloatArray
@@ -64,21 +66,22 @@ class CommonErrors:
 
 @dataclass(frozen=True)
 class CommonFit:
-    """A fit of N heliostats with the errors that their sightings have in common.
+    """A fit of N heliostats together with the errors that their sightings share.
 
     Attributes
     ----------
     fitted
-        The fit; its covariance accounts for the common errors.
+        The fit; its covariance includes the common errors.
     turn, turn_covariance
-        Turn about the mirror's x and y axes, rad, (N, 2) and (N, 2, 2).
+        Rotation about the mirror's x and y axes and its covariance, rad, (N, 2) and (N, 2, 2).
     shared, shared_covariance
-        The K shared errors after these sightings, and their covariance.
+        The K shared errors given these sightings, and their covariance.
     information, pull
-        What each heliostat's sightings reveal of the shared errors: its part of their inverse
-        covariance, (N, K, K), and of the inverse covariance times the mean, (N, K).
+        Information that each heliostat's sightings provide about the shared errors: the
+        contribution to the inverse covariance, (N, K, K), and to the inverse covariance times the
+        mean, (N, K).
     sightings
-        The sightings without the errors that were found.
+        The sightings corrected for the errors that were found.
     """
 
     fitted: FieldFit

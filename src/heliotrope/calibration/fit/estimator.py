@@ -1,12 +1,12 @@
 r"""The estimator: maximum a posteriori parameters of every heliostat.
 
-For each heliostat the deviations x of the model's parameters minimise
+For each heliostat the fit finds the deviations x of the model's parameters that minimise
 
 $$ \sum_i ρ(|W_i\,(n_i(x) - b_i(x))|^2 / s^2) + \sum_p (x_p / σ_p)^2 $$
 
-with n the mechanism's normal, b the bisector of source and destination as seen from its vertex, W
-the whitening by the sighting's covariance, s the scale of the residuals (estimated from them), ρ a
-robust loss and σ the priors of the parameter table.
+where n is the mechanism's normal, b the bisector of source and destination as seen from its vertex,
+W the whitening by the sighting's covariance, s the scale of the residuals (estimated from the
+residuals), ρ a robust loss and σ the priors from the parameter table.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ FAR = 0.15
 
 
 class FitOutcome(IntEnum):
-    """How the fit of a heliostat ended."""
+    """Outcome of the fit of one heliostat."""
 
     CONVERGED = kernels.CONVERGED
     NOT_CONVERGED = kernels.NOT_CONVERGED
@@ -59,7 +59,7 @@ class FitOutcome(IntEnum):
 
     @property
     def text(self) -> str:
-        """One clause for people."""
+        """The outcome in one clause, for display."""
         return _TEXTS[self]
 
 
@@ -76,29 +76,29 @@ _TEXTS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FieldFit(Value, Framed):
-    """Fitted parameters of N heliostats, P each; without N where one mechanism was fitted.
+    """Fitted parameters of N heliostats, P each; without the axis N if one mechanism was fitted.
 
     Attributes
     ----------
     names
-        The P parameters.
+        Names of the P parameters.
     values
         Deviations from the nominal mechanism, rad, m or 1, (N, P).
     covariance
-        Covariance of the values, (N, P, P), with the noise scaled to the residuals.
+        Covariance of the values, (N, P, P), with the noise scaled to match the residuals.
     prior
         Standard deviations of the priors, (N, P).
     scale
         Estimated noise in units of the sightings' sigma, (N,).
     lengths, rows
-        Length of each sighting's whitened residual in units of ``scale``, and the row of its
+        Length of each sighting's whitened residual in units of ``scale``, and the index of its
         heliostat, (M,).
     count
         Number of sightings used, (N,).
     iterations, outcome
         (N,); `FitOutcome` as integers.
     centre
-        Centre of the priors: zero, or a far start, (N, P).
+        Centre of the priors, (N, P): zero, or a start value far from nominal.
     heliostats
         Names, (N,); () if unknown.
     """
@@ -188,7 +188,7 @@ class FieldFit(Value, Framed):
         return self.of_one(heliostat) if np.ndim(self.scale) else self
 
     def only(self, row: int) -> "FieldFit":
-        """Return the fit of one heliostat with the axis N, (1,)."""
+        """Return the fit of one heliostat, keeping the axis N, (1,)."""
         mine = self.rows == row
         values = {name: getattr(self, name)[row : row + 1] for name in BY_HELIOSTAT}
         rows = np.zeros(int(mine.sum()), dtype=np.int64)
@@ -254,23 +254,23 @@ def fit(
     sightings
         Sightings of these heliostats, in any order.
     model
-        Name of a model of the parameter table, or names of parameters.
+        Name of a model in the parameter table, or names of parameters.
     priors
-        Standard deviations that replace the table's, by name, (N,) or scalars.
+        Standard deviations that replace those of the table, by name, (N,) or scalars.
     loss
         "square", "huber" or "cauchy".
     adapt_scale
-        Estimate the noise from the residuals; otherwise the sightings' sigma is used.
+        Whether to estimate the noise from the residuals; otherwise the sightings' sigma is used.
     keep
-        Mask of the sightings to use, (M,).
+        Mask of the sightings to fit, (M,).
     max_iterations
-        Most steps of Levenberg-Marquardt, for each heliostat and each estimate of the scale.
+        Maximum number of Levenberg-Marquardt steps, per heliostat and per estimate of the scale.
 
     Raises
     ------
     InputError
-        If a sighting is of a heliostat that is not there, a prior is not above 0, or the model
-        names the ratio of a worm.
+        If a sighting refers to a heliostat that does not exist, a prior is not above 0, or the
+        model includes the ratio of a worm.
     UnknownNameError
         If the model, one of its parameters or the loss is unknown.
     """

@@ -1,4 +1,4 @@
-"""Whitened residuals of sightings and their derivatives, all rows at once."""
+"""Whitened residuals of sightings and their derivatives, for all sightings at once."""
 
 from dataclasses import dataclass
 
@@ -19,10 +19,10 @@ class Linearised:
         Normal minus bisector in the tangent plane, whitened by the sightings'
         covariance, (M, 2).
     jacobian
-        Derivative of the residual by the named parameters, (M, 2, P).
+        Derivative of the residual with respect to the named parameters, (M, 2, P).
     beam
-        Matrices that turn a whitened residual into the beam error to the right of and above
-        the destination as seen from the mirror, rad, (M, 2, 2).
+        Matrices that convert a whitened residual into the beam error to the right of and above the
+        destination as seen from the mirror, rad, (M, 2, 2).
     """
 
     residual: FloatArray
@@ -36,7 +36,7 @@ def linearise(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> Lin
     Parameters
     ----------
     mechanism
-        One for each sighting, batch shape (M,).
+        One mechanism per sighting, batch shape (M,).
     s
         M sightings.
     names

@@ -1,12 +1,13 @@
-r"""Own error terms of drives, fitted beside the parameters of the mechanisms.
+r"""User-defined drive error terms, fitted together with the mechanism parameters.
 
 A term adds k · f(φ) to the angle of one joint: f is a function of the angles φ that the nominal
-drives give for the counts, and k its coefficient, one of each heliostat. k · sin(azimuth) is one
-term, the errors of a drive in a look-up table are one for each row of the table.
+drives produce at the counts, and k is its coefficient, one per heliostat. For example, k ·
+sin(azimuth) is one term; the drive errors in a look-up table are one term per table entry.
 
-The kernels know nothing of terms. The counts that a mechanism without terms would need for the same
-angle stand in for those recorded, and a Gauss-Newton step of all unknowns moves the coefficients;
-the derivative by a coefficient is f times that by the bias of the drive, which the chain gives.
+The kernels do not model these terms. Instead, each recorded count is replaced by the count that a
+mechanism without terms would need for the same angle, and a Gauss-Newton step over all unknowns
+updates the coefficients. The derivative with respect to a coefficient is f times the derivative
+with respect to the drive's bias, which the chain provides.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,20 +37,20 @@ _INVERSION = 30
 
 @dataclass(frozen=True)
 class DriveTerm:
-    """An error of one drive that is linear in its coefficient.
+    """A drive error that is linear in its coefficient.
 
     Attributes
     ----------
     name
         Name of the coefficient.
     joint
-        Driven joint whose angle it adds to.
+        Driven joint to whose angle the term is added.
     shape
-        Function of the angles of the D driven joints, rad, (..., D), that gives the error for a
+        Function of the angles of the D driven joints, rad, (..., D), that returns the error for a
         coefficient of 1, (...).
     prior
-        Standard deviation of the coefficient before any measurement, rad if the function has no
-        unit.
+        Standard deviation of the coefficient before any measurement, in rad if the function is
+        dimensionless.
     """
 
     name: str
@@ -59,23 +60,23 @@ class DriveTerm:
 
 
 def table_terms(joint: str, drive: int, knots: npt.ArrayLike, prior: float) -> list[DriveTerm]:
-    """Return the terms of a look-up table: errors at knots, and straight lines between them.
+    """Return the terms of a look-up table: errors at knots, with linear interpolation in between.
 
-    Beyond the ends the error is constant.
+    Beyond the end knots the error is constant.
 
     Parameters
     ----------
     joint, drive
-        Driven joint, and its place among the driven ones, from 0.
+        Driven joint, and its index among the driven joints, from 0.
     knots
-        Angles of the joint, rad, ascending, (K,).
+        Joint angles of the knots, rad, ascending, (K,).
     prior
         Standard deviation of the error at a knot, rad.
 
     Raises
     ------
     InputError
-        If there are fewer than two knots, or they do not ascend.
+        If there are fewer than two knots, or they are not ascending.
     """
     at = as_numbers(knots, "knots")
     if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0.0).all():
@@ -90,7 +91,7 @@ def table_terms(joint: str, drive: int, knots: npt.ArrayLike, prior: float) -> l
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TermFit(Value, Framed):
-    """Parameters of N heliostats with K coefficients of own terms each.
+    """Parameters of N heliostats, with K term coefficients each.
 
     Attributes
     ----------
@@ -103,9 +104,9 @@ class TermFit(Value, Framed):
     covariance
         Covariance of the coefficients, (N, K, K).
     mechanism
-        The nominal mechanisms with the parameters, but without the terms, (N,).
+        The nominal mechanisms with the fitted parameters but without the terms, (N,).
     original
-        The heliostats before the fit; the terms are functions of their nominal drives' angles.
+        The heliostats before the fit; the terms are functions of their nominal drive angles.
     """
 
     fitted: FieldFit
@@ -152,7 +153,7 @@ class TermFit(Value, Framed):
         )
 
     def without_terms(self, sightings: Sightings) -> Sightings:
-        """Return sightings with the counts at which ``mechanism`` stands as the terms move it."""
+        """Return the sightings with the counts at which ``mechanism`` alone has their poses."""
         sightings = self.original.rows_of(sightings)
         row = sightings.heliostat
         shapes = _shapes(self.terms, self.original.mechanism[row], sightings.counts)
@@ -160,14 +161,14 @@ class TermFit(Value, Framed):
         return replace(sightings, counts=moved)
 
     def to_send(self, heliostat: npt.ArrayLike, counts: npt.ArrayLike) -> FloatArray:
-        """Return the counts to send, (M, D), so that mechanism and terms together reach a pose.
+        """Return the counts to send, (M, D), so that the mechanism with its terms reaches a pose.
 
         Parameters
         ----------
         heliostat
-            Rows of the heliostats, () or (M,).
+            Indices of the heliostats, () or (M,).
         counts
-            Counts at which ``mechanism`` has the pose, (D,) or (M, D), as `track` gives them.
+            Counts at which ``mechanism`` has the pose, (D,) or (M, D), as returned by `track`.
         """
         goal = np.atleast_2d(as_float(counts))
         row = np.broadcast_to(np.asarray(heliostat, dtype=np.intp), goal.shape[:-1])
@@ -193,25 +194,25 @@ def fit_terms(
     loss: Loss = "cauchy",
     adapt_scale: bool = True,
 ) -> TermFit:
-    """Return the maximum a posteriori parameters together with own terms of the drives.
+    """Return the maximum a posteriori parameters and the coefficients of drive error terms.
 
     Parameters
     ----------
     mechanism, sightings
-        Heliostats, and M sightings of them.
+        Heliostats, and M sightings of these heliostats.
     model, priors, loss, adapt_scale
-        For these see `heliotrope.calibration.fit.estimator.fit`.
+        As for `heliotrope.calibration.fit.estimator.fit`.
     terms
-        K terms. What a parameter explains as well, such as a constant beside a bias, is divided
-        according to the priors.
+        K terms. An effect that a parameter also explains, such as a constant next to a bias, is
+        divided between the two according to the priors.
 
     Raises
     ------
     InputError
-        If there is no term, two have one name, a prior is not above 0, or a function gives
-        something else than one finite number for each sighting.
+        If there are no terms, two terms have the same name, a prior is not above 0, or a function
+        returns anything but one finite number per sighting.
     UnknownNameError
-        If a joint is not driven; for the rest see `heliotrope.calibration.fit.estimator.fit`.
+        If a joint is not driven; for other cases see `heliotrope.calibration.fit.estimator.fit`.
     """
     field = members(mechanism)
     nominal, recorded = field.mechanism, field.rows_of(sightings)

@@ -1,10 +1,11 @@
-"""Learns a field: parameters, their drift in time, noise, steps, regimes and outliers.
+"""Learns a field: parameters, their drift over time, noise, steps, regimes and outliers.
 
-Begin with `learn`; `predict` and `assess` compare the result with sightings; `beliefs_of` goes on
-from it, one sighting after another (`observe`). `compare_models` and `choose_model` find the model
-of a field, `choose_own_model` that of one heliostat, and `search_periodic_errors` worms of unknown
-ratio. Learning on several machines (`calibration.learn.on_dask`) needs the optional
-dask.distributed and stays in its module.
+Begin with `learn`; `predict` and `assess` compare the result with sightings; `beliefs_of` turns it
+into a belief per heliostat, which `observe` updates with one sighting after another.
+`compare_models` and `choose_model` find the model of a field, `choose_own_model` that of one
+heliostat, and `search_periodic_errors` worms of unknown ratio. Learning on several computers
+(`calibration.learn.on_dask`) needs the optional dask.distributed and must be imported from its
+module.
 """
 
 from heliotrope.calibration.learn.assessment import Assessment, HeliostatFigures, assess

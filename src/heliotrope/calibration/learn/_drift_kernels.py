@@ -1,14 +1,14 @@
-"""Compiled: covariances of sightings whose parameters drift in time, and their consequences.
+"""Compiled: covariances of sightings whose parameters drift, and quantities derived from them.
 
-The whitened residual of sighting i is −Σ_p J_ip x_p(t_i) + noise. Each x_p is a constant
-with a variance, plus an offset that lasts as long as a regime, plus Ornstein-Uhlenbeck
-processes of some amplitude and time; so two sightings share
+The whitened residual of sighting i is −Σ_p J_ip x_p(t_i) + noise. Each x_p is a constant with a
+variance, plus an offset that lasts for one regime, plus Ornstein-Uhlenbeck processes with given
+amplitudes and time constants. The covariance of two sightings is therefore
 
     K_ij = Σ_p J_ip J_jpᵀ (σ_p² + ρ_p² [same regime] + δ_p² min(e_i, e_j)
                             + Σ_c a_c² exp(−|t_i − t_j| / τ_c))
 
-with e the number of steps of the zeros before the sighting. A sighting at an unknown time (NaN)
-shares no drift with any other.
+where e is the number of zero steps before the sighting. A sighting at an unknown time (NaN) shares
+no drift with any other.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Compiled: the best cut of a heliostat's time into regimes; see regimes.py."""
+"""Compiled: the optimal partition of a heliostat's history into regimes; see regimes.py."""
 
 import math
 

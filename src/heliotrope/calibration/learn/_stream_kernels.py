@@ -1,7 +1,8 @@
-"""Compiled: one sighting updates the weighted hypotheses of a mirror; see stream.py.
+"""Compiled: one sighting updates the weighted hypotheses of a heliostat; see stream.py.
 
 A state holds the P constants, the offsets of the Z zeros in the present regime, and the C
-Ornstein-Uhlenbeck processes. Each hypothesis is a Gaussian of it: mean (S,), covariance (S, S).
+Ornstein-Uhlenbeck processes. Each hypothesis is a Gaussian over this state: mean (S,), covariance
+(S, S).
 """
 
 import math
@@ -210,11 +211,12 @@ def update(
 ):  # fmt: skip
     """Hypotheses (weight, mean, covariance, regime) after one more sighting, and its log density.
 
-    ``rows`` (2, S) are the derivatives of the whitened values ``value`` (2,) by the state;
-    ``noise`` (2, 2); ``zeros`` and ``offsets`` (Z,) the places of the zeros' constants and of their
-    offsets; ``first`` the place of the first process; ``step`` and ``lost`` (Z,) the variances of a
-    step and of a regime's offset; ``chance`` (5,) the probabilities of what happened; ``far`` the
-    variance of a blunder. The last result is the probability that the sighting is a blunder.
+    ``rows`` (2, S) are the derivatives of the whitened values ``value`` (2,) with respect to the
+    state; ``noise`` is (2, 2). ``zeros`` and ``offsets`` (Z,) are the positions of the zeros'
+    constants and of their offsets in the state, and ``first`` is the position of the first process.
+    ``step`` and ``lost`` (Z,) are the variances of a step and of a regime offset; ``chance`` (5,)
+    are the probabilities of the possible events; ``far`` is the variance of a blunder. The last
+    result is the probability that the sighting is a blunder.
     """
     count, size = mean.shape
     most = 5 * count

@@ -1,4 +1,4 @@
-"""How well a field was learnt: errors of the held-out sightings."""
+"""How well a field was learnt, judged by the errors of the held-out sightings."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -35,26 +35,26 @@ NAMED, STRAINED = 8, 10.0
 
 @dataclass(frozen=True)
 class HeliostatFigures:
-    """Figures of one heliostat.
+    """Results for one heliostat.
 
     Attributes
     ----------
     name
         Name of the heliostat.
     count
-        Number of sightings, training and held out together.
+        Number of sightings, training and held-out together.
     beam, normal
         Errors of the held-out sightings, rad.
     mean
         Mean beam error of the held-out sightings, rad.
     coverage
-        Share of the held-out sightings within their 90 % ellipse.
+        Fraction of the held-out sightings within their 90 % ellipse.
     axes
-        Zeros of azimuth and elevation before the fit (of the first and second axis where there is
-        no azimuth) and their scatter after it, Guo (43)-(47); None with fewer than two held-out
-        sightings, for a single axis, or where a mistake puts an axis over the top.
+        Offsets of azimuth and elevation before the fit (of the first and second axis if there is no
+        azimuth) and their scatter after the fit, Guo (43)-(47); None with fewer than two held-out
+        sightings, for a single axis, or where a faulty sighting puts an axis over the top.
     outliers, regimes, steps
-        Numbers in the training part.
+        Counts in the training part.
     """
 
     name: str
@@ -69,7 +69,7 @@ class HeliostatFigures:
     steps: int
 
     def document(self) -> dict[str, Any]:
-        """Return the figures for JSON, in mrad."""
+        """Return the results for JSON, in mrad."""
         figures: dict[str, Any] = {
             "n": self.count,
             "n_held_out": self.beam.count,
@@ -95,31 +95,31 @@ class HeliostatFigures:
 
 @dataclass(frozen=True)
 class Assessment(Framed):
-    """Figures of a field.
+    """Results for a field.
 
     Attributes
     ----------
     heliostats
-        Heliostats with sightings.
+        Results for the heliostats with sightings.
     median_of_medians, mean_of_means
-        Beam errors over the heliostats with `ENOUGH` sightings, rad.
+        Beam errors over the heliostats with at least `ENOUGH` sightings, rad.
     coverage
-        Share of all their held-out sightings within the 90 % ellipse.
+        Fraction of all their held-out sightings within the 90 % ellipse.
     beam
         Errors of all their held-out sightings, rad.
     fewest
-        Fewest sightings of a heliostat in the overall figures: `ENOUGH`, or 0 if no heliostat
-        has that many.
+        Minimum number of sightings for a heliostat to enter the overall results: `ENOUGH`, or 0 if
+        no heliostat has that many.
     blunders
-        Number of held-out sightings more than `BLUNDER` standard deviations away; they enter
-        every figure but ``mean_explained``.
+        Number of held-out sightings more than `BLUNDER` standard deviations away; they enter every
+        result except ``mean_explained``.
     unexplained
-        Rows of the held-out sightings that no mechanism explains: more than `BLUNDER` standard
-        deviations and `ELSEWHERE` away.
+        Indices of the held-out sightings that no mechanism explains, that is, more than `BLUNDER`
+        standard deviations and more than `ELSEWHERE` away.
     mean_explained
-        ``mean_of_means`` without them, rad.
+        ``mean_of_means`` without these sightings, rad.
     unusable
-        Rows of sightings beyond the reach of the drives; they enter no figure.
+        Indices of sightings beyond the reach of the drives; they enter no result.
     """
 
     heliostats: tuple[HeliostatFigures, ...]
@@ -154,7 +154,7 @@ class Assessment(Framed):
         )
 
     def document(self) -> dict[str, Any]:
-        """Return the figures for JSON, in mrad."""
+        """Return the results for JSON, in mrad."""
         return {
             "heliostats": {h.name: h.document() for h in self.heliostats},
             "median_of_medians_mrad": 1e3 * self.median_of_medians,
@@ -188,11 +188,11 @@ def assess(
     names
         Names of the N heliostats.
     learned
-        Learnt from a part of its sightings.
+        Field learnt from a part of its sightings.
     prediction
-        Prediction of the tested ones, in their order, if it is known already.
+        Prediction of the tested sightings, in their order, if already computed.
     tested
-        Mask of the sightings to test on, (M,); default: all that were not used.
+        Mask of the sightings to test on, (M,); by default all that were not used in learning.
     """
     rows = np.flatnonzero(~learned.used if tested is None else tested)
     sightings = learned.sightings.take(rows)

@@ -1,15 +1,15 @@
-r"""Drift of parameters in time, learnt from a field: creep of the zeros, motion of the normal.
+r"""Parameter drift learnt from a field: slow creep of the zeros, fast motion of the normal.
 
 The parameters of a heliostat at time t are
 
 $$ x_p(t) = μ_p + s_p + ρ_p[\text{regime}(t)] + \sum_c d_{pc}(t) $$
 
-with μ the mean of the field, s the deviation of the heliostat (variance τ², learnt from the field),
-ρ an offset of the two zeros in each regime and after each step, and d Ornstein-Uhlenbeck processes:
-the zeros creep over months (*slow*) and optionally over *weeks*, the mirror's normal moves within
-*hours* (temperature, wind, direction of approach). All is linear in x and Gaussian, so everything
-follows in closed form (Rasmussen & Williams 2006, Gaussian Processes for Machine Learning,
-(2.23)-(2.24), (5.8)-(5.12)).
+where μ is the mean of the field, s the deviation of the heliostat (variance τ², learnt from the
+field), ρ an offset of the two zeros in each regime and after each step, and d Ornstein-Uhlenbeck
+processes: the zeros creep over months (*slow*) and optionally over *weeks*, and the mirror normal
+moves within *hours* (temperature, wind, direction of approach). The model is linear in x and
+Gaussian, so everything follows in closed form (Rasmussen & Williams 2006, Gaussian Processes for
+Machine Learning, (2.23)-(2.24), (5.8)-(5.12)).
 """
 
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ MOST_STEPS = 12
 
 @dataclass(frozen=True)
 class Process:
-    """One Ornstein-Uhlenbeck process: its parameter, and its time scale (one of `GROUPS`)."""
+    """One Ornstein-Uhlenbeck process: its parameter and its time scale (one of `GROUPS`)."""
 
     parameter: str
     group: str
@@ -85,12 +85,12 @@ def default_processes(mechanism: Mechanism) -> tuple[Process, ...]:
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """Hyperparameters of a field or, refined, of one heliostat.
+    """Hyperparameters of a field or, when refined, of one heliostat.
 
     Attributes
     ----------
     names
-        The P parameters, including those that only drift.
+        Names of the P parameters, including those that only drift.
     processes
         C processes.
     mean, spread
@@ -101,13 +101,13 @@ class Hyperparameters:
     step
         Standard deviation of a step of the zeros, (P,).
     wide
-        Standard deviation of a constant whose nominal value was wrong, (P,).
+        Standard deviation of a constant whose nominal value turned out to be wrong, (P,).
     amplitude
         Standard deviation of each process, (C,).
     tau
-        Time constants of the groups in use, days, (G,).
+        Time constants of the time scales in use, days, (G,).
     noise
-        Noise of a sighting, in units of its sigma.
+        Noise of a sighting, in units of the sighting's sigma.
     rate
         Steps per day.
     heavy
@@ -129,7 +129,7 @@ class Hyperparameters:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The groups in use, in the order of ``tau``."""
+        """The time scales in use, in the order of ``tau``."""
         return tuple(g for g in GROUPS if any(p.group == g for p in self.processes))
 
     @property
@@ -145,11 +145,11 @@ class Hyperparameters:
 
     @property
     def vector(self) -> FloatArray:
-        """Logarithms of noise, amplitudes and time constants, the variables of the search."""
+        """Logarithms of noise, amplitudes and time constants: the variables of the optimisation."""
         return np.asarray(np.log(np.concatenate([[self.noise], self.amplitude, self.tau])))
 
     def with_vector(self, vector: FloatArray) -> "Hyperparameters":
-        """Return these with noise, amplitudes and time constants from their logarithms."""
+        """Return these with noise, amplitudes and time constants set from a log vector."""
         values = np.exp(vector)
         c = len(self.processes)
         return replace(
@@ -434,8 +434,8 @@ def _no_less_than_nothing(covariances: FloatArray, before: FloatArray) -> FloatA
 class Posterior:
     """Posterior of one heliostat's parameters at any time, given its sightings.
 
-    Made by `posterior`; ``inverse`` is the inverse covariance of the values of ``data``, and
-    ``alpha`` its product with them.
+    Created by `posterior`; ``inverse`` is the inverse covariance of the values of ``data``, and
+    ``alpha`` is its product with these values.
     """
 
     hyper: Hyperparameters
@@ -455,7 +455,7 @@ class Posterior:
         regime
             (m,).
         wander
-            Whether the processes are included; otherwise the constant part and regime only.
+            Whether to include the drift processes; otherwise only the constant part and the regime.
         """
         h, data = self.hyper, self.data
         m, size = len(time), len(h.names)
@@ -486,7 +486,7 @@ class Posterior:
         return values, _no_less_than_nothing(covariances, own)
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return z² (n,), error (n, 2), covariance (n, 2, 2) of each as the others predict it."""
+        """Return z² (n,), error (n, 2), covariance (n, 2, 2) of each given the other sightings."""
         return left_out(self.inverse, self.alpha)
 
     def log_predictive(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Forecast: where a learnt heliostat will throw its beam, and how surely."""
+"""Forecast: where a learnt heliostat will send its beam, and with what uncertainty."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ class Forecast(Value, Framed):
     Attributes
     ----------
     heliostat
-        Name, or row.
+        Name or index.
     time
         Unix seconds (UTC), (T,).
     sun
@@ -27,14 +27,14 @@ class Forecast(Value, Framed):
     aim
         ENU metres, (3,).
     counts
-        Drive counts to which the heliostat is steered, (T, D).
+        Drive counts to which the heliostat is commanded, (T, D).
     error
         Expected beam error to the right of and above the aim as seen from the mirror, rad, (T, 2).
     covariance
-        Covariance of the error as a sighting would show it: parameters, drift and noise, rad²,
+        Covariance of the error as a sighting would measure it: parameters, drift and noise, rad²,
         (T, 2, 2).
     reachable
-        Whether the sun is up and the aim within reach, (T,); all else is NaN where it is not.
+        Whether the sun is up and the aim within reach, (T,); where not, all other values are NaN.
     """
 
     heliostat: str
@@ -48,12 +48,12 @@ class Forecast(Value, Framed):
 
     @property
     def beam(self) -> FloatArray:
-        """Length of the expected error, rad, (T,)."""
+        """Magnitude of the expected error, rad, (T,)."""
         return np.asarray(np.linalg.norm(self.error, axis=-1))
 
     @property
     def rms(self) -> FloatArray:
-        """Root mean square of the error with its uncertainty, two-dimensional, rad, (T,)."""
+        """Two-dimensional root mean square of the error including its uncertainty, rad, (T,)."""
         spread = np.trace(self.covariance, axis1=-2, axis2=-1)
         return np.asarray(np.sqrt(self.beam**2 + spread))
 

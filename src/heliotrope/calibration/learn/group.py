@@ -1,8 +1,9 @@
-"""Hyperparameters of a group of mirrors, learnt at night from the photographs of a running plant.
+"""Hyperparameters of a heliostat group, learnt overnight from a running plant's photographs.
 
-The learning itself is step 3 of `learning`, as in ``heliotrope evaluate``. Around it is what an
-unattended plant needs: few enough sightings for a night, and a check that the new values would have
-predicted the photographs better. What was learnt serves each mirror's model (`applied`).
+The learning itself is step 3 of `learning`, as in ``heliotrope evaluate``. This module adds what an
+unattended plant needs: a limit on the sightings, so that the work fits into a night, and a check
+that the new values would have predicted the photographs better. The learnt values then enter the
+model of each heliostat (`applied`).
 """
 
 from collections.abc import Sequence

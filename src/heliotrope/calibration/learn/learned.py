@@ -1,4 +1,4 @@
-"""The learned model of a field and its predictions: parameters at any time, beams, forecasts."""
+"""The learnt model of a field and its predictions: parameters at any time, beams, forecasts."""
 
 from dataclasses import dataclass, replace
 
@@ -40,25 +40,25 @@ USUAL_SIGMA = 5e-4
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prediction(Value, Framed):
-    """Predicted against measured positions of M beams.
+    """Predicted and measured positions of M beams.
 
     Attributes
     ----------
     errors
-        Predicted against measured, (M,).
+        Angle between the predicted and the measured beam, (M,).
     plane
         Predicted minus measured, rad of beam to the right of and above the destination, (M, 2).
     covariance
         Predicted covariance of ``plane``: parameters, drift and noise, rad², (M, 2, 2).
     inside
-        Whether the error lies in the 90 % ellipse, (M,).
+        Whether the error lies within the 90 % ellipse, (M,).
     beam
-        Matrices that turn a whitened residual into ``plane``, (M, 2, 2).
+        Matrices that convert a whitened residual into ``plane``, (M, 2, 2).
     values
-        The parameters' deviations at that time, (M, P).
+        The parameter deviations at the time of each sighting, (M, P).
     usable
-        Whether the mechanism can say where the beam went, (M,); ``inside`` is false and
-        ``covariance`` NaN where it cannot. See `heliotrope.calibration.learn.unusable`.
+        Whether the mechanism can predict where the beam went, (M,); where not, ``inside`` is false
+        and ``covariance`` NaN. See `heliotrope.calibration.learn.unusable`.
     """
 
     errors: BeamErrors
@@ -105,11 +105,11 @@ class Learned(Value, Framed):
     Attributes
     ----------
     mechanism
-        Nominal, (N,).
+        Nominal mechanisms, (N,).
     sightings
         All sightings given.
     model
-        The constant parameters.
+        Names of the constant parameters.
     used
         Mask of the sightings to learn from, (M,).
     static
@@ -125,14 +125,14 @@ class Learned(Value, Framed):
     unusable
         Mask of the sightings that no parameters near the fit can produce, (M,); they are left out.
     rows
-        For each heliostat the rows of its sightings, outliers included, in the order of its
+        For each heliostat the indices of its sightings, outliers included, in the order of its
         member.
     heliostats
         Names, (N,); () if unknown.
     around
-        The place of the heliostats, as far as it is known.
+        Site of the heliostats, if known.
     misfits
-        Heliostats that their sightings do not describe, with the reason; they are not learnt.
+        Heliostats that their sightings do not describe, with the reason; these are not learnt.
     """
 
     mechanism: Mechanism
@@ -151,7 +151,7 @@ class Learned(Value, Framed):
     misfits: tuple[Misfit, ...] = ()
 
     def row(self, heliostat: int | str) -> int:
-        """Return the row of a heliostat, by name or by row.
+        """Return the index of a heliostat, by name or by index.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class Learned(Value, Framed):
         )
 
     def doubted(self) -> "Learned":
-        """Return the same, where the clock may be wrong: no heliostat counts as learnt."""
+        """Return the same result marked as doubtful clock: no heliostat counts as learnt."""
         outcome = self.static.outcome.copy()
         outcome[np.isin(outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))] = (
             FitOutcome.CLOCK
@@ -224,30 +224,30 @@ class Learned(Value, Framed):
         steered: Mechanism | None = None,
         sigma: float | None = None,
     ) -> Forecast:
-        """Return the expected place of a heliostat's beam, with its uncertainty.
+        """Return the expected position of a heliostat's beam, with its uncertainty.
 
         Parameters
         ----------
         heliostat
-            Name or row.
+            Name or index.
         times
-            See `heliotrope.sun.Times`, (T,); a pandas index is one of them.
+            T times, see `heliotrope.sun.Times`; a pandas index is accepted.
         target
             Name of a target of the plant learnt from, a target or receiver, or a point (m), (3,).
         site
-            Place, if it was learnt from mechanisms alone.
+            Site, if the field was learnt from mechanisms alone.
         steered
-            The mechanism that steers the heliostat, batch shape (); default: as learned, at
-            the time of its last sighting used. With the nominal one the error is that before
-            calibration.
+            The mechanism that the controller assumes for the heliostat, batch shape (); default: as
+            learnt, at the time of its last sighting used. The nominal mechanism yields the error
+            before calibration.
         sigma
-            Standard deviation of a sighting's ray, rad of beam; default: the median of those of
-            this heliostat.
+            Standard deviation of a sighting's ray, rad of beam; default: the median over this
+            heliostat's sightings.
 
         Raises
         ------
         InputError
-            If the place is unknown.
+            If the site is unknown.
         UnknownNameError
             If there is no such heliostat or target.
         """
@@ -281,7 +281,7 @@ class Learned(Value, Framed):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The P parameters, including those that only drift."""
+        """Names of the P parameters, including those that only drift."""
         return self.hyper.names
 
     def regimes(self, heliostat: int, when: FloatArray) -> npt.NDArray[np.int64]:
@@ -295,16 +295,16 @@ class Learned(Value, Framed):
         Parameters
         ----------
         heliostat
-            Rows, (M,).
+            Indices of the heliostats, (M,).
         time
             See `heliotrope.sun.Times`, () or (M,); NaN: at an unknown time.
 
         Raises
         ------
         InputError
-            A row that is not there.
+            If an index is out of range.
         TimeError
-            Something that is not a time, or has no time zone.
+            If a value is not a time, or has no time zone.
         """
         rows = np.asarray(heliostat, dtype=np.intp)
         invalid = (rows < 0) | (rows >= len(self.members))
@@ -333,14 +333,14 @@ class Learned(Value, Framed):
 
 
 def predict(learned: Learned, sightings: Sightings) -> Prediction:
-    """Return the predicted beams of sightings against the measured ones.
+    """Return the predicted beams of sightings compared with the measured beams.
 
     Parameters
     ----------
     learned
-        Of N heliostats.
+        Learnt field of N heliostats.
     sightings
-        M of these heliostats, at any time.
+        M sightings of these heliostats, at any time.
     """
     require("learned", learned, Learned, "what learn or calibrate returns")
     sightings = Members(learned.mechanism, learned.heliostats).rows_of(sightings)
@@ -397,10 +397,10 @@ def moved_by(
 
 
 def left_out_errors(learned: Learned) -> FloatArray:
-    """Return each beam error as predicted from the other sightings of its heliostat, (M, 2).
+    """Return each beam error, predicted from the heliostat's other sightings, (M, 2).
 
-    Predicted minus measured, rad to the right of and above the destination. Outliers and
-    sightings that were not used are predicted from all that were.
+    Predicted minus measured, rad to the right of and above the destination. Outliers and unused
+    sightings are predicted from all sightings that were used.
     """
     known = predict(learned, learned.sightings)
     errors = known.plane.copy()

@@ -1,12 +1,12 @@
 """Learning a field: from sightings to parameters that predict, with their uncertainty.
 
 1. A robust maximum a posteriori fit of each heliostat (`fit.estimator`).
-2. Regimes in time (`regimes`), and the fit again on the common one.
+2. Regimes in time (`regimes`), and a second fit on the regime with the common zeros.
 3. From a sample of the field: the population of the parameters, their drift and the noise
    (`drift`), without the outliers (`outliers`).
-4. For each heliostat the posterior of its own sightings under these hyperparameters.
+4. For each heliostat the posterior given its own sightings, under these hyperparameters.
 
-Steps 1, 2 and 4 treat every heliostat by itself; only step 3 needs several.
+Steps 1, 2 and 4 treat every heliostat independently; only step 3 needs several heliostats.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -281,39 +281,39 @@ def learn(
 ) -> Learned:
     """Learn parameters, regimes, drift and noise of every heliostat.
 
-    A heliostat that its sightings do not describe keeps its nominal parameters and teaches the
-    field nothing; ``misfits`` of the result names it with the reason.
+    A heliostat that its sightings do not describe keeps its nominal parameters and does not
+    influence the field; ``misfits`` of the result names it with the reason.
 
     Parameters
     ----------
     mechanism
         The heliostats: their nominal mechanisms, (N,) or (); or ``plant[name]``, a group, or a
-        plant of one kind, whose nominal mechanisms are learnt. The last three give names.
+        plant of one kind, whose nominal mechanisms are used. The last three also supply names.
     sightings
-        M of these heliostats, in any order.
+        M sightings of these heliostats, in any order.
     model
-        Name of a model of the parameter table, or names of parameters.
+        Name of a model in the parameter table, or names of parameters.
     used
         Mask of the sightings to learn from, (M,).
     priors
-        Standard deviations that replace the table's, by name.
+        Standard deviations that replace those of the table, by name.
     processes
-        Processes of the drift; ``()`` for none. Default: `drift.default_processes`.
+        Drift processes; ``()`` for no drift. Default: `drift.default_processes`.
     hyper
-        Hyperparameters of the field, if known already.
+        Hyperparameters of the field, if already known.
     loss
-        Loss of the robust fit.
+        Loss function of the robust fit.
     own
         Whether each heliostat's noise and drift may differ from the field's.
     rounds
-        Rounds of expectation and maximisation over the population.
+        Number of expectation-maximisation rounds over the population.
     misfits
-        The heliostats not to learn, if known already; default: `find_misfits`.
+        The heliostats to exclude, if already known; default: `find_misfits`.
     runner, chunk
-        Learns chunks of this many heliostats elsewhere, for example
-        `heliotrope.calibration.learn.on_dask.runner`. The results are the same bit for bit.
+        Runner that learns chunks of this many heliostats elsewhere, for example
+        `heliotrope.calibration.learn.on_dask.runner`. The results are identical bit for bit.
     progress
-        Called with (done, all) heliostats.
+        Called with the numbers of heliostats (done, total).
 
     Raises
     ------

@@ -1,10 +1,11 @@
-"""Mirrors that their sightings do not describe, with the likely reason.
+"""Heliostats that their sightings do not describe, with the likely reason.
 
-A mirror whose motor is connected the other way round, or whose rows belong to another mirror, fits
-no parameters, or fits absurd ones. Each likely mistake is a hypothesis: the sightings are read as
-if it had been made, and fitted as all others are. The hypothesis that explains them far better is
-the reason. Such a mirror is not learnt, and teaches the field nothing. Photographs that are
-mirrored or turned are a mistake of the camera, tested over all mirrors together.
+If a motor is connected in reverse, or sightings are assigned to the wrong heliostat, the sightings
+fit no parameters, or only absurd ones. Each likely mistake is a hypothesis: the sightings are
+reinterpreted as if the mistake had been made, and fitted in the usual way. A hypothesis that
+explains the sightings far better is reported as the reason. Such a heliostat is not learnt, and
+does not influence the field. Mirrored or rotated photographs are a camera mistake, which is tested
+over all heliostats together.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -65,16 +66,16 @@ PHOTOGRAPHS = (
 
 @dataclass(frozen=True)
 class Misfit:
-    """A mirror that is not learnt.
+    """A heliostat that is not learnt.
 
     Attributes
     ----------
     row
-        Row of the heliostat.
+        Index of the heliostat.
     outcome
         `FitOutcome.MISFIT`, or `FitOutcome.UNMOVED`.
     reason
-        A clause for people.
+        The reason in one clause, for display.
     """
 
     row: int
@@ -88,18 +89,18 @@ def find_misfits(
     used: npt.NDArray[np.bool_] | None = None,
     targets: Sequence[Target] = (),
 ) -> tuple[Misfit, ...]:
-    """Return the mirrors that their sightings do not describe.
+    """Return the heliostats that their sightings do not describe.
 
     Parameters
     ----------
     mechanism
-        Nominal, (N,).
+        Nominal mechanisms, (N,).
     sightings
-        M of these heliostats; names are used in the reasons.
+        M sightings of these heliostats; their names appear in the reasons.
     used
         Mask of the sightings to judge by, (M,).
     targets
-        Targets of the plant; without them mirrored photographs are not looked for.
+        Targets of the plant; without them the check for mirrored photographs is skipped.
     """
     judged = sightings if used is None else sightings.take(used)
     names = parameter_table.model("full", mechanism.parameters)

@@ -1,9 +1,9 @@
-"""Chooses the parameters that a field needs, by prediction; the evidence is shown beside it.
+"""Chooses the parameters that a field needs, by predictive score, and reports the evidence.
 
-Every candidate is learnt on a sample of the field. Its score is the mean logarithm of the
-probability density of each sighting given the others of its heliostat (leave-one-out
-cross-validation in closed form: Rasmussen & Williams 2006, (5.10)-(5.12)). The simplest
-candidate within one standard error of the best is chosen (Breiman et al. 1984).
+Every candidate is learnt on a sample of the field. Its score is the mean log probability density of
+each sighting given the heliostat's other sightings (leave-one-out cross-validation in closed form:
+Rasmussen & Williams 2006, (5.10)-(5.12)). The simplest candidate within one standard error of the
+best is chosen (Breiman et al. 1984).
 """
 
 import contextlib
@@ -44,7 +44,8 @@ class ScoredModel:
     log_predictive
         Mean log probability density of a sighting given the others.
     behind, behind_error
-        Distance of ``log_predictive`` to the best candidate's, and its standard error.
+        Difference between ``log_predictive`` and that of the best candidate, and its standard
+        error.
     log_evidence
         Log evidence of all sightings under the learnt hyperparameters.
     """
@@ -68,7 +69,7 @@ class ScoredModel:
 
 
 def candidate_models(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
-    """Return the models that fit this kind of mechanism, by name, the simplest first."""
+    """Return the models that suit this kind of mechanism, by name, the simplest first."""
     known = mechanism.parameters
     candidates: dict[str, tuple[str, ...]] = {}
     for name in ("guo6", "jacks", "khalsa8", "malan8"):
@@ -129,10 +130,10 @@ def compare_models(
     mechanism
         Heliostats as for `learn`.
     sightings
-        M of these heliostats.
+        M sightings of these heliostats.
     models
-        By name, each the name of a model or the names of parameters; default:
-        `candidate_models`, the simplest first.
+        By name, each the name of a model or the names of parameters; default: `candidate_models`,
+        the simplest first.
     used
         Mask of the sightings to learn from, (M,).
     progress
@@ -143,7 +144,7 @@ def compare_models(
     InputError
         If no heliostat has enough sightings, or there are no models.
     UnknownNameError
-        If there is no such model or parameter.
+        If a model or parameter does not exist.
     """
     field = members(mechanism)
     nominal, sightings = field.mechanism, field.rows_of(sightings)

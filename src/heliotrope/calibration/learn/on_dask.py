@@ -1,4 +1,4 @@
-"""Learns chunks of heliostats on several machines with dask.distributed."""
+"""Learns chunks of heliostats on several computers with dask.distributed."""
 
 from typing import TYPE_CHECKING, Any
 

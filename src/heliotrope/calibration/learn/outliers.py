@@ -1,9 +1,9 @@
 """Outliers by the generalised extreme Studentized deviate test (Rosner 1983, Technometrics 25).
 
-The sighting farthest from the prediction of the others is removed repeatedly; all up to the last
-one that was farther than chance allows are outliers, so that two similar ones do not hide each
-other. The squared distance in two components is χ² with two degrees of freedom: the largest of n
-exceeds 2 ln(n / α) with probability α.
+The sighting farthest from the prediction of the others is removed repeatedly; every sighting
+removed up to and including the last one that was farther than chance allows is an outlier. Two
+similar outliers therefore cannot hide each other. The squared distance in two components is χ² with
+two degrees of freedom: the largest of n exceeds 2 ln(n / α) with probability α.
 """
 
 import numpy as np

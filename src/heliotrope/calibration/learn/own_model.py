@@ -1,10 +1,11 @@
 """Chooses the model of one heliostat from its own sightings, in a fraction of a second.
 
-`models` compares candidates over a field, with drift and population: minutes of work for a report.
-A running plant knows one heliostat at a time and has to go on. Here each candidate is one robust
-fit; its score is the log probability density of each visit given the others, under its priors and
-white noise (Rasmussen & Williams 2006, (5.10)-(5.12), for blocks of two). The simplest candidate
-within one standard error of the best is chosen, as there.
+`models` compares candidates over a field, including drift and population, which is minutes of work
+for a report. A running plant calibrates one heliostat at a time and has to continue. Here each
+candidate is one robust fit; its score is the log probability density of each calibration visit
+given the others, under its priors and white noise (Rasmussen & Williams 2006, (5.10)-(5.12), for
+blocks of two). As in `models`, the simplest candidate within one standard error of the best is
+chosen.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,9 +49,9 @@ class OwnModel:
     Attributes
     ----------
     name, parameters
-        Its name, and the parameters to fit.
+        Name of the model, and names of the parameters to fit.
     errors
-        Periodic errors of unknown ratio that are found and part of it.
+        Periodic errors of initially unknown ratio that were found and belong to the model.
     """
 
     name: str
@@ -60,10 +61,10 @@ class OwnModel:
     def fitting(
         self, nominal: Mechanism, sightings: Sightings, group: Hyperparameters | None = None
     ) -> tuple[FieldFit, FieldFit]:
-        """Return the fit of constants and the one that follows the drift of its ``group``.
+        """Return the fit of constants, and the fit that follows the drift of its ``group``.
 
-        The constants are those of the `latest` sightings; see `present`. The values are deviations
-        from ``nominal``, (1,), so that they alone make the mechanism: ratios are among them.
+        The constants are fitted to the `latest` sightings; see `present`. The values are deviations
+        from ``nominal``, (1,), and include the ratios, so that they fully define the mechanism.
         """
         some = latest(sightings)
         constants = self.completed(fit(self.start(nominal), some, self.parameters))
@@ -77,7 +78,7 @@ class OwnModel:
         group: Hyperparameters | None,
         flown: Sequence[Flown] = (),
     ) -> FieldFit:
-        """Return the fit that follows the drift, beside a fit of constants; see `present`."""
+        """Return the fit that follows the drift, alongside a fit of constants; see `present`."""
         fitted = fitting_present(
             self.start(nominal), sightings, self._searched(constants), group, flown
         )
@@ -96,11 +97,11 @@ class OwnModel:
         )
 
     def start(self, nominal: Mechanism) -> Mechanism:
-        """Return the mechanism from which the parameters are fitted."""
+        """Return the mechanism at which the fit of the parameters starts."""
         return periodic.with_ratios(nominal, self.errors)
 
     def completed(self, fitted: FieldFit) -> FieldFit:
-        """Return a fit from `start` with the ratios among the values."""
+        """Return a fit that began at `start`, with the ratios added to its values."""
         if not self.errors:
             return fitted
         count, ratios = len(fitted.names), np.array([e.ratio - e.known for e in self.errors])
@@ -127,18 +128,18 @@ class OwnModel:
 def choose_own_model(nominal: Mechanism, sightings: Sightings, simple: str) -> OwnModel:
     """Return the simplest model that explains the sightings of one heliostat.
 
-    The candidates are those of `models.candidate_models`, periodic errors of searched ratio
-    among them, each together with the parameters of the simple model. With fewer than `FEWEST`
-    visits it is the simple model.
+    The candidates are those of `models.candidate_models`, including periodic errors whose ratio is
+    searched for, each combined with the parameters of the simple model. With fewer than `FEWEST`
+    visits the simple model is returned.
 
     Parameters
     ----------
     nominal
         Batch shape (1,).
     sightings
-        M of this heliostat, row 0.
+        M sightings of this heliostat, at index 0.
     simple
-        Name of the model that few sightings allow.
+        Name of the simple model, which needs only a few sightings.
     """
     base, sightings = parameter_table.model(simple, nominal.parameters), latest(sightings)
     mean = periodic.visit_means(nominal, sightings)

@@ -1,23 +1,24 @@
-r"""Searches the residuals for a periodic error: of unknown ratio, or a harmonic of a known one.
+r"""Searches the residuals for a periodic error of unknown ratio, or a harmonic of a known ratio.
 
-A worm or gear that runs out of true adds A cos(r x − δ) to the angle of its joint: x is the ideal
-angle of the drive (the stroke of a jack) and r the unknown ratio (Malan, thesis, (6.1), knew his:
-30). For each trial r a cosine and a sine are added to the model, linearised about a robust fit, and
-the constants float with them within their priors: the residuals are whitened by the noise and the
-priors together. Of one heliostat with ν degrees of freedom left by the constants and normal noise
-of unknown size, the share q of the squares that remains has the probability
+An eccentric worm or gear adds A cos(r x − δ) to its joint angle, where x is the ideal angle of the
+drive (the stroke of a jack) and r the unknown ratio (Malan, thesis, (6.1), knew the ratio: 30). For
+each trial r a cosine and a sine are added to the model, linearised about a robust fit. The
+constants may vary within their priors, because the residuals are whitened by the noise and the
+priors together. For one heliostat whose constants leave ν degrees of freedom, with normal noise of
+unknown size, the probability that the remaining fraction q of the sum of squares is as small by
+chance is
 
 $$ P(q) = q^{(ν-2)/2} $$
 
-to be as small by chance (Baluev 2008, MNRAS 385, 1279, (6) and table 1, here with the constants of
-a mirror in place of his polynomial). −ln P is exponential, so its sum over N heliostats
-follows a gamma law of shape N. The probability of the highest peak by chance is at most the number
-of trials times that of one (Bonferroni). Residuals of real machines are not white: the height of a
-peak counts in units of the spectrum that remains around it.
+(Baluev 2008, MNRAS 385, 1279, (6) and table 1, with the constants of a heliostat in place of his
+polynomial). −ln P is exponentially distributed, so its sum over N heliostats follows a gamma
+distribution of shape N. The chance probability of the highest peak is at most the number of trials
+times that of one trial (Bonferroni). Residuals of real heliostats are not white, so the height of a
+peak is measured relative to the surrounding spectrum.
 
-Once a wave is found, ratio and σ come from fits that hold it: to the first fit it was noise, and
-with too large a noise the constants are stiff and draw the ratio to one side. A constant that the
-fit moved further than its prior floats as far there.
+Once a wave is found, its ratio and σ come from fits that include the wave. The first fit counted
+the wave as noise; noise that is assumed too large makes the constants stiff and biases the ratio. A
+constant that the fit moved further than its prior may vary here by the same amount.
 """
 
 from dataclasses import dataclass, replace
@@ -64,24 +65,24 @@ OUTLIER = 5.0
 
 @dataclass(frozen=True)
 class PeriodicError:
-    """A periodic error of one drive, the same ratio on N heliostats.
+    """A periodic error of one drive, with the same ratio on N heliostats.
 
     Attributes
     ----------
     joint
-        Name of the joint that the drive turns.
+        Name of the joint that the drive moves.
     ratio
-        Periods in a turn of the joint (rotary), or radians in a metre of stroke (jack).
+        Periods per joint revolution (rotary), or radians per metre of stroke (jack).
     sigma
-        Standard deviation of the ratio; 0 for a harmonic of a known one.
+        Standard deviation of the ratio; 0 for a harmonic of a known ratio.
     amplitude, phase
-        A and δ of each heliostat, rad, (N,); NaN where a heliostat has too few sightings.
+        A and δ of each heliostat, rad, (N,); NaN for heliostats with too few sightings.
     false_alarm
-        Probability that chance makes so high a peak anywhere in the search, at most.
+        Upper bound on the probability that chance produces so high a peak anywhere in the search.
     clear
         Whether no other ratio explains the sightings nearly as well.
     known
-        Ratio that the plant gives, of which ``ratio`` is a harmonic; 0 if unknown.
+        Ratio in the plant file of which ``ratio`` is a harmonic; 0 if unknown.
     """
 
     joint: str
@@ -178,20 +179,21 @@ class _Member:
 def search_periodic_errors(
     mechanism: Mechanism, sightings: Sightings, *, used: npt.ArrayLike | None = None
 ) -> tuple[PeriodicError, ...]:
-    """Return the best periodic error of each drive whose ratio is unknown, the clearest first.
+    """Return the best periodic error of each drive whose ratio is unknown, most significant first.
 
-    Each has its probability of chance; take those that are `PeriodicError.found`. The search is
-    over `FEWEST_TURNS` to as many turns within the range of the drive as there are visits: more
-    turns than visits cannot be told from fewer. Of a drive whose ratio is known only the
-    `HARMONICS` are tried, and an error is returned only if one of them is found. Empty if the
-    sightings are too few.
+    Each comes with its probability of arising by chance; use only errors that are
+    `PeriodicError.found`. The search runs from `FEWEST_TURNS` to as many periods within the range
+    of the drive as there are calibration visits, because more periods than visits cannot be
+    distinguished from fewer. For a drive whose ratio is known only the `HARMONICS` are tried, and
+    an error is returned only if one of the harmonics is found. The result is empty if there are too
+    few sightings.
 
     Parameters
     ----------
     mechanism
-        Nominal, (N,), all of one kind.
+        Nominal mechanisms, (N,), all of one kind.
     sightings
-        M of these heliostats.
+        M sightings of these heliostats.
     used
         Mask of the sightings to learn from, (M,).
     """

@@ -1,9 +1,10 @@
-"""One mirror's parameters now, from all of its photographs in the order in which they came.
+"""Present parameters of one heliostat, from all its photographs in chronological order.
 
-A fit of constants lets a photograph of last year count as much as today's. Here the fit only says
-where each sighting is linearised and which is suspect; the values come from the state that follows
-the drift (`stream`): it forgets what the drive has lost since, and weighs steps, regimes and
-mistakes. The whole history is replayed, so nothing but the sightings has to be kept.
+A fit of constants weights last year's photographs as much as today's. Here that fit only provides
+the linearisation point of each sighting and marks suspect sightings; the values come from the state
+that follows the drift (`stream`), which discounts old sightings as the drive drifts, and weighs
+steps, regimes and faulty sightings. The whole history is replayed, so only the sightings have to be
+stored.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,10 @@
-"""Regimes: spans of time in which a heliostat's zeros are shifted, as after a repair.
+"""Regimes: periods in which a heliostat's zeros are shifted, for example after a repair.
 
-The time of a heliostat's sightings is cut into segments, each on the common zeros or on zeros of
-its own, so that the truncated squares of the residuals plus a price for each cut and each new pair
-of zeros are least (optimal partitioning: Jackson et al. 2005, IEEE Signal Processing Letters 12;
-truncated loss: Fearnhead & Rigaill 2019, J. Am. Stat. Assoc. 114). Slow creep is modelled in
-`drift`.
+The history of a heliostat's sightings is divided into segments, each with the common zeros or with
+zeros of its own. The division minimises the truncated squares of the residuals plus a penalty for
+each cut and for each new pair of zeros (optimal partitioning: Jackson et al. 2005, IEEE Signal
+Processing Letters 12; truncated loss: Fearnhead & Rigaill 2019, J. Am. Stat. Assoc. 114). Slow
+creep is modelled in `drift`.
 """
 
 import numpy as np

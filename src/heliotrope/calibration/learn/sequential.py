@@ -1,4 +1,4 @@
-"""Predicts each sighting from what was measured before it, as a plant in service does."""
+"""Predicts each sighting from the sightings before it, as a plant in service does."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -29,9 +29,10 @@ CHUNK = 50
 def beliefs_of(learned: Learned) -> tuple[Belief, ...]:
     """Return the belief of each heliostat after the sightings that it was learnt from.
 
-    This is the work of a night: hyperparameters, the centre of the priors and the derivatives of
-    the past come from the batch, each sighting linearised about the posterior at its time; steps,
-    regimes and mistakes are weighed again as the sightings come. ``stream.observe`` goes on.
+    This is overnight work: hyperparameters, the centre of the priors and the derivatives of past
+    sightings come from the batch, with each sighting linearised about the posterior at its time.
+    Steps, regimes and faulty sightings are weighed again as the sightings are replayed.
+    ``stream.observe`` then continues with new sightings.
     """
     sightings = learned.sightings
     beliefs = []
@@ -55,14 +56,14 @@ def beliefs_of(learned: Learned) -> tuple[Belief, ...]:
 
 
 def predict_by_stream(learned: Learned, progress: Progress | None = None) -> Prediction:
-    """Return the held-out sightings, each predicted by the belief after all earlier ones.
+    """Return the held-out sightings, each predicted by the belief after all earlier sightings.
 
     Parameters
     ----------
     learned
-        Learnt from the earliest sightings of each heliostat.
+        Field learnt from the earliest sightings of each heliostat.
     progress
-        Called with (done, all) held-out sightings.
+        Called with the numbers of held-out sightings (done, total).
     """
     sightings, size = learned.sightings, len(learned.names)
     beliefs = list(beliefs_of(learned))
@@ -88,20 +89,20 @@ def predict_in_turn(
     runner: Runner | None = None,
     progress: Progress | None = None,
 ) -> Prediction:
-    """Return the held-out sightings, each predicted from all earlier ones of its heliostat.
+    """Return the held-out sightings, each predicted from the heliostat's earlier sightings.
 
-    The hyperparameters remain those of the training part, so other heliostats contribute through
-    the population alone. Every history is learnt afresh: parameters, regimes, steps and outliers.
-    Sightings at the same time do not see each other.
+    The hyperparameters remain those of the training part, so other heliostats contribute only
+    through the population. For every prediction the parameters, regimes, steps and outliers are
+    learnt again from the whole history. Simultaneous sightings do not influence each other.
 
     Parameters
     ----------
     learned
-        Learnt from the earliest sightings of each heliostat.
+        Field learnt from the earliest sightings of each heliostat.
     priors, runner
         As for `heliotrope.calibration.learn.learn`; ``priors`` as scalars or (N,).
     progress
-        Called with (done, all) held-out sightings.
+        Called with the numbers of held-out sightings (done, total).
     """
     asked = np.flatnonzero(~learned.used)
     parts = []

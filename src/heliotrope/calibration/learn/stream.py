@@ -1,17 +1,17 @@
-r"""The streaming learner: the belief of one mirror, updated by each sighting as it comes.
+r"""The streaming learner: the belief about one heliostat, updated by each new sighting.
 
 The model is that of `drift`, written as a state instead of a covariance between sightings: the
-constants, the zeros' offsets in the present regime, and the Ornstein-Uhlenbeck processes,
+constants, the offsets of the zeros in the present regime, and the Ornstein-Uhlenbeck processes,
 
 $$ d(t + Δ) = e^{-Δ/τ} d(t) + w, \qquad \langle w^2 \rangle = a^2 (1 - e^{-2Δ/τ}). $$
 
 A sighting is linear in the state, so the belief remains Gaussian (Kalman 1960), and equals the
-posterior of the batch for the same derivatives and events. What happened since the previous
-sighting is not known: nothing, a step of the zeros, a new regime or the return from it, or the
-sighting is a mistake. Each is a hypothesis with a weight, multiplied by the probability density of
-each sighting; later sightings settle it (a Gaussian sum: Alspach & Sorenson 1972, IEEE
-Transactions on Automatic Control 17). Everything is an argument, the time included, and every
-function returns a new belief.
+batch posterior for the same derivatives and events. What happened since the previous sighting is
+unknown: nothing, a step of the zeros, the start or the end of a regime, or the sighting itself is
+faulty. Each possibility is a hypothesis with a weight, which is multiplied by the probability
+density of each sighting; later sightings decide between the hypotheses (a Gaussian sum: Alspach &
+Sorenson 1972, IEEE Transactions on Automatic Control 17). All inputs, including the time, are
+arguments, and every function returns a new belief.
 """
 
 import math
@@ -42,7 +42,7 @@ IGNORED = 0.05
 
 
 class Event(IntEnum):
-    """What happened between two sightings; `UNKNOWN` weighs everything."""
+    """What happened between two sightings; `UNKNOWN` weighs all possibilities."""
 
     UNKNOWN = kernels.UNKNOWN
     NOTHING = kernels.NOTHING
@@ -93,28 +93,29 @@ def layout_of(hyper: Hyperparameters) -> Layout:
 
 @dataclass(frozen=True)
 class Belief:
-    """The belief about one mirror after its sightings so far.
+    """The belief about one heliostat after its sightings so far.
 
     Attributes
     ----------
     hyper
-        Hyperparameters of the mirror, P names.
+        Hyperparameters of the heliostat, with P names.
     layout
-        Made from them.
+        Transition model derived from the hyperparameters.
     centre
         Centre of the priors, (P,).
     weight
         Weights of the K hypotheses, the heaviest first, (K,).
     mean, covariance
-        The state under each: constants less ``centre``, offsets, processes; (K, S), (K, S, S).
+        The state under each hypothesis, as constants minus ``centre``, offsets, processes: means
+        and covariances, (K, S), (K, S, S).
     regime
-        Whether the zeros are off, (K,).
+        Whether the zeros are shifted under each hypothesis, (K,).
     time
-        Days of the latest sighting; NaN before the first.
+        Time of the latest sighting, days; NaN before the first.
     count
         Number of sightings.
     mistaken
-        Probability that the latest sighting showed something else.
+        Probability that the latest sighting was faulty.
     density
         Log probability density of all sightings.
     """
@@ -146,10 +147,10 @@ class Belief:
         }
 
     def at(self, time: float) -> tuple[FloatArray, FloatArray]:
-        """Return parameters (P,) and their covariance (P, P) at a time in days, not in the past.
+        """Return parameters (P,) and covariance (P, P) at a time, days, not in the past.
 
-        The hypotheses count by weight, except for the least that weigh less than `IGNORED`
-        together. NaN: at an unknown time.
+        The hypotheses count by weight; the lightest are ignored as long as their weights sum to
+        less than `IGNORED`. NaN: at an unknown time.
         """
         h, state, gap = self.hyper, self.layout, self.days_since(time)
         many = int(np.searchsorted(np.cumsum(self.weight), 1.0 - IGNORED)) + 1
@@ -177,7 +178,7 @@ class Belief:
 
 
 def read_belief(hyper: Hyperparameters, document: dict[str, Any]) -> Belief:
-    """Return the belief of a document made by `Belief.document`."""
+    """Return the belief from a document created by `Belief.document`."""
     time = document["time_days"]
     return Belief(
         hyper=hyper,
@@ -204,10 +205,10 @@ def begin(
     Parameters
     ----------
     hyper
-        Of the field or the mirror.
+        Hyperparameters of the field or the heliostat.
     centre, own
-        Centre of the priors, and which of them is a far start without a population mean, (P,);
-        default: the nominal mechanism.
+        Centre of the priors, and which parameters start far from nominal, without a population
+        mean, (P,); default: the nominal mechanism.
     """
     size = len(hyper.names)
     middle = np.zeros(size) if centre is None else np.asarray(centre, dtype=np.float64)
@@ -304,11 +305,12 @@ def update(
     jacobian
         Whitened derivatives, (2, P).
     value
-        To be explained by the parameters' deviations from the centre, (2,).
+        Residual to be explained by the deviations of the parameters from the centre, (2,).
     time
-        Days, not before the previous sighting's; NaN: unknown, it shares no drift with others.
+        Days, not before the previous sighting; NaN: unknown, so the sighting shares no drift with
+        others.
     event
-        What is known to have happened before it, for example from a log of maintenance.
+        Event known to have happened before the sighting, for example from a maintenance log.
     """
     h, state = belief.hyper, belief.layout
     rows, noise = jacobian @ state.view, h.noise**2 * np.eye(2)
@@ -359,9 +361,9 @@ def observe(
     belief
         Before it.
     mechanism
-        Nominal mechanism of the mirror, (1,).
+        Nominal mechanism of the heliostat, (1,).
     sighting
-        One sighting, of heliostat 0. One beyond the reach of the drives changes nothing.
+        One sighting, of heliostat 0. A sighting beyond the reach of the drives changes nothing.
     event
         As for `update`.
     """

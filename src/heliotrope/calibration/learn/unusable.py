@@ -1,7 +1,8 @@
 """Sightings that a mechanism cannot produce.
 
-Counts beyond the reach of a jack (its triangle is stretched flat) leave the joint where it is, so
-that the derivative is infinite and one such row would spoil the whole field. It is left out.
+Counts beyond the reach of a jack (its triangle is fully extended) do not move the joint further.
+The derivative is infinite there, and one such sighting would corrupt the whole field, so it is left
+out.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
-"""Learns one group in a process of its own: ``python -m heliotrope.calibration.learn.worker``.
+"""Learns one group in its own process: ``python -m heliotrope.calibration.learn.worker``.
 
-A plant starts it at night and writes a `GroupTask` to its input, pickled; it answers with one JSON
-document and ends. It uses only the computing time that other processes leave.
+A plant starts this process at night and writes a pickled `GroupTask` to its input; the process
+replies with one JSON document and ends. It uses only CPU time that other processes leave free.
 """
 
 import json

@@ -1,10 +1,10 @@
-"""Plans measurements: the suns and targets that reveal most about each heliostat.
+"""Plans measurements: the sun positions and targets that are most informative per heliostat.
 
 `plan_sightings` chooses among the `candidate_sightings` of one heliostat, `plan_each` does so for
-several that share targets, `plan_campaign` schedules a whole field; `fleets_of` prepares the
-heliostats of a plant. `plan_commission` plans the first days of a new field, up to a goal. Tables
-and pictures are in `calibration.plan.report`, updates of a covariance by one more sighting in
-`calibration.plan.gain`.
+several heliostats that share targets, and `plan_campaign` schedules a whole field; `fleets_of`
+prepares the heliostats of a plant. `plan_commission` plans the first days of a new field until a
+goal is reached. Tables and plots are in `calibration.plan.report`, covariance updates for one more
+sighting in `calibration.plan.gain`.
 """
 
 from heliotrope.calibration.plan.campaign import CalibrationCampaign, Timing, plan_campaign

@@ -1,10 +1,10 @@
-"""Allocates the beams of a whole day to intervals and targets.
+"""Allocates a day's calibration beams to intervals and targets.
 
-An option is a pair of interval and target with room for some beams. The beam with the greatest
-gain is allocated again and again (greedy choice under capacities, Fisher, Nemhauser & Wolsey
-1978). Gains only fall as heliostats become better known, so an outdated gain is computed again
-only when it comes to the top (Minoux 1978). Then beams are moved and exchanged between options
-as long as the sum of squared errors falls, because the greedy choice does not look ahead.
+An option is an interval on a target with capacity for some beams. The beam with the greatest gain
+is allocated repeatedly (greedy choice under capacities, Fisher, Nemhauser & Wolsey 1978). Gains
+only decrease as heliostats become better known, so an outdated gain is recomputed only when it
+comes to the top (Minoux 1978). Because the greedy choice does not look ahead, beams are then moved
+and exchanged between options as long as the sum of squared errors decreases.
 """
 
 from collections.abc import Sequence

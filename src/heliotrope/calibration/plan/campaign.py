@@ -1,10 +1,10 @@
 """Plans a campaign: which heliostat is measured on which target at what time.
 
-A target shows one beam at a time. Its time is cut into slots of equal length (settle, expose,
-clear). Either each day is planned as a whole, and every heliostat gets its most telling hours as
-far as there is room; or each slot goes to the heliostat whose sighting then lowers the field's
-expected squared beam error most. Mirrors travel while others are measured; each comes from its
-aim point and returns to it.
+A target takes one beam at a time. Its time is divided into slots of equal length (settle, expose,
+clear). Either each day is planned as a whole, so that every heliostat is measured in its most
+informative hours as far as capacity allows; or each slot is assigned to the heliostat whose
+sighting then reduces the field's expected squared beam error most. Heliostats slew while others are
+measured; each comes from its aim point and returns to it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,16 +33,16 @@ MEMORY = 1e9
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of a beam on a target, s.
+    """Durations for one beam on a target, s.
 
     Attributes
     ----------
     settle
-        From the beam's arrival until it stands still.
+        From the arrival of the beam until the beam is steady.
     exposure
         Exposure of the camera.
     clear
-        From the exposure until it has left the target and the next may arrive.
+        From the exposure until the beam has left the target and the next beam may arrive.
     """
 
     settle: float = 5.0
@@ -59,23 +59,23 @@ class Timing:
 
     @property
     def slot(self) -> float:
-        """Time that one beam occupies the target, s."""
+        """Time for which one beam occupies the target, s."""
         return self.settle + self.exposure + self.clear
 
 
 @dataclass(frozen=True)
 class CalibrationCampaign:
-    """M planned sightings in order of time, with the beam errors to expect.
+    """M planned sightings in order of time, with the expected beam errors.
 
-    Heliostats are numbered through all fleets. Times are unix seconds (UTC).
+    Heliostats are numbered consecutively over all fleets. Times are Unix seconds (UTC).
 
     Attributes
     ----------
     leave, arrive, time, done, back
-        When the beam leaves its aim, arrives on the target, is exposed (middle of the
+        Times at which the beam leaves its aim, arrives on the target, is exposed (middle of the
         exposure), has left the target, and is back at its aim, (M,).
     heliostat, target
-        Rows, (M,).
+        Indices, (M,).
     counts
         Drive counts at ``time``, (M, D).
     heliostat_error, error
@@ -84,8 +84,8 @@ class CalibrationCampaign:
     before
         Expected RMS beam error of the field before the campaign, rad.
     expected
-        Expected RMS beam error of each heliostat after the campaign, rad, (N,); 0 where it
-        does not count.
+        Expected RMS beam error of each heliostat after the campaign, rad, (N,); 0 for heliostats
+        that do not count.
     slots
         Number of slots on all targets together.
     """
@@ -135,7 +135,7 @@ def plan_campaign(
     fleets
         The heliostats, kind by kind.
     site
-        Place and air.
+        Location and atmosphere.
     targets
         Targets with cameras.
     start, stop
@@ -143,29 +143,29 @@ def plan_campaign(
     timing, limits
         Default: `Timing()` and `SightingLimits()`.
     every
-        Interval at which the gains of the whole field are computed, s; the sightings chosen
-        are computed for their own times.
+        Interval at which the gains of the whole field are computed, s; the gains of the chosen
+        sightings are computed for their actual times.
     ahead
-        Plan each day as a whole, so that the error is smallest at its end; otherwise slot by
-        slot, so that the error falls fastest.
+        Whether to plan each day as a whole, so that the error is smallest at its end; otherwise
+        slot by slot, so that the error falls fastest.
     worth
-        A measurement must lower the heliostat's own expected squared error by this share; a
-        slot in which none does stays empty.
+        Minimum fraction by which a measurement must reduce the heliostat's own expected squared
+        error; a slot in which no measurement does so stays empty.
     count
-        Most measurements; default: no limit.
+        Maximum number of measurements; default: no limit.
     progress
-        Called with (slots done, all slots) after each interval.
+        Called with the numbers of slots (done, total) after each interval.
 
     Returns
     -------
-    A schedule in which no two beams share a target, no heliostat is in two places, each
-    leaves its aim in time, and stops and limits are kept. The way back is taken to last as
-    long as the way out.
+    In the schedule no two beams share a target, no heliostat is in two places at once, each leaves
+    its aim in time, and stops and limits are respected. The return slew is assumed to take as long
+    as the outward slew.
 
     Raises
     ------
     InputError
-        If there are no heliostats or targets, or the sun is not up in the span.
+        If there are no heliostats or targets, or the sun is not up in the time span.
     """
     if not fleets or not sum(len(f) for f in fleets) or not targets:
         raise InputError("campaign: give heliostats and at least one target")

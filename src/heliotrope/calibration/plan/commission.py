@@ -1,12 +1,12 @@
-"""Plans the commissioning of a field: from the errors of an installation to a goal, in days.
+"""Plans the commissioning of a field, in days: from installation errors to the accuracy goal.
 
-A target takes the visits one after the other, as a running plant does: joint first visits before
-all others, then those that are due together, and alone those that a joint visit did not find.
-Within each kind, heliostats come first whose visits lower the expected squared error of the field
-most for each second. Gains are computed for all heliostats at the middle of an interval of half an
-hour, in which each is visited once at most; the gains of different heliostats do not depend on
-each other. Where a plant measures mirrors on its receiver, that is one more place, for mirrors that
-are known well enough; they stay at their aims.
+A target takes the calibration visits one after the other, as in a running plant: first joint first
+visits, then joint visits that are due, then single visits for heliostats that a joint visit did not
+find. Within each kind, the heliostats whose visits reduce the expected squared error of the field
+most per second come first. Gains are computed for all heliostats at the middle of each half-hour
+interval, in which each heliostat is visited at most once; the gains of different heliostats are
+independent. A plant that measures heliostats on its receiver has one more place for visits, open to
+heliostats that are known well enough; they stay at their aims.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -46,33 +46,34 @@ def _default_limits() -> SightingLimits:
 
 @dataclass(frozen=True)
 class CommissionTerms:
-    """Cost and yield of a visit, and the purpose of the plan.
+    """Cost and accuracy of a calibration visit, and the goal of the plan.
 
     Attributes
     ----------
     goal
-        Beam error that 90 % of the mirrors shall not exceed, RMS over the year, rad.
+        Beam error that 90 % of the heliostats must not exceed, RMS over the year, rad.
     settle, shots, interval
-        A visit of one mirror, s: until it stands still, and its photographs; 80 s together.
+        Durations in a single visit, s: until the heliostat is steady, and for its photographs; 80 s
+        in total.
     look
-        Time of a further search photograph when the beam is not on the target, s.
+        Time of each further search photograph when the beam is not on the target, s.
     sigma
-        Standard deviation of a photograph's beam in each direction, rad.
+        Standard deviation of the beam position in a photograph, per direction, rad.
     joint
-        Visits of several mirrors at once; None: there are none.
+        Joint visits of several heliostats; None: no joint visits.
     receiver
-        Visits of mirrors on a receiver; None: there are none.
+        Receiver visits; None: no receiver visits.
     repeat
-        Part of the beam error that is drawn anew at each visit and in operation, standard
-        deviation in each direction, rad.
+        Random part of the beam error, drawn anew at each visit and in operation, standard deviation
+        per direction, rad.
     worth
-        Least share of a heliostat's expected squared error that a visit must take away.
+        Minimum fraction of a heliostat's expected squared error that a visit must remove.
     clear
-        Share of the time without clouds.
+        Fraction of the time without clouds.
     every
         Interval at which gains are computed, s.
     limits
-        Limits of the sun and of angles.
+        Limits on the sun position and on angles.
     """
 
     goal: float = 6e-4
@@ -105,16 +106,16 @@ class CommissionTerms:
 
     @property
     def alone(self) -> float:
-        """Time of a visit of one mirror without driving and searching, s."""
+        """Time of a single visit without slewing and searching, s."""
         return self.settle + self.shots * self.interval
 
     def accuracy(self, together: bool, *, produces: bool = False) -> float:
-        """Standard deviation in each direction of a visit, rad.
+        """Standard deviation per direction that a visit achieves, rad.
 
         Parameters
         ----------
         together, produces
-            Whether it is a coded visit, and one on a receiver.
+            Whether it is a coded visit, and whether it is a receiver visit.
         """
         terms = self.receiver if produces else self.joint if together else None
         noise = self.sigma / np.sqrt(self.shots) if terms is None else terms.sigma
@@ -122,7 +123,7 @@ class CommissionTerms:
 
     @property
     def floor(self) -> float:
-        """RMS beam error that no number of visits lowers, rad."""
+        """RMS beam error that no number of visits can reduce, rad."""
         return float(np.sqrt(2.0) * self.repeat)
 
 
@@ -163,25 +164,25 @@ class Visit:
 
 @dataclass(frozen=True)
 class CommissionPlan:
-    """A plan and its prediction.
+    """A commissioning plan and its predicted result.
 
     Attributes
     ----------
     visits
-        In order of their beginnings.
+        In order of their start times.
     time
-        POSIX s of the curve, (K,): the beginning, and the end of each interval.
+        POSIX s of the curve, (K,): the start, and the end of each interval.
     percentiles, rms
         Predicted 50th and 90th percentile of the field's beam error, and its RMS, rad, (K, 2) and
         (K,).
     seconds
         Time of all targets by use: "photographs", "search", "travel" and "idle", s.
     days
-        Beginning and end of each day's sun, POSIX s.
+        Start and end of each day's sunlight, POSIX s.
     terms
         The terms.
     unseen
-        Heliostats that were never measured at the end.
+        Heliostats that remain unmeasured at the end.
     """
 
     visits: tuple[Visit, ...]
@@ -195,19 +196,19 @@ class CommissionPlan:
 
     @property
     def reached(self) -> float | None:
-        """When the 90th percentile is predicted at the goal, POSIX s; None if it is not."""
+        """Time at which the predicted 90th percentile reaches the goal, POSIX s; None if never."""
         good = np.flatnonzero(self.percentiles[:, 1] <= self.terms.goal)
         return float(self.time[good[0]]) if good.size else None
 
     @property
     def busy(self) -> float:
-        """Share of the time of all targets that is used."""
+        """Fraction of the targets' time that is used."""
         total = sum(self.seconds.values())
         return 1.0 - self.seconds["idle"] / total if total else 0.0
 
     @property
     def limit(self) -> str:
-        """The obstacle to the goal, in one clause; empty once the goal is reached."""
+        """The obstacle that keeps the plan from its goal, in one clause; empty if reached."""
         if self.reached is not None:
             return ""
         total = sum(self.seconds.values())
@@ -248,38 +249,38 @@ def plan_commission(
     terms: CommissionTerms | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> CommissionPlan:
-    """Return the visits of a commissioning, up to the goal or the end of the span.
+    """Return the visits of a commissioning, up to the goal or the end of the time span.
 
     Parameters
     ----------
     fleets
-        The heliostats with what is known of them; see `fleets_of`.
+        The heliostats with the information available on each; see `fleets_of`.
     site, targets
-        Place and air; targets with cameras.
+        Location and atmosphere; targets with cameras.
     start, stop
         POSIX s.
     size
-        Larger side of the mirrors, m, () or (N,).
+        Longer side of the mirrors, m, () or (N,).
     measured
-        Heliostats that were measured before, as by a drone, () or (N,).
+        Heliostats measured before, for example by a drone, () or (N,).
     missed
-        Joint first visits that the beam of each heliostat has missed before, () or (N,).
+        Number of joint first visits that each heliostat's beam has missed so far, () or (N,).
     held
-        Heliostats that cannot be visited, () or (N,); they count in the field's errors.
+        Heliostats that cannot be visited, () or (N,); they still count in the field's errors.
     terms
         Default: `CommissionTerms()`.
     progress
-        Called with (intervals done, all intervals).
+        Called with the numbers of intervals (done, total).
 
     Raises
     ------
     InputError
-        If there are no heliostats or targets, or the sun is not up in the span.
+        If there are no heliostats or targets, or the sun is not up in the time span.
 
     Notes
     -----
-    Clouds shorten every interval by the same share. Shading, blocking and glare are not considered:
-    the running schedule avoids them, and a mirror that is hidden now comes an hour later.
+    Clouds shorten every interval by the same fraction. Shading, blocking and glare are ignored,
+    because the running schedule avoids them and visits an obstructed heliostat an hour later.
     """
     if not fleets or not sum(len(f) for f in fleets) or not targets:
         raise InputError("commission: give heliostats and at least one target")

@@ -1,4 +1,4 @@
-"""A commissioning as tables, a document, a picture and a page."""
+"""A commissioning plan as tables, a JSON document, a plot and a page."""
 
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime

@@ -1,4 +1,4 @@
-"""Heliostats to plan for, with the information on their parameters, kind by kind."""
+"""Heliostats to plan for, with the information on their parameters, one fleet per kind."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -39,16 +39,16 @@ class Fleet:
     names
         P parameters of the model.
     information
-        Information on the parameters so far, (N, P, P); see `precision`.
+        Information matrix of the parameters so far, (N, P, P); see `precision`.
     form
-        Form of the squared beam error, (N, P, P); see `error_form`. A heliostat with form 0
-        does not count and is never measured in a campaign.
+        Quadratic form of the squared beam error, (N, P, P); see `error_form`. A heliostat whose
+        form is 0 does not count and is never measured in a campaign.
     aim
         Aim points between measurements, ENU metres, (N, 3).
     sigma
         Standard deviation of the measured beam direction, rad.
     labels
-        Names of the heliostats, (N,); may be left empty.
+        Names of the heliostats, (N,); may be empty.
     """
 
     mechanism: Mechanism
@@ -85,32 +85,33 @@ def fleets_of(
     installed: float | None = None,
     progress: Progress | None = None,
 ) -> list[Fleet]:
-    """Return the heliostats of a plant, one fleet for each of its groups.
+    """Return the heliostats of a plant, one fleet per group.
 
     Parameters
     ----------
     plant
-        Its heliostats aim at their own aim points, otherwise at the first receiver or target.
+        Plant whose heliostats aim at their own aim points or, by default, at the first receiver or
+        target.
     heliostats
         Names; default: all.
     year
-        Calendar year whose suns weigh the beam error.
+        Calendar year whose sun positions weight the beam error.
     model
-        A model of the parameter table; "auto": the usual one for the kind of mechanism.
+        A model of the parameter table; "auto": the usual model for the kind of mechanism.
     made
-        Sightings made so far; rows are those of ``plant.names``.
+        Sightings made so far; indices refer to ``plant.names``.
     sigma
         Standard deviation of a measured beam direction, rad.
     installed
-        Expected beam error of a group before any sighting, rad RMS: its priors are scaled to it.
-        Default: the priors of the table as they are.
+        Expected beam error of a group before any sighting, rad RMS, to which its priors are scaled.
+        Default: the priors of the table, unscaled.
     progress
-        Called with (groups done, all groups).
+        Called with the numbers of groups (done, total).
 
     Raises
     ------
     UnknownNameError
-        If the plant has no such heliostat, or there is no such model.
+        If a heliostat or model does not exist.
     """
     chosen = set(heliostats or plant.names)
     for name in chosen:
@@ -181,33 +182,33 @@ def plan_each(
     criterion: Criterion = "d",
     progress: Progress | None = None,
 ) -> tuple[dict[str, SightingPlan], CandidateSightings]:
-    """Return a plan for each heliostat by name, and the candidates of the first.
+    """Return a plan for each heliostat by name, and the candidates of the first heliostat.
 
-    Each heliostat has its own part of a step, so that no two are on a target at once.
+    Each heliostat has its own part of a time step, so that no two are on a target at once.
 
     Parameters
     ----------
     fleets
         Fleets with labels.
     site, targets
-        Place and air; targets with cameras.
+        Location and atmosphere; targets with cameras.
     start, stop
         Unix seconds (UTC).
     every
-        Step of the times considered, s.
+        Step between the times considered, s.
     slot
-        Time that one beam occupies a target, s.
+        Time for which one beam occupies a target, s.
     count
-        Measurements of each heliostat.
+        Number of measurements per heliostat.
     criterion
         As for `plan_sightings`.
     progress
-        Called with (heliostats done, all heliostats).
+        Called with the numbers of heliostats (done, total).
 
     Raises
     ------
     InputError
-        If a heliostat cannot be measured in the span.
+        If a heliostat cannot be measured in the time span.
     """
     times = time_grid(start, stop, every)
     rows = [(fleet, i) for fleet in fleets for i in range(len(fleet))]

@@ -1,8 +1,8 @@
-"""Gain of one more sighting: rank-two updates of covariances, batch axes first.
+"""Gain from one more sighting: rank-two updates of covariances, batch axes first.
 
-With C the covariance of the parameters and J the whitened derivative (2, P) of a
-sighting, the information grows by JᵀJ, and with S = 1 + J C Jᵀ (matrix determinant
-lemma, Woodbury's identity)
+With C the covariance of the parameters and J the whitened derivative (2, P) of a sighting, the
+information increases by JᵀJ, and with S = 1 + J C Jᵀ (matrix determinant lemma, Woodbury's
+identity)
 
     log det grows by log det S,   C' = C − (J C)ᵀ S⁻¹ (J C),
     tr(A C) falls by tr(S⁻¹ (J C) A (J C)ᵀ).

@@ -1,8 +1,8 @@
-"""Cost and yield of a visit of several mirrors to one target, as a plant makes it.
+"""Cost and accuracy of a joint visit (several heliostats on one target), as a plant performs it.
 
-A later visit takes few codes, since beams that do not overlap share one. In a first visit nobody
-knows where a beam is: each mirror has a code of its own along one axis, and a second stack of
-photographs verifies all of them with their new parameters.
+A later visit needs only a few codes, since beams that do not overlap share a code. In a first visit
+the beam positions are unknown, so each heliostat has its own code along one axis, and a second
+stack of photographs verifies all heliostats with their new parameters.
 """
 
 from dataclasses import dataclass
@@ -37,26 +37,27 @@ _ABOVE = 2.0
 
 @dataclass(frozen=True)
 class JointTerms:
-    """Visits of several mirrors at once, told apart by coded movements.
+    """Visits of several heliostats at once, distinguished by coded movements.
 
     Attributes
     ----------
     most, least
-        Mirrors of a later visit, at most; and how many a visit needs to be a joint one.
+        Maximum number of heliostats in a later visit, and the minimum number for a joint visit.
     first
-        Mirrors of a first visit, at most; 0: each has its first visit alone.
+        Maximum number of heliostats in a first visit; 0: each heliostat has its first visit alone.
     known
-        Expected beam error on the target above which a mirror goes with the new ones, rad RMS.
+        Expected beam error on the target above which a heliostat joins the first visits, rad RMS.
     tries
-        Joint first visits that a beam may miss before its mirror goes alone.
+        Number of joint first visits that a beam may miss before its heliostat is visited alone.
     step
-        Time of each photograph, with the movement before it, s.
+        Time per photograph, including the preceding movement, s.
     beside
-        Time of a visit beside photographs and slews, s: fits, parameters, waiting for the last.
+        Time of a visit excluding photographs and slews, s: fits, parameter transfer, waiting for
+        the last heliostat.
     sigma
-        Standard deviation of a beam in each direction by all photographs of a stack, rad.
+        Standard deviation of a beam position from all photographs of a stack, per direction, rad.
     brightest
-        Most light on a target, suns.
+        Maximum irradiance on a target, suns.
     """
 
     most: int = 49
@@ -86,14 +87,14 @@ class JointTerms:
 
     @classmethod
     def of(cls, settings: JointSettings, sigma: float) -> "JointTerms":
-        """Return the joint visits of a plant.
+        """Return the joint-visit terms of a plant.
 
         Parameters
         ----------
         settings
-            Of the plant file.
+            Joint-visit settings from the plant file.
         sigma
-            Standard deviation of a beam beside that of its centroid, rad.
+            Standard deviation of a beam excluding that of its centroid, rad.
         """
         return cls(
             most=settings.most,
@@ -108,14 +109,14 @@ class JointTerms:
         )
 
     def photographs(self, mirrors: int, *, own: bool) -> int:
-        """Return the photographs of a visit.
+        """Return the number of photographs in a visit.
 
         Parameters
         ----------
         mirrors
             Their number.
         own
-            Whether each mirror has a code of its own; a second stack verifies them then.
+            Whether each heliostat has its own code; a second stack then verifies them.
         """
         if not own:
             return 2 * (_codes(mirrors / _SHARING) + 1)
@@ -129,22 +130,22 @@ class JointTerms:
     def fitting(
         self, target: Target, size: FloatArray, slant: FloatArray, spread: FloatArray
     ) -> int:
-        """Return how many of some mirrors, from the first on, do not make a target too bright.
+        """Return how many heliostats, from the first on, keep a target below its limit.
 
         Parameters
         ----------
         target
             The target.
         size, slant
-            Larger sides of the mirrors and their distances from the target, m, (M,).
+            Longer sides of the mirrors and their distances from the target, m, (M,).
         spread
-            Expected squared beam error of both directions together, rad², (M,).
+            Expected squared beam error in both directions together, rad², (M,).
 
         Notes
         -----
-        The surer a mirror is, the farther from the middle its place may be. The light is random
-        while the places of beams are unknown: its expectation and twice its standard deviation
-        count.
+        The smaller the expected error of a heliostat, the farther from the middle its place may be.
+        While beam positions are unknown the irradiance is random; its expectation plus twice its
+        standard deviation counts.
         """
         power = _REFLECTED * size**2
         beam = beam_sigma(slant, slope=_SLOPE) ** 2 + (0.5 * size) ** 2 / 12.0

@@ -1,4 +1,4 @@
-"""The chance that a beam is on a target, at the first try and at the places searched next."""
+"""The probability that a beam is on a target, at the first attempt and at later search points."""
 
 import numpy as np
 from scipy.special import erf

@@ -1,8 +1,9 @@
-"""Percentiles of the beam errors of a field, predicted from the knowledge of its mirrors.
+"""Percentiles of the beam errors of a field, predicted from the covariance of each heliostat.
 
-The true squared error of a mirror, averaged over the suns of the year, is eᵀ F e with e ~ N(0, C):
-a sum of squares with mean tr(F C) and variance 2 tr((F C)²). A gamma distribution of this mean and
-variance replaces it (Satterthwaite 1946, for sums of mean squares); the field is their mixture.
+The true squared error of a heliostat, averaged over the sun positions of the year, is eᵀ F e with e
+~ N(0, C): a sum of squares with mean tr(F C) and variance 2 tr((F C)²). It is approximated by a
+gamma distribution with this mean and variance (Satterthwaite 1946, for sums of mean squares); the
+distribution of the field is the mixture over its heliostats.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""Plans the sightings of one heliostat: the suns and targets that reveal most about it.
+"""Plans the sightings of one heliostat: the most informative sun positions and targets.
 
 A camera-target sighting adds JᵀJ to the information on the parameters, with J the whitened
 derivative of normal minus bisector. The *D-optimal* choice maximises the determinant of the
-information, the *V-optimal* choice minimises the expected squared error of the beam over the
+information, and the *V-optimal* choice minimises the expected squared error of the beam over the
 year (Atkinson, Donev & Tobias 2007, chapters 10 and 12: greedy choice and Fedorov's exchange).
 """
 
@@ -31,16 +31,16 @@ SWEEPS = 50
 
 @dataclass(frozen=True)
 class SightingLimits:
-    """Limits that a sighting must keep.
+    """Limits that a sighting must satisfy.
 
     Attributes
     ----------
     min_elevation
         Lowest apparent elevation of the sun, rad.
     max_incidence
-        Largest angle between the sun and the mirror's normal, rad.
+        Largest angle between the sun and the mirror normal, rad.
     max_obliquity
-        Largest angle between the beam and the target's normal, rad.
+        Largest angle between the beam and the target normal, rad.
     """
 
     min_elevation: float = MIN_ELEVATION
@@ -65,7 +65,7 @@ class CandidateSightings:
     targets
         Names of the targets.
     heliostat, target
-        Rows, (M,).
+        Heliostat indices, (M,).
     time
         Unix seconds (UTC), (M,).
     sun
@@ -77,7 +77,7 @@ class CandidateSightings:
     incidence, obliquity
         Angle between sun and mirror normal, and between beam and target normal, rad, (M,).
     jacobian
-        Whitened derivative of normal minus bisector by the parameters, (M, 2, P).
+        Whitened derivative of normal minus bisector with respect to the parameters, (M, 2, P).
     """
 
     names: tuple[str, ...]
@@ -96,7 +96,7 @@ class CandidateSightings:
         return len(self.time)
 
     def take(self, rows: npt.ArrayLike) -> "CandidateSightings":
-        """Return the sightings at ``rows`` (indices or a mask), in that order."""
+        """Return the sightings at indices ``rows`` (or a mask), in that order."""
         index = np.asarray(rows)
         if not index.size:
             index = index.astype(np.intp)
@@ -113,7 +113,7 @@ class CandidateSightings:
 
 @dataclass(frozen=True)
 class Aimed:
-    """Mirrors aimed at a target; batch shape (...).
+    """Heliostats aimed at a target; batch shape (...).
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Aimed:
     incidence, obliquity
         rad, (...).
     able
-        Whether stops and limits allow it, (...).
+        Whether the stops and limits allow the pose, (...).
     """
 
     counts: FloatArray
@@ -139,17 +139,16 @@ def aim_at(
     limits: SightingLimits,
     current: FloatArray | None = None,
 ) -> Aimed:
-    """Return the poses that send the sun to the centre of a target.
+    """Return the poses that reflect the sun to the centre of a target.
 
     Parameters
     ----------
     mechanism, sun
-        Batch shapes broadcast; unit vectors ENU, (..., 3). The sun's elevation is not
-        checked.
+        Batch shapes broadcast; unit vectors ENU, (..., 3). The elevation of the sun is not checked.
     target, limits
         The target, and the limits that decide `Aimed.able`.
     current
-        Present drive counts, (..., D), to choose the nearer branch.
+        Present drive counts, (..., D), used to choose the nearer branch.
     """
     solved = track(mechanism, sun, target.center, current=current)
     normal, vertex = solved.chosen(solved.normal), solved.chosen(solved.vertex)
@@ -176,33 +175,33 @@ def candidate_sightings(
     sigma: npt.ArrayLike = 5e-4,
     limits: SightingLimits | None = None,
 ) -> CandidateSightings:
-    """Return all sightings that sun, targets and stops allow.
+    """Return all sightings that sun position, targets and stops allow.
 
     Parameters
     ----------
     mechanism
         Best estimates, batch shape (N,).
     site
-        Place and air.
+        Location and atmosphere.
     targets
         Targets with cameras; beams are sent to their centres.
     times
-        (T,), see `heliotrope.sun.Times`; `time_grid` makes them.
+        T times, see `heliotrope.sun.Times`; `time_grid` creates them.
     names
         P parameters of the table.
     sigma
-        Standard deviation of the beam's direction as the camera measures it, rad, () or (N,).
+        Standard deviation of the beam direction as the camera measures it, rad, () or (N,).
     limits
         Default: `SightingLimits()`.
 
     Returns
     -------
-    Sorted by heliostat, then target, then time; possibly none.
+    Sorted by heliostat, then target, then time; may be empty.
 
     Raises
     ------
     InputError
-        If there is no target, or the mechanisms do not have one batch axis.
+        If there is no target, or the mechanisms do not have exactly one batch axis.
     """
     if not targets:
         raise InputError("planning: there is no target; a camera-target sighting needs one")
@@ -281,15 +280,15 @@ def sighting_jacobian(
     Parameters
     ----------
     mechanism
-        One for each sighting, batch shape (M,).
+        One mechanism per sighting, batch shape (M,).
     counts, sun
         Drive counts (M, D) and unit vectors (M, 3).
     target
-        Target, with the beam at its centre.
+        Target; the beam is at its centre.
     names
         P parameters.
     sigma
-        Standard deviation of the beam's direction, rad, () or (M,).
+        Standard deviation of the beam direction, rad, () or (M,).
     """
     rows = len(counts)
     if not rows:
@@ -328,15 +327,15 @@ class SightingPlan:
     chosen
         The sightings.
     rank
-        Order of usefulness, 1 to K, (K,).
+        Rank by usefulness, 1 to K, (K,).
     gain
-        Growth of the log determinant of the information, nats, (K,).
+        Increase in the log determinant of the information, nats, (K,).
     before
         Expected RMS beam error over the year before the first sighting, rad.
     error
         Expected RMS beam error after each sighting, rad, (K,).
     best_first
-        The same if made in order of rank, rad, (K,).
+        The same if the sightings are made in order of rank, rad, (K,).
     covariance
         Covariance of the parameters after all sightings, (P, P).
     """
@@ -354,7 +353,7 @@ class SightingPlan:
 
     @property
     def log_det(self) -> float:
-        """Growth of the log determinant by all sightings, nats."""
+        """Increase in the log determinant from all sightings, nats."""
         return float(self.gain.sum())
 
 
@@ -368,7 +367,7 @@ def plan_sightings(
     exchange: bool = True,
     gap: float = 0.0,
 ) -> SightingPlan:
-    """Return the sightings of one heliostat that together reveal most about it.
+    """Return the most informative set of sightings of one heliostat.
 
     Parameters
     ----------
@@ -377,26 +376,26 @@ def plan_sightings(
     count
         Number of sightings; fewer if there are not enough candidates.
     information
-        Information on the parameters so far, (P, P); see `precision`.
+        Information matrix of the parameters so far, (P, P); see `precision`.
     form
-        Form of the squared beam error, (P, P); see `error_form`.
+        Quadratic form of the squared beam error, (P, P); see `error_form`.
     criterion
         "d": largest determinant of the information; "v": smallest expected squared
         beam error.
     exchange
-        Improve the greedy choice by exchanging one sighting at a time.
+        Whether to improve the greedy choice by exchanging one sighting at a time.
     gap
-        Least time between two sightings, s; at 0 their times only differ.
+        Minimum time between two sightings, s; at 0 the times need only differ.
 
     Raises
     ------
     InputError
-        If there is no candidate, the count is below 1 or the criterion is unknown.
+        If there are no candidates, the count is below 1 or the criterion is unknown.
 
     Notes
     -----
-    The growth of log det is submodular, so the greedy choice reaches at least 63 % of the
-    largest one (Nemhauser et al. 1978); with exchange the tests find 98 % or more.
+    The increase in log det is submodular, so the greedy choice reaches at least 63 % of the largest
+    possible increase (Nemhauser et al. 1978); with exchange the tests find 98 % or more.
     """
     if criterion not in ("d", "v"):
         raise InputError(f"criterion {criterion!r}: give d (determinant) or v (beam variance)")

@@ -1,4 +1,4 @@
-"""Cost and yield of a receiver visit: mirrors measured where they shine."""
+"""Cost and accuracy of a receiver visit: heliostats measured while they track the receiver."""
 
 from dataclasses import dataclass
 
@@ -32,19 +32,19 @@ _ENDS = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
 
 @dataclass(frozen=True)
 class ReceiverTerms:
-    """Visits of mirrors that track a receiver, told apart by coded movements.
+    """Visits of heliostats that track a receiver, distinguished by coded movements.
 
     Attributes
     ----------
     settings
-        Of the plant file.
+        Receiver-visit settings from the plant file.
     face
-        The face of the receiver.
+        Surface of the receiver.
     sigma
-        Standard deviation of a beam in each direction by all photographs of a stack, rad; measured
-        in the simulated plant: 0.32 mrad RMS in both directions together.
+        Standard deviation of a beam position from all photographs of a stack, per direction, rad;
+        measured in the simulated plant: 0.32 mrad RMS in both directions together.
     pace
-        Time of a visit as a share of that of the simulated plant.
+        Duration of a visit as a fraction of that in the simulated plant.
     """
 
     settings: ReceiverSettings
@@ -59,14 +59,14 @@ class ReceiverTerms:
 
     @classmethod
     def of(cls, plant: Plant, sigma: float) -> "ReceiverTerms | None":
-        """Return the receiver visits of a plant; None if its file names none.
+        """Return the receiver-visit terms of a plant; None if its file defines none.
 
         Parameters
         ----------
         plant
             The plant.
         sigma
-            Standard deviation of a beam beside that of its centroid, rad.
+            Standard deviation of a beam excluding that of its centroid, rad.
         """
         settings = plant.receiver_visits
         if settings is None:
@@ -76,27 +76,28 @@ class ReceiverTerms:
 
     @property
     def known(self) -> float:
-        """Largest expected beam error, at the sun of the visit, of a mirror that goes, rad RMS."""
+        """Largest expected beam error of a participant, at the visit's sun position, rad RMS."""
         known, again = self.settings.known, 2.0 * self.settings.visit**2
         return float(np.sqrt(max(0.0, min((_SURE * known) ** 2, known**2 - again))))
 
     def at_once(self, shining: int) -> int:
-        """Return how many mirrors may move at once of those that shine on the receiver."""
+        """Return how many of the heliostats on the receiver may move at once."""
         cost = _COST * self.settings.movement**2
         return min(self.settings.most, int(self.settings.power * shining / cost))
 
     def photographs(self, mirrors: int) -> int:
-        """Return the photographs of a visit: each mirror has a code of its own for each axis."""
+        """Return the number of photographs in a visit: each heliostat has its own code per axis."""
         return max(_FEWEST, 1 << (2 * mirrors).bit_length())
 
     def span(self, mirrors: int, shining: int) -> float:
-        """Return the time of a visit, s, until all have the parameters that it gave.
+        """Return the time of a visit, s, until all heliostats have the parameters that it produced.
 
         Parameters
         ----------
         mirrors, shining
-            Mirrors that take part, and those that shine on the receiver: as the plant does it, a
-            share of them is away for new parameters at a time, and at least one.
+            Number of heliostats that take part, and of those on the receiver. As in the plant, only
+            a fraction of the latter, but at least one heliostat, is away for new parameters at a
+            time.
         """
         settings = self.settings
         step = settings.settle + settings.exposures * _PHOTOGRAPH
@@ -104,12 +105,12 @@ class ReceiverTerms:
         return self.pace * (_BESIDE + step * self.photographs(mirrors) + _AWAY * turns)
 
     def shining(self, position: FloatArray, aim: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return the mask of mirrors that stay on the receiver with every movement, (N,).
+        """Return the mask of heliostats that stay on the receiver throughout their movements, (N,).
 
         Parameters
         ----------
         position, aim
-            Feet of the heliostats, and their aims in operation, ENU, m, (N, 3).
+            Heliostat positions and their aims in operation, ENU, m, (N, 3).
         """
         path = aim - position
         size = self.settings.movement * np.linalg.norm(path, axis=1)

@@ -1,4 +1,4 @@
-"""Plans as tables, JSON documents and pictures."""
+"""Plans as tables, JSON documents and plots."""
 
 import csv
 import io

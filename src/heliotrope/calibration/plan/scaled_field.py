@@ -1,7 +1,7 @@
-"""The knowledge of all heliostats of a plan, and what a target would reveal of them at one sun.
+"""Knowledge of all heliostats in a plan, and what a target visit would add at one sun position.
 
-Heliostats are numbered through all fleets. Parameters are scaled by their present knowledge, so
-that metres and radians weigh alike, and padded to the largest model.
+Heliostats are numbered consecutively over all fleets. Parameters are scaled by their present
+standard deviations, so that metres and radians have equal weight, and padded to the largest model.
 """
 
 from collections.abc import Sequence

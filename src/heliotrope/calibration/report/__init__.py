@@ -1,8 +1,8 @@
-"""Reports a calibration: one page with its pictures, and files for other programs.
+"""Reports a calibration: a page with its plots, and files for other programs.
 
-A `CalibrationReport` holds the content, `write_report` writes the page and all files beside it.
-`FieldParameters` are the parameters at one moment as they stand in ``calibration.json``:
-`read_json` reads them, `Plant.with_calibration` puts them into a plant.
+A `CalibrationReport` holds the content; `write_report` writes the page and all files beside it.
+`FieldParameters` are the parameters at one moment as stored in ``calibration.json``: `read_json`
+reads them, and `Plant.with_calibration` applies them to a plant.
 """
 
 from heliotrope.calibration.report.content import CalibrationReport, HeliostatRow

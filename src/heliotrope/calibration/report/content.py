@@ -1,4 +1,4 @@
-"""Content of a calibration report: figures of every heliostat, computed once."""
+"""Content of a calibration report: the results for every heliostat, computed once."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +22,7 @@ from heliotrope.mechanism.parameters import MODELS
 
 @dataclass(frozen=True)
 class HeliostatRow:
-    """Beam errors of one heliostat, rad: before, after, and of the held-out sightings."""
+    """Beam errors of one heliostat, rad: before, after, and for the held-out sightings."""
 
     index: int
     name: str
@@ -35,7 +35,7 @@ class HeliostatRow:
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """A calibration with all that its report shows.
+    """A calibration with everything that its report shows.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class CalibrationReport:
     plant, group
         The plant, and the name of the group of these heliostats.
     assessment
-        Figures of a second learning with a part of the sightings held out, or None.
+        Results of a second learning run with part of the sightings held out, or None.
     ids
         Name of each sighting, for the list of outliers.
     left_out
@@ -54,11 +54,11 @@ class CalibrationReport:
     note
         How the held-out part was chosen.
     comparison
-        Lines on the comparison of models.
+        Lines that compare the models.
     clock
-        The common error of the clock, if it could be tested.
+        The common clock error, if it could be tested.
     notes
-        Lines on what contradicts most of the sightings.
+        Notes on contradictions that affect most of the sightings.
     """
 
     names: tuple[str, ...]
@@ -79,14 +79,14 @@ class CalibrationReport:
 
     @property
     def calibrated(self) -> Plant:
-        """The plant with what was learnt; see `FieldParameters.applied_to`."""
+        """The plant with the learnt parameters; see `FieldParameters.applied_to`."""
         return self._applied[0]
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """Lines on clock, contradictions, mirrors that do not fit, and those that were not learnt.
+        """Notes on the clock, contradictions, heliostats that do not fit or were not learnt.
 
-        What calls the result into question comes first.
+        Notes that call the result into question come first.
         """
         kept = self._applied[1]
         if self.clock is not None and self.clock.found:
@@ -107,12 +107,12 @@ class CalibrationReport:
 
     @cached_property
     def after(self) -> FloatArray:
-        """Beam errors of each sighting as predicted from the others, rad right and up, (M, 2)."""
+        """Beam error of each sighting, predicted from the others, rad right and up, (M, 2)."""
         return left_out_errors(self.learned)
 
     @cached_property
     def distance(self) -> FloatArray:
-        """From mirror to destination, m; 1 where that is at infinity, (M,)."""
+        """From mirror to destination, m; 1 if the destination is at infinity, (M,)."""
         s = self.learned.sightings
         path = s.destination - self.learned.mechanism[s.heliostat].pose(s.counts).vertex
         return np.where(s.destination_at_infinity, 1.0, np.linalg.norm(path, axis=-1))
@@ -124,7 +124,7 @@ class CalibrationReport:
 
     @property
     def aim(self) -> FloatArray:
-        """Aim point for the map of the year: the first target, or the mean destination."""
+        """Aim point for the year map: the first target, or the mean destination."""
         if len(self.targets):
             return np.asarray(self.targets[0])
         s = self.learned.sightings
@@ -132,7 +132,7 @@ class CalibrationReport:
 
     @cached_property
     def rows(self) -> tuple[HeliostatRow, ...]:
-        """Figures of the heliostats that have sightings."""
+        """Results for the heliostats that have sightings."""
         held = {h.name: h.beam for h in self.assessment.heliostats} if self.assessment else {}
         size = np.linalg.norm(self.after, axis=-1)
         nothing = summarise(np.empty(0))
@@ -153,7 +153,7 @@ class CalibrationReport:
         return tuple(rows)
 
     def blind_spots(self, i: int) -> tuple[BlindSpot, ...]:
-        """Return the combinations of parameters that heliostat ``i``'s sightings do not show."""
+        """Return the parameter combinations that heliostat ``i``'s sightings leave undetermined."""
         r, count = self.results, len(self.learned.model)
         line = self.aim - self.learned.mechanism.position[i]
         covariance = r.covariance[i][:count, :count]
@@ -163,8 +163,8 @@ class CalibrationReport:
     def guo(self) -> dict[str, dict[str, float]] | None:
         """Guo's six parameters of each heliostat with sightings, degrees; None for other models.
 
-        They are those of the whole machine, in the ranges of `regularise`; what only drifts
-        (`canting_secondary`) is not among them.
+        They describe the complete mechanism, in the ranges of `regularise`; parameters that only
+        drift (`canting_secondary`) are not included.
         """
         r = self.results
         if not set(r.model) <= set(MODELS["guo6"]) or not r.learnt.any():
@@ -185,7 +185,7 @@ class CalibrationReport:
         }
 
     def document(self) -> dict[str, Any]:
-        """Return the figures for JSON."""
+        """Return the results for JSON."""
         results = self.results
         tested = {h.name: h for h in self.assessment.heliostats} if self.assessment else {}
         heliostats = {

@@ -1,4 +1,4 @@
-"""Writes the report of a calibration: one page with its pictures, and files beside it."""
+"""Writes a calibration report: one page with its plots, and files beside it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,9 +20,9 @@ MOST_SECTIONS = 60
 
 
 def write_parameters(report: CalibrationReport, path: Path) -> None:
-    """Write the parameters with their standard deviations as CSV, one row for each heliostat.
+    """Write the parameters and their standard deviations as CSV, one record per heliostat.
 
-    Columns carry the unit: ``tilt_north_rad``, ``tilt_north_sigma_rad``.
+    Column names carry the unit: ``tilt_north_rad``, ``tilt_north_sigma_rad``.
     """
     r, c = report.results, report.learned.static
     header = ["name", "sightings", "outcome", "noise_scale"]
@@ -50,7 +50,7 @@ def write_report(
 ) -> Path:
     """Write the page and the files beside it; returns the path of the page.
 
-    ``index.html`` (with all pictures in it), ``parameters.csv``, ``calibration.json``,
+    ``index.html`` (with all plots embedded), ``parameters.csv``, ``calibration.json``,
     ``calibration.parquet``, and ``plant.toml`` with the calibrated heliostats.
 
     Parameters
@@ -60,9 +60,9 @@ def write_report(
     folder
         Created if it does not exist.
     progress
-        Called with (done, all) after each picture.
+        Called with the numbers of plots (done, total) after each plot.
     most
-        Largest number of heliostats with pictures of their own: those with the largest errors.
+        Maximum number of heliostats with their own plots: those with the largest errors.
     """
     folder.mkdir(parents=True, exist_ok=True)
     learned, r = report.learned, report.results

@@ -1,4 +1,4 @@
-"""Pictures of a calibration: the field, all heliostats, and one heliostat in full."""
+"""Plots of a calibration: the field, all heliostats, and one heliostat in detail."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,8 +1,8 @@
-"""Results of a calibration in files: a JSON with everything, a Parquet table, a plant file.
+"""Calibration results as files: a complete JSON file, a Parquet table, a plant file.
 
-The JSON holds for each heliostat its parameters with their covariance at one moment, its regimes,
-steps and outliers, and the hyperparameters of the field. The Parquet table has one row for each
-heliostat. The plant is the given one with the calibrated parameters.
+For each heliostat the JSON file contains the parameters with their covariance at one moment,
+regimes, steps and outliers; it also contains the hyperparameters of the field. The Parquet table
+has one record per heliostat. The plant file is the given plant with the calibrated parameters.
 """
 
 import json
@@ -40,9 +40,9 @@ class FieldParameters:
     Attributes
     ----------
     model
-        The constant parameters.
+        Names of the constant parameters.
     names
-        The P parameters, including those that only drift.
+        Names of the P parameters, including those that only drift.
     heliostats
         Names, (N,).
     time
@@ -50,15 +50,15 @@ class FieldParameters:
     values, covariance
         Deviations (N, P) and their covariance (N, P, P), rad, m or 1.
     noise
-        Noise of a sighting, in units of its sigma, (N,).
+        Noise of a sighting, in units of the sighting's sigma, (N,).
     used
         Number of sightings used, (N,).
     learnt
-        Whether the heliostat's own sightings gave its parameters, (N,). The others have the
-        part that the field shares.
+        Whether the parameters come from the heliostat's own sightings, (N,). All other heliostats
+        get only the part that the field shares.
     shared
-        Whether enough heliostats support a part of a parameter that the field shares, (P,); where
-        not, a heliostat that was not learnt has 0.
+        Whether enough heliostats support the shared part of a parameter, (P,); where not, the value
+        is 0 for a heliostat that was not learnt.
     """
 
     model: tuple[str, ...]
@@ -81,10 +81,10 @@ class FieldParameters:
         )
 
     def applied_to(self, plant: Plant) -> tuple[Plant, tuple[str, ...]]:
-        """Return the plant with these parameters, and lines on the heliostats that were not learnt.
+        """Return the plant with these parameters, and notes on the heliostats that were not learnt.
 
-        They keep their own parameters. One that has none gets the part that the field shares,
-        where enough heliostats support it.
+        Heliostats that were not learnt keep their own parameters. If a heliostat has none, it gets
+        the part that the field shares, where enough heliostats support it.
         """
         own = np.zeros(len(self.heliostats), np.bool_)
         for i, name in enumerate(self.heliostats):
@@ -178,7 +178,7 @@ def write_json(
     learned
         The learnt field.
     results
-        Its parameters at one moment.
+        Parameters of the field at one moment.
     ids
         Names of the M sightings, for the list of outliers.
     """
@@ -248,12 +248,12 @@ def _moment(seconds: float) -> str | None:
 
 
 def read_json(path: str | Path) -> FieldParameters:
-    """Return the parameters of a file that `write_json` wrote, of the heliostats learnt.
+    """Return the parameters of the learnt heliostats from a file written by `write_json`.
 
     Raises
     ------
     FormatError
-        If it is not such a file; the text says what is wrong and where.
+        If it is not such a file; the message says what is wrong and where.
     """
     root = _json.read_json(path, "a calibration")
     if not root.has("kind") or root["kind"].text() != KIND:
@@ -306,7 +306,7 @@ def _seconds(node: _json.JsonNode) -> float:
 
 
 def write_parquet(path: Path, mechanism_units: dict[str, str], results: FieldParameters) -> None:
-    """Write one row for each heliostat: parameters and standard deviations with their unit."""
+    """Write one record per heliostat: parameters and standard deviations with their units."""
     import pandas as pd
 
     columns: dict[str, Any] = {"name": results.heliostats, "sightings": results.used}
@@ -324,30 +324,31 @@ def write_parquet(path: Path, mechanism_units: dict[str, str], results: FieldPar
 def write_paint(
     folder: str | Path, plant: Plant, learned: Learned, time: float | None = None
 ) -> dict[str, tuple[str, ...]]:
-    """Write what was learnt as heliostat properties in PAINT's form.
+    """Write the learnt parameters as heliostat properties in PAINT's format.
 
-    ARTIST reads these, but takes joint tilts for 0: `write_artist` writes into its own form.
+    ARTIST reads these files but sets the joint tilts to 0; `write_artist` writes ARTIST's own
+    format.
 
     Parameters
     ----------
     folder
-        Gets ``properties/NAME.json`` for each heliostat learnt, and ``left-out.txt`` with the
-        parameters that have no place there.
+        Folder for ``properties/NAME.json`` of each learnt heliostat, and for ``left-out.txt`` with
+        the parameters that the format cannot hold.
     plant
-        The plant that it was learnt from.
+        The plant that the field was learnt from.
     learned
-        Of heliostats with names.
+        Learnt field whose heliostats have names.
     time
         Unix seconds; default: the time of the last sighting used.
 
     Returns
     -------
-    By heliostat, the parameters that have no place in the form, with their values.
+    By heliostat, the parameters that the format cannot hold, with their values.
 
     Raises
     ------
     InputError
-        If nothing learnt has a name, or a mechanism is not of kind ``two_jacks``.
+        If no learnt heliostat has a name, or a mechanism is not of kind ``two_jacks``.
     """
     from heliotrope.field.formats import paint
 
@@ -376,30 +377,30 @@ def write_artist(
     learned: Learned,
     time: float | None = None,
 ) -> dict[str, tuple[str, ...]]:
-    """Write a copy of a scenario of ARTIST with the learned parameters of its heliostats.
+    """Write a copy of an ARTIST scenario with the learnt parameters of its heliostats.
 
     Parameters
     ----------
     path, scenario
-        HDF5 files: the new scenario, and the one that ARTIST's generator has made.
+        HDF5 files: the new scenario, and the scenario created by ARTIST's generator.
     plant
-        The plant that it was learnt from.
+        The plant that the field was learnt from.
     learned
-        Of heliostats with names, all of them in the scenario.
+        Learnt field whose heliostats have names, all of which are in the scenario.
     time
         Unix seconds; default: the time of the last sighting used.
 
     Returns
     -------
-    By heliostat, the parameters that have no place in the form, with their values.
+    By heliostat, the parameters that the format cannot hold, with their values.
 
     Raises
     ------
     FormatError
-        If the scenario cannot be read, or has another layout.
+        If the scenario cannot be read, or has a different layout.
     InputError
-        If nothing learnt has a name, a mechanism is not of kind ``two_jacks``, or a heliostat is
-        not in the scenario.
+        If no learnt heliostat has a name, a mechanism is not of kind ``two_jacks``, or a heliostat
+        is not in the scenario.
     """
     from heliotrope.field.formats import artist
 
@@ -411,29 +412,29 @@ def write_artist(
 def write_opencsp(
     path: str | Path, table: str | Path, plant: Plant, learned: Learned, time: float | None = None
 ) -> dict[str, tuple[str, ...]]:
-    """Write a copy of OpenCSP's table of heliostats with the positions that were learnt.
+    """Write a copy of an OpenCSP heliostat table with the learnt positions.
 
     Parameters
     ----------
     path, table
-        The new table, and the one that the plant was read from.
+        The new table, and the table from which the plant was read.
     plant
-        The plant that it was learnt from.
+        The plant that the field was learnt from.
     learned
-        Of heliostats with names, all of them in the table.
+        Learnt field whose heliostats have names, all of which are in the table.
     time
         Unix seconds; default: the time of the last sighting used.
 
     Returns
     -------
-    By heliostat, the parameters that have no place in the table: all but the position.
+    By heliostat, the parameters that the table cannot hold: all but the position.
 
     Raises
     ------
     FormatError
         If the table cannot be read.
     InputError
-        If nothing learnt has a name, or a heliostat is not in the table.
+        If no learnt heliostat has a name, or a heliostat is not in the table.
     """
     from heliotrope.field.formats import opencsp
 
@@ -447,20 +448,21 @@ def write_opencsp(
 def write_solarpilot(
     path: str | Path, layout: str | Path, plant: Plant, learned: Learned, time: float | None = None
 ) -> dict[str, tuple[str, ...]]:
-    """Write a copy of SolarPILOT's layout with the positions that were learnt.
+    """Write a copy of a SolarPILOT layout with the learnt positions.
 
-    SolarPILOT has no names: rows keep their order. The parameters are those of `write_opencsp`.
+    SolarPILOT has no names, so the order of the lines is kept. The arguments are those of
+    `write_opencsp`.
 
     Returns
     -------
-    By heliostat, the parameters that have no place in the layout: all but the position.
+    By heliostat, the parameters that the layout cannot hold: all but the position.
 
     Raises
     ------
     FormatError
         If the layout cannot be read.
     InputError
-        If nothing learnt has a name, or a heliostat is not in the layout.
+        If no learnt heliostat has a name, or a heliostat is not in the layout.
     """
     from heliotrope.field.formats import solarpilot
 

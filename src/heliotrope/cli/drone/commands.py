@@ -10,13 +10,13 @@ from heliotrope.cli.drone.rtk import rtk
 from heliotrope.cli.drone.simulate import simulate
 
 app = typer.Typer(
-    help="Measure a field with a drone, its lamp and its camera.", no_args_is_help=True
+    help="Measure a field with a drone that carries a lamp and a camera.", no_args_is_help=True
 )
 
 
 @app.callback()
 def _root() -> None:
-    """Measure a field with a drone, its lamp and its camera."""
+    """Measure a field with a drone that carries a lamp and a camera."""
 
 
 for command in (plan, evaluate, match, dome, rtk, simulate):

@@ -29,20 +29,25 @@ def dome(
     elevations: Annotated[
         str, typer.Option(help="Elevations of the rings, degrees.")
     ] = "35,50,65,80",
-    photographs: Annotated[int, typer.Option(min=1, max=10_000, help="Photographs in all.")] = 48,
+    photographs: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Total number of photographs.")
+    ] = 48,
     targets: Annotated[
-        int, typer.Option(min=1, max=10_000, help="Coded targets, laid out in a square.")
+        int, typer.Option(min=1, max=10_000, help="Number of coded targets, laid out in a square.")
     ] = 25,
-    spacing: Annotated[float, typer.Option(min=0.01, max=1000, help="Between targets, m.")] = 2.5,
+    spacing: Annotated[
+        float, typer.Option(min=0.01, max=1000, help="Distance between targets, m.")
+    ] = 2.5,
     target_mm: Annotated[
-        float, typer.Option(min=1, max=100_000, help="Side of a target's black square.")
+        float, typer.Option(min=1, max=100_000, help="Side length of a target's black square.")
     ] = 400.0,
     formats: Annotated[
         str, typer.Option(help="Formats of waypoint files: some of dji,qgc,litchi, or none.")
     ] = "dji,qgc,litchi",
     aircraft: Annotated[str, typer.Option(help="Drone for DJI's files.")] = "M3E",
     simulate: Annotated[
-        bool, typer.Option("--simulate", help="Also render the photographs, with their truth.")
+        bool,
+        typer.Option("--simulate", help="Also render the photographs, with their ground truth."),
     ] = False,
     size: Annotated[
         str, typer.Option(help="Size of a rendered photograph, WIDTHxHEIGHT, pixels.")
@@ -50,7 +55,9 @@ def dome(
     rtk_mm: Annotated[
         str, typer.Option(help="RTK error of each rendered position, E,N,U in mm.")
     ] = "6,6,8",
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all randomness.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**63 - 1, help="Seed of all random numbers.")
+    ] = 0,
 ) -> None:
     """Plan a dome flight over coded targets; `drone rtk --targets` evaluates its photographs."""
     import numpy as np

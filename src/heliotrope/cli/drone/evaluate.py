@@ -32,18 +32,22 @@ def evaluate(
     ] = None,
     reference: Annotated[
         Path | None,
-        typer.Option(help="Table (CSV) of normals by another method, to compare the result with."),
+        typer.Option(
+            help="Table (CSV) of normals from another method, to compare with the result."
+        ),
     ] = None,
     axis: Annotated[
         Literal["area", "plain"],
         typer.Option(
-            help="Optical axis: mean of the normals over the mirror's area, or over the "
-            "reflections alike (plain)."
+            help="Optical axis: mean of the normals over the mirror area, or over the "
+            "reflections with equal weights (plain)."
         ),
     ] = "area",
     matches: Annotated[
         Path | None,
-        typer.Option(help="Table (CSV) of mirrors named by hand, as `drone match` prepares it."),
+        typer.Option(
+            help="Table (CSV) of mirrors identified by hand, as prepared by `drone match`."
+        ),
     ] = None,
     focal: shared.FocalOption = None,
     survey_mm: shared.SurveyOption = 10.0,
@@ -51,7 +55,7 @@ def evaluate(
     rtk_mm: shared.RtkOption = 30.0,
     out: shared.OutOption = Path("out/drone"),
     report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Write the page with its pictures.")
+        bool, typer.Option("--report/--no-report", help="Write the page with its plots.")
     ] = True,
     processes: shared.ProcessesOption = 0,
     scheduler: calibration.SchedulerOption = None,

@@ -14,7 +14,9 @@ def match(
     field: shared.FieldOption,
     photo: Annotated[
         list[str] | None,
-        typer.Option(help="A photograph, NAME or FLIGHT/NAME; default: all not identified."),
+        typer.Option(
+            help="A photograph, NAME or FLIGHT/NAME; default: all that are not identified."
+        ),
     ] = None,
     camera: shared.CameraOption = None,
     commands: shared.CommandsOption = None,

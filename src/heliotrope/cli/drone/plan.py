@@ -27,7 +27,7 @@ def plan(
     field: Annotated[Path, typer.Argument(metavar="PLANT", help="Plant file or PAINT folder.")],
     into: Annotated[Path, typer.Option(help="Folder for the plan.")] = Path("flight"),
     points: Annotated[
-        int, typer.Option(min=1, max=1000, help="Calibration points of each heliostat.")
+        int, typer.Option(min=1, max=1000, help="Calibration points per heliostat.")
     ] = 20,
     model: Annotated[
         str, typer.Option(help="auto, or jacks, malan8, guo6, khalsa8, full.")
@@ -44,7 +44,9 @@ def plan(
     spread_deg: Annotated[
         float,
         typer.Option(
-            min=0.1, max=180, help="Largest angle of an optical axis from its cluster's mean."
+            min=0.1,
+            max=180,
+            help="Largest angle between an optical axis and the mean of its cluster.",
         ),
     ] = 25.0,
     view_deg: Annotated[
@@ -56,41 +58,47 @@ def plan(
         typer.Option(min=0, max=1000, help="Pointing error of mirrors that patterns must cover."),
     ] = 5.0,
     samples: Annotated[
-        float, typer.Option(min=1, max=1e6, help="Reflections on each facet.")
+        float, typer.Option(min=1, max=1e6, help="Number of reflections per facet.")
     ] = 9.0,
     facet_focal: Annotated[
         float | None,
         typer.Option(min=1, max=100_000, help="Focal length of the facets, m; default: flat."),
     ] = None,
     least_spacing: Annotated[
-        float, typer.Option(min=0.01, max=1000, help="Least distance of hover points, m.")
+        float, typer.Option(min=0.01, max=1000, help="Minimum distance between hover points, m.")
     ] = 0.6,
     led: Annotated[
-        str, typer.Option(help="Lamp from the camera: right,down,forward in m.")
+        str, typer.Option(help="Lamp position relative to the camera: right,down,forward in m.")
     ] = "0,0,0",
     sigma_mrad: Annotated[
         float,
         typer.Option(
-            min=0.001, max=1000, help="Standard deviation that all reflections of a mirror share."
+            min=0.001, max=1000, help="Standard deviation common to all reflections of a mirror."
         ),
     ] = 0.2,
     scatter_mrad: Annotated[
         float,
         typer.Option(
-            min=0.001, max=1000, help="Standard deviation of the normal that one reflection shows."
+            min=0.001, max=1000, help="Standard deviation of the normal measured by one reflection."
         ),
     ] = 0.8,
     focal_px: Annotated[
         float, typer.Option(min=1, max=1e6, help="Focal length of the camera, pixels.")
     ] = 3000.0,
     elevations: Annotated[
-        str, typer.Option(help="Lowest,highest elevation of the drone from the mirrors, degrees.")
+        str,
+        typer.Option(
+            help="Minimum,maximum elevation of the drone as seen from the mirrors, degrees."
+        ),
     ] = "20,85",
     airspace: Annotated[
         Path | None, typer.Option(help="JSON with keep-outs, fence, heights, home.")
     ] = None,
     tower: Annotated[
-        bool, typer.Option("--tower/--no-tower", help="Keep away from receivers and targets.")
+        bool,
+        typer.Option(
+            "--tower/--no-tower", help="Keep out of the volumes around receivers and targets."
+        ),
     ] = True,
     min_height: Annotated[
         float, typer.Option(min=0, max=10_000, help="Lower limit above ground, m.")
@@ -98,19 +106,25 @@ def plan(
     max_height: Annotated[
         float, typer.Option(min=0, max=10_000, help="Upper limit above ground, m.")
     ] = 120.0,
-    home: Annotated[str | None, typer.Option(help="Take-off: east,north,up in m.")] = None,
+    home: Annotated[str | None, typer.Option(help="Take-off place: east,north,up in m.")] = None,
     drones: Annotated[int, typer.Option(min=1, max=50, help="Drones flying at the same time.")] = 1,
-    speed: Annotated[float, typer.Option(min=0.01, max=15, help="Between stations, m/s.")] = 8.0,
+    speed: Annotated[
+        float, typer.Option(min=0.01, max=15, help="Speed between stations, m/s.")
+    ] = 8.0,
     photo: Annotated[
         str, typer.Option(help="Time to come to rest and take a photograph.")
     ] = "2.5s",
     endurance: Annotated[str, typer.Option(help="Flying time on one battery.")] = "25min",
     change: Annotated[str, typer.Option(help="Time to change the battery.")] = "5min",
-    hours_a_day: Annotated[float, typer.Option(min=0.01, max=24, help="Flying hours a day.")] = 8.0,
+    hours_a_day: Annotated[
+        float, typer.Option(min=0.01, max=24, help="Flying hours per day.")
+    ] = 8.0,
     target_minutes: Annotated[
         float,
         typer.Option(
-            min=0.001, max=1e6, help="Camera and target, for comparison: time between photographs."
+            min=0.001,
+            max=1e6,
+            help="For comparison with camera and target: time between photographs.",
         ),
     ] = 2.0,
     formats: Annotated[

@@ -27,7 +27,7 @@ def rtk(
     targets: Annotated[
         bool,
         typer.Option(
-            "--targets", help="By coded targets (`drone dome`) instead of mirrors; no commands."
+            "--targets", help="Use coded targets (`drone dome`) instead of mirrors; no commands."
         ),
     ] = False,
     survey_mm: shared.SurveyOption = 10.0,

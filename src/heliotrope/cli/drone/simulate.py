@@ -24,19 +24,24 @@ def simulate(
     folder: Annotated[Path, typer.Argument(help="Folder for the photographs.")],
     group: Annotated[str, typer.Option(help="Group of heliostats; default: the first.")] = "",
     heliostats: Annotated[
-        int, typer.Option(min=1, max=1_000_000, help="Number of heliostats, nearest to the middle.")
+        int,
+        typer.Option(
+            min=1, max=1_000_000, help="Number of heliostats, those nearest to the middle."
+        ),
     ] = 80,
     hover: Annotated[
         str,
         typer.Option(help="Middle of the pattern, E,N,U in m; default: on the side of the tower."),
     ] = "",
     distance: Annotated[
-        float, typer.Option(min=5, max=10_000, help="From the mirrors, m.")
+        float, typer.Option(min=5, max=10_000, help="Distance from the mirrors, m.")
     ] = 100.0,
-    columns: Annotated[int, typer.Option(min=1, max=1000, help="Columns of the pattern.")] = 6,
-    rows: Annotated[int, typer.Option(min=1, max=1000, help="Rows of the pattern.")] = 6,
+    columns: Annotated[
+        int, typer.Option(min=1, max=1000, help="Number of columns in the pattern.")
+    ] = 6,
+    rows: Annotated[int, typer.Option(min=1, max=1000, help="Number of rows in the pattern.")] = 6,
     step: Annotated[
-        float, typer.Option(min=0.01, max=1000, help="Between hover positions, m.")
+        float, typer.Option(min=0.01, max=1000, help="Distance between hover positions, m.")
     ] = 0.5,
     size: Annotated[
         str, typer.Option(help="Size of a photograph, WIDTHxHEIGHT, pixels.")
@@ -51,7 +56,7 @@ def simulate(
     rtk_mm: Annotated[
         float, typer.Option(min=0, max=100_000, help="RTK error of each position.")
     ] = 8.0,
-    offset_mm: Annotated[str, typer.Option(help="RTK's common offset, E,N,U.")] = "0,0,0",
+    offset_mm: Annotated[str, typer.Option(help="Common RTK offset, E,N,U.")] = "0,0,0",
     survey_mm: Annotated[
         float, typer.Option(min=0, max=100_000, help="Survey error of the heliostats' positions.")
     ] = 10.0,
@@ -59,7 +64,7 @@ def simulate(
         float, typer.Option(min=0, max=100_000, help="Error of vertices from the kinematic model.")
     ] = 30.0,
     canting_mrad: Annotated[
-        float, typer.Option(min=0, max=100, help="Canting error of facets, each of two directions.")
+        float, typer.Option(min=0, max=100, help="Canting error of facets, per direction.")
     ] = 0.3,
     map_mrad: Annotated[
         float, typer.Option(min=0, max=100, help="Error of the slope maps that are written (RMS).")
@@ -67,29 +72,33 @@ def simulate(
     lens_px: Annotated[
         float,
         typer.Option(
-            min=-1000, max=1000, help="Error of the camera file at the corner of the frame, pixels."
+            min=-1000,
+            max=1000,
+            help="Effect of errors in the camera file at the corner of the frame, pixels.",
         ),
     ] = 0.5,
     gimbal_deg: Annotated[
-        float, typer.Option(min=0, max=90, help="Error of the gimbal's angles, wobble included.")
+        float, typer.Option(min=0, max=90, help="Error of the gimbal angles, including wobble.")
     ] = 0.5,
     hover_mm: Annotated[
         float, typer.Option(min=0, max=100_000, help="Deviation of the drone from its pattern.")
     ] = 100.0,
     speed: Annotated[
-        float, typer.Option(min=0, max=100, help="Speed while photographing, m/s; 0: it hovers.")
+        float, typer.Option(min=0, max=100, help="Speed while photographing, m/s; 0: hover.")
     ] = 1.0,
     exposure_ms: Annotated[
-        float, typer.Option(min=0, max=10_000, help="Exposure of a photograph.")
+        float, typer.Option(min=0, max=10_000, help="Exposure time of a photograph.")
     ] = 1.0,
     clouds: Annotated[
-        float, typer.Option(min=0, max=1, help="Relative variation of the sky's light by clouds.")
+        float,
+        typer.Option(min=0, max=1, help="Relative variation of the sky's light due to clouds."),
     ] = 0.1,
     plan: Annotated[
         Path | None,
         typer.Option(
-            help="plan.json of a campaign: each pattern is flown into a folder of its own; "
-            "--hover, --distance, --columns, --rows, --step, --heliostats are ignored."
+            help="plan.json of a campaign: each pattern is flown into a separate folder; "
+            "--hover, --distance, --columns, --rows, --step, --heliostats are "
+            "ignored."
         ),
     ] = None,
     stations: Annotated[
@@ -101,9 +110,12 @@ def simulate(
     ] = None,
     night: Annotated[bool, typer.Option("--night", help="By moonlight.")] = False,
     dark: Annotated[
-        bool, typer.Option("--dark", help="Without moon: only the lamp is seen on the mirrors.")
+        bool,
+        typer.Option("--dark", help="Moonless night: only the lamp is visible in the mirrors."),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all randomness.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**63 - 1, help="Seed of all random numbers.")
+    ] = 0,
 ) -> None:
     """Render a flight: photographs as a DJI drone writes them, commands, camera, truth."""
     import numpy as np

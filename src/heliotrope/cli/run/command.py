@@ -58,7 +58,7 @@ def run(
         typer.Option(
             min=1,
             max=1_000_000,
-            help="Number in the default plant, instead of 10,000.",
+            help="Number of heliostats in the default plant, instead of 10,000.",
             rich_help_panel=_TWIN,
         ),
     ] = None,
@@ -79,8 +79,8 @@ def run(
     start: Annotated[
         str,
         typer.Option(
-            help="Simulated start: a day (its morning at the site), ISO 8601 with a time zone, "
-            '"now", or "morning" (of today).',
+            help="Simulated start: a day (its morning at the site), ISO 8601 with a time "
+            'zone, "now", or "morning" (of today).',
             rich_help_panel=_TWIN,
         ),
     ] = "morning",
@@ -89,7 +89,7 @@ def run(
         typer.Option(
             min=0,
             max=2**63 - 1,
-            help="Seed of how the mirrors really stand.",
+            help="Seed of the true installation errors.",
             rich_help_panel=_TWIN,
         ),
     ] = 0,
@@ -97,8 +97,9 @@ def run(
         Begin,
         typer.Option(
             "--from",
-            help="second-day: the field tracks, and a part of it was measured yesterday; new: "
-            "nobody has measured it; stow: as second-day, in the morning at stow.",
+            help="second-day: the field tracks, and part of it was measured the day "
+            "before; new: no heliostat has been measured; stow: as second-day, but in "
+            "the morning at stow.",
             rich_help_panel=_TWIN,
         ),
     ] = Begin.SECOND_DAY,
@@ -113,12 +114,13 @@ def run(
         bool,
         typer.Option(
             "--configure",
-            help="Write calibration and machine table to local controllers that hold others.",
+            help="Write calibration and machine table to local controllers whose stored "
+            "values differ.",
             rich_help_panel=_REAL,
         ),
     ] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Only read the files.", rich_help_panel=_REAL)
+        bool, typer.Option("--check", help="Only check the files.", rich_help_panel=_REAL)
     ] = False,
     idle: Annotated[
         bool | None,
@@ -134,14 +136,14 @@ def run(
         typer.Option(
             min=0.001,
             max=1e6,
-            help="Time after which to end; default: at Ctrl-C.",
+            help="Time after which to stop; default: run until Ctrl-C.",
             rich_help_panel=_WORK,
         ),
     ] = None,
     every: Annotated[
         float,
         typer.Option(
-            min=0.1, max=86_400, help="Seconds between printed lines.", rich_help_panel=_WORK
+            min=0.1, max=86_400, help="Interval between printed lines, s.", rich_help_panel=_WORK
         ),
     ] = 10.0,
     stow_rate: Annotated[
@@ -149,61 +151,62 @@ def run(
         typer.Option(
             min=0,
             max=1e6,
-            help="Heliostats a second that an ordinary STOW of many sends to stow; 0: all at once. "
-            "Emergencies always send all at once.",
+            help="Heliostats per second that an ordinary STOW of many sends to stow; 0: "
+            "all at once. Emergencies always send all at once.",
             rich_help_panel=_WORK,
         ),
     ] = 200.0,
     host: Annotated[
         str,
         typer.Option(
-            help="Address to listen at; TLS is required unless it is this machine's own.",
+            help="Address to listen on; TLS is required unless it is local to this computer.",
             rich_help_panel=_CONSOLE,
         ),
     ] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(min=0, max=65_535, help="0: a free one.", rich_help_panel=_CONSOLE)
+        int,
+        typer.Option(min=0, max=65_535, help="Port; 0: any free port.", rich_help_panel=_CONSOLE),
     ] = 8080,
     name: Annotated[
         list[str] | None,
         typer.Option(
-            help="Name by which browsers reach this machine; may be repeated.",
+            help="Host name by which browsers reach this computer; may be repeated.",
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
     certificate: Annotated[
-        Path | None, typer.Option(help="PEM file: TLS.", rich_help_panel=_CONSOLE)
+        Path | None, typer.Option(help="PEM file of the TLS certificate.", rich_help_panel=_CONSOLE)
     ] = None,
     key: Annotated[
         Path | None,
-        typer.Option(help="PEM file of the certificate's key.", rich_help_panel=_CONSOLE),
+        typer.Option(help="PEM file of the certificate's private key.", rich_help_panel=_CONSOLE),
     ] = None,
     plain: Annotated[
         bool,
         typer.Option(
             "--plain",
-            help="Without TLS all the same: behind a proxy that has it.",
+            help="Allow operation without TLS, behind a proxy that provides it.",
             rich_help_panel=_CONSOLE,
         ),
     ] = False,
     proxy: Annotated[
         list[str] | None,
         typer.Option(
-            help="IP address of a trusted proxy, which names the callers; may be repeated.",
+            help="IP address of a trusted proxy, which identifies the callers; may be repeated.",
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
     people_by_proxy: Annotated[
         Path | None,
         typer.Option(
-            help="File that says how --proxy names people whom it has signed in.",
+            help="File that defines how --proxy names users whom it has signed in.",
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
     second_factor: Annotated[
         str,
         typer.Option(
-            help="Role from which on people need a second factor: viewer, operator or engineer.",
+            help="Lowest role for which a second factor is required: viewer, operator or engineer.",
             rich_help_panel=_CONSOLE,
         ),
     ] = "",
@@ -212,7 +215,7 @@ def run(
         typer.Option(
             min=0.0,
             max=600.0,
-            help="Minutes without an order after which a page's next one needs the password again; "
+            help="Minutes without an order after which a page asks for the password again; "
             "0: never.",
             rich_help_panel=_CONSOLE,
         ),
@@ -220,7 +223,7 @@ def run(
     notice: Annotated[
         Path | None,
         typer.Option(
-            help="File with a text for everybody who is about to sign in.",
+            help="File with a text shown before sign-in.",
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
@@ -229,7 +232,7 @@ def run(
         typer.Option(
             min=0,
             max=65_535,
-            help="Port that serves EMERGENCY alone; default: the one after --port.",
+            help="Port for EMERGENCY alone; default: the one after --port.",
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
@@ -237,12 +240,12 @@ def run(
         bool, typer.Option("--no-console", help="Only print lines.", rich_help_panel=_CONSOLE)
     ] = False,
     no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Open no browser.", rich_help_panel=_CONSOLE)
+        bool, typer.Option("--no-browser", help="Do not open a browser.", rich_help_panel=_CONSOLE)
     ] = False,
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for all records; default: nothing outlasts the run.",
+            help="Folder for all records; default: nothing is kept after the run.",
             rich_help_panel=_KEPT,
         ),
     ] = None,
@@ -256,21 +259,22 @@ def run(
     syslog: Annotated[
         str | None,
         typer.Option(
-            help="Send security events and alarms on: tls://host, tcp://host or udp://host.",
+            help="Forward security events and alarms to: tls://host, tcp://host or udp://host.",
             rich_help_panel=_KEPT,
         ),
     ] = None,
     syslog_authority: Annotated[
         Path | None,
         typer.Option(
-            help="PEM file of the authority of that host; default: the system's.",
+            help="PEM file of the certificate authority for that host; default: the system's.",
             rich_help_panel=_KEPT,
         ),
     ] = None,
     heads: Annotated[
         Path | None,
         typer.Option(
-            help="Folder, best of another machine, for the heads of the records' hash chains.",
+            help="Folder, preferably on another computer, for the heads of the records' "
+            "hash chains.",
             rich_help_panel=_KEPT,
         ),
     ] = None,
@@ -279,7 +283,7 @@ def run(
         typer.Option(
             min=0.001,
             max=8760,
-            help="Hours between heads, in that folder and to syslog.",
+            help="Interval at which heads are written to that folder and to syslog, hours.",
             rich_help_panel=_KEPT,
         ),
     ] = 1.0,
@@ -288,15 +292,18 @@ def run(
         typer.Option(
             min=1,
             max=36_500,
-            help="Days for which photographs of calibrations are kept: all for 30 of them, then "
-            "one a day of each heliostat.",
+            help="Days for which calibration photographs are kept: all of them for 30 "
+            "days, then one per day and heliostat.",
             rich_help_panel=_KEPT,
         ),
     ] = 400.0,
     photographs_gb: Annotated[
         float,
         typer.Option(
-            min=0.001, max=1e6, help="Size of all kept photographs, GB.", rich_help_panel=_KEPT
+            min=0.001,
+            max=1e6,
+            help="Maximum size of all kept photographs, GB.",
+            rich_help_panel=_KEPT,
         ),
     ] = 4.0,
 ) -> None:

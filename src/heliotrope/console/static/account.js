@@ -1,10 +1,13 @@
 // The page of one's own account, which does without the frame: who owes something sees only this one.
 (() => {
+  let t = (text) => text; // English until the catalogue is there
+  const words = import("./words.js").then((found) => { t = found.t; }).catch(() => {});
+  const word = (text) => text;
   const find = (id) => document.getElementById(id);
   const csrf = document.querySelector('meta[name="heliotrope-csrf"]').content;
   const DUE = {
-    password: "Somebody else knows this password. Change it before you go on.",
-    factor: "Your role needs a second factor. Set it up before you go on.",
+    password: word("Somebody else knows this password. Change it before you go on."),
+    factor: word("Your role needs a second factor. Set it up before you go on."),
   };
 
   async function api(method, path, body) {
@@ -15,7 +18,7 @@
       headers["Content-Type"] = "application/json";
     }
     const answer = await fetch(`/api/v1/${path}`, options);
-    if (answer.status === 401) { location.assign("/login"); throw new Error("signed out"); }
+    if (answer.status === 401) { location.assign("/login"); throw new Error(t("signed out")); }
     const data = answer.status === 204 ? null : await answer.json();
     if (!answer.ok) throw new Error(typeof data.detail === "string" ? data.detail : data.detail.map((one) => one.msg).join("; "));
     return data;
@@ -32,7 +35,7 @@
   }
 
   on("password", async (given) => {
-    if (given.new !== given.again) throw new Error("the two new passwords differ; nothing was changed");
+    if (given.new !== given.again) throw new Error(t("the two new passwords differ; nothing was changed"));
     await api("PUT", "session/password", { old: given.old ?? "", new: given.new });
     location.assign("/login");
   });
@@ -61,12 +64,12 @@
 
   async function look() {
     const who = await api("GET", "session");
-    find("due").textContent = DUE[who.owes] ?? "";
+    find("due").textContent = who.owes in DUE ? t(DUE[who.owes]) : "";
     find("password").hidden = who.owes === "factor";
     find("old").hidden = find("password").elements.old.disabled = who.no_password;
     find("factor").hidden = who.owes === "password";
     find("begin").hidden = who.factor;
     find("remove").hidden = !who.factor;
   }
-  look().catch(() => {});
+  words.then(look).catch(() => {});
 })();

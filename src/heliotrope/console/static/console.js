@@ -9,22 +9,23 @@ import * as people from "./people.js";
 import { act, bar, say, whoCommands } from "./orders.js";
 import { ask, count, h } from "./dom.js";
 import { alertText, headOf } from "./showing.js";
+import { t } from "./words.js";
 
 function map(box) {
-  const view = h("select", { title: "Colour by (V)", ariaLabel: "Colour by", onchange: () => store.emit("view", view.value) },
+  const view = h("select", { title: t("Colour by (V)"), ariaLabel: t("Colour by"), onchange: () => store.emit("view", view.value) },
     Object.entries(VIEWS).map(([name, { title }]) => h("option", { value: name }, title)));
-  const title = (name) => name[0].toUpperCase() + name.slice(1);
-  const mode = h("select", { title: "What a drag or a click on the map does; Shift and drag draws in every mode", ariaLabel: "Select by", onchange: () => store.emit("mode", mode.value) },
-    h("option", { value: "pan" }, "Move the map"), h("optgroup", { label: "Select by a drag" }, SHAPES.map((name) => h("option", { value: name }, title(name)))),
-    h("optgroup", { label: "Select by a click" }, CLICKS.map((name) => h("option", { value: name }, title(name)))));
-  const all = h("button", { className: "hx-button", title: "Show the whole field (0)", onclick: () => store.emit("fit") }, "Whole");
-  const none = h("button", { className: "hx-button", title: "Clear (Escape)", onclick: () => store.select([], -1) }, "Clear");
-  const query = h("input", { type: "search", className: "hx-query", spellcheck: false, "aria-label": "Query",
-    placeholder: "P0097A, or state = TRACKING and error > 1", title: "Names of heliostats (* for any letters), or conditions. Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Operators: = != < > <= >= ~ (pattern with *). Press / to type here." });
-  const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(rows.length === 1 ? `${store.field.names[rows[0]]} is selected` : `${count(rows.length)} heliostats match`); } catch (error) { say(error.message, true); } };
+  const title = (name) => { const text = t(name); return text[0].toUpperCase() + text.slice(1); };
+  const mode = h("select", { title: t("What a drag or a click on the map does; Shift and drag draws in every mode"), ariaLabel: t("Select by"), onchange: () => store.emit("mode", mode.value) },
+    h("option", { value: "pan" }, t("Move the map")), h("optgroup", { label: t("Select by a drag") }, SHAPES.map((name) => h("option", { value: name }, title(name)))),
+    h("optgroup", { label: t("Select by a click") }, CLICKS.map((name) => h("option", { value: name }, title(name)))));
+  const all = h("button", { className: "hx-button", title: t("Show the whole field (0)"), onclick: () => store.emit("fit") }, t("Whole"));
+  const none = h("button", { className: "hx-button", title: t("Clear (Escape)"), onclick: () => store.select([], -1) }, t("Clear"));
+  const query = h("input", { type: "search", className: "hx-query", spellcheck: false, "aria-label": t("Query"),
+    placeholder: t("P0097A, or state = TRACKING and error > 1"), title: t("Names of heliostats (* for any letters), or conditions. Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Operators: = != < > <= >= ~ (pattern with *). Press / to type here.") });
+  const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(rows.length === 1 ? t("{name} is selected", { name: store.field.names[rows[0]] }) : t("{n} heliostats match", { n: count(rows.length) })); } catch (error) { say(error.message, true); } };
   query.addEventListener("keydown", (event) => { if (event.key === "Enter") run(); event.stopPropagation(); });
   const field = h("div", { className: "hx-map-field" });
-  box.append(h("div", { className: "hx-tools" }, view, mode, all, none, query, h("button", { className: "hx-button", onclick: run }, "Select")), field);
+  box.append(h("div", { className: "hx-tools" }, view, mode, all, none, query, h("button", { className: "hx-button", onclick: run }, t("Select"))), field);
   store.on("mode", (now) => { mode.value = now; });
   document.addEventListener("keydown", (event) => {
     if (event.key === "/" && !/INPUT|SELECT|TEXTAREA/.test(document.activeElement?.tagName)) { event.preventDefault(); query.focus(); }
@@ -33,7 +34,7 @@ function map(box) {
 }
 
 function badge(box) {
-  store.on("frame", (now) => { box.textContent = now.alarms ? String(now.alarms) : ""; });
+  store.on("frame", (now) => { box.textContent = now.alarms ? count(now.alarms) : ""; });
 }
 
 function alert(box) {
@@ -42,17 +43,17 @@ function alert(box) {
     // Each person withdraws their own order; an engineer withdraws another's by the owner's name.
     const { calls } = store.head.order, owners = calls.map((call) => call.who), own = !calls.length || owners.includes(me.name);
     const by = (call) => `${call.who}: ${call.reason}`;
-    const whose = own ? "your emergency order" : `another person's emergency order (${calls.map(by).join("; ")})`;
-    const given = await ask(`Withdraw ${whose}? Nothing moves because of it.`, own ? [] : [{ name: "owner", label: "Whose", options: owners }], "Withdraw");
+    const question = own ? t("Withdraw your emergency order? Nothing moves because of it.") : t("Withdraw another person's emergency order ({orders})? Nothing moves because of it.", { orders: calls.map(by).join("; ") });
+    const given = await ask(question, own ? [] : [{ name: "owner", label: t("Whose"), options: owners }], t("Withdraw"));
     if (!given) return;
     try {
       const left = (await api("DELETE", "emergency", own ? undefined : { owner: given.owner })).calls;
-      say(left.length ? `withdrawn; still ordered by ${left.map(by).join("; ")}` : "emergency withdrawn; Resume ends it");
+      say(left.length ? t("withdrawn; still ordered by {orders}", { orders: left.map(by).join("; ") }) : t("emergency withdrawn; Resume ends it"));
     } catch (error) { say(error.message, true); }
-  } }, "Withdraw");
+  } }, t("Withdraw"));
   const resume = h("button", { className: "hx-button", onclick: async () => {
-    if (await ask("Resume automatic control? It raises the heliostats that it had.", [], "Resume")) await act(() => api("POST", "automatic/resume"), "Resume");
-  } }, "Resume");
+    if (await ask(t("Resume automatic control? It raises the heliostats that it had."), [], t("Resume"))) await act(() => api("POST", "automatic/resume"), t("Resume"));
+  } }, t("Resume"));
   alertText(box, text);
   box.append(viewer ? "" : back, viewer ? "" : resume);
   store.on("frame", (now) => {
@@ -87,7 +88,7 @@ function tabs() {
 function menu(box) {
   const does = { ...people, factor: () => location.assign("/account"), trends: () => window.open("/trends", "_blank", "noopener"), wall: () => window.open("/wall", "_blank", "noopener"), async leave() { await api("DELETE", "session"); location.assign("/login"); } };
   const summary = box.querySelector("summary");
-  summary.textContent = `${me.name} · ${me.role}`;
+  summary.textContent = `${me.name} · ${t(me.role)}`;
   for (const item of box.querySelectorAll("button")) {
     if (item.dataset.role && item.dataset.role !== me.role) item.remove();
     item.onclick = () => { box.open = false; does[item.dataset.opens](); };
@@ -103,8 +104,8 @@ part("theme").onclick = () => {
   store.emit("theme");
 };
 store.confirm = async () => {
-  const given = await ask("Nothing was ordered here for a while. The view stays; give your password to go on.",
-    [{ name: "own_password", label: "Your own password", type: "password" }], "Go on");
+  const given = await ask(t("Nothing was ordered here for a while. The view stays; give your password to go on."),
+    [{ name: "own_password", label: t("Your own password"), type: "password" }], t("Go on"));
   if (given) await api("PUT", "session/presence", given);
   return Boolean(given);
 };

@@ -1,5 +1,6 @@
 // Building blocks of the page. Text is always inserted as text, never as markup.
 import { store } from "./live.js";
+import { day, fixed, plain, t, whole } from "./words.js";
 
 export function h(tag, given = {}, ...children) {
   const made = document.createElement(tag);
@@ -14,10 +15,10 @@ export function h(tag, given = {}, ...children) {
 }
 
 const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
-export const number = (value, digits = 2) => (known(value) ? value.toFixed(digits) : "–");
-export const mrad = (value, digits = 2) => (known(value) ? (1e3 * value).toFixed(digits) : "–");
-export const degrees = (value, digits = 2) => (known(value) ? ((value * 180) / Math.PI).toFixed(digits) : "–");
-export const count = (value) => (known(value) ? value.toLocaleString("en") : "–");
+export const number = (value, digits = 2) => (known(value) ? fixed(value, digits) : "–");
+export const mrad = (value, digits = 2) => (known(value) ? fixed(1e3 * value, digits) : "–");
+export const degrees = (value, digits = 2) => (known(value) ? fixed((value * 180) / Math.PI, digits) : "–");
+export const count = (value) => (known(value) ? whole(value) : "–");
 export const clock = (at) => (known(at) && at > 0 ? new Date(1e3 * at).toISOString().slice(11, 19) : "–");
 // The same in the browser's time zone, "" where that is UTC: always beside UTC, never instead of it.
 export function local(at) {
@@ -28,13 +29,13 @@ export function local(at) {
 export function moment(at) {
   if (!known(at) || at <= 0) return "–";
   const text = new Date(1e3 * at).toISOString(), today = store.head?.at.slice(0, 10), here = local(at);
-  return `${text.slice(0, 10) === today ? "" : `${text.slice(0, 10)} `}${text.slice(11, 19)}${here && ` (${here})`}`;
+  return `${text.slice(0, 10) === today ? "" : `${day(at)} `}${text.slice(11, 19)}${here && ` (${here})`}`;
 }
 export function span(seconds) {
-  if (!known(seconds)) return "never";
+  if (!known(seconds)) return t("never");
   if (seconds < 120) return `${Math.max(0, seconds).toFixed(0)} s`;
   if (seconds < 7200) return `${(seconds / 60).toFixed(0)} min`;
-  return seconds < 172800 ? `${(seconds / 3600).toFixed(1)} h` : `${(seconds / 86400).toFixed(1)} d`;
+  return seconds < 172800 ? `${fixed(seconds / 3600, 1)} h` : `${fixed(seconds / 86400, 1)} d`;
 }
 
 export function table(columns, rows, act) {
@@ -92,7 +93,7 @@ export function lay(dialog) {
   dialog.show();
 }
 
-// Asks in a dialog; null: cancelled. With `go` the dialog stays after an error, with what was typed, until `go` has succeeded.
+// Asks in a dialog; null: cancelled. An option is a value, or a value and its text. With `go` the dialog stays after an error, with what was typed, until `go` has succeeded.
 export function ask(title, fields, confirm, go = async () => {}) {
   return new Promise((resolve) => {
     const told = h("p", { className: "hx-told bad", role: "alert", hidden: true }), given = () => Object.fromEntries(fields.map((field, i) => [field.name, inputs[i].value]));
@@ -104,13 +105,13 @@ export function ask(title, fields, confirm, go = async () => {}) {
       try { await go(given()); dialog.close("yes"); } catch (error) { told.textContent = error.message; told.hidden = false; } finally { busy = false; }
     };
     const inputs = fields.map((field) => {
-      if (field.options) return h("select", { name: field.name }, field.options.map((o) => h("option", { value: o }, o)));
+      if (field.options) return h("select", { name: field.name }, field.options.map((o) => [o].flat()).map(([value, text = value]) => h("option", { value }, text)));
       return h("input", { name: field.name, type: field.type ?? "text", value: field.value ?? "", step: "any", required: field.required ?? true });
     });
     const dialog = h("dialog", { className: "hx-dialog" }, h("form", { onsubmit: submit },
       h("h2", {}, title), fields.map((field, i) => h("label", {}, field.label, inputs[i])), told,
       h("div", { className: "hx-row" },
-        h("button", { type: "button", className: "hx-button", onclick: () => dialog.close("") }, "Cancel"),
+        h("button", { type: "button", className: "hx-button", onclick: () => dialog.close("") }, t("Cancel")),
         h("button", { type: "submit", value: "yes", className: "hx-button main" }, confirm))));
     dialog.addEventListener("close", () => {
       resolve(dialog.returnValue === "yes" ? given() : null);
@@ -128,7 +129,7 @@ export function chart(canvas, series, night) {
   c.clearRect(0, 0, wide, high);
   const points = series.flatMap((line) => line.points).filter(([, v]) => v > 0);
   c.font = "11px system-ui, sans-serif"; c.fillStyle = night ? "#aab4bf" : "#57606a";
-  if (!points.length) { c.fillText("no measurement has finished yet", 12, high / 2); return; }
+  if (!points.length) { c.fillText(t("no measurement has finished yet"), 12, high / 2); return; }
   const times = points.map(([t]) => t), values = points.map(([, v]) => v);
   const first = Math.min(...times), last = Math.max(...times, first + 60);
   const low = Math.log10(Math.min(...values, 0.1)) - 0.1, top = Math.log10(Math.max(...values, 20)) + 0.05;
@@ -138,7 +139,7 @@ export function chart(canvas, series, night) {
   for (const v of [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50]) {
     if (Math.log10(v) < low || Math.log10(v) > top) continue;
     c.beginPath(); c.moveTo(40, y(v)); c.lineTo(wide - 12, y(v)); c.stroke();
-    c.fillText(String(v), 34, y(v) + 4);
+    c.fillText(plain(v), 34, y(v) + 4);
   }
   c.textAlign = "left"; c.fillText(clock(first), 40, high - 6);
   c.textAlign = "right"; c.fillText(clock(last), wide - 12, high - 6);

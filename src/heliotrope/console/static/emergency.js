@@ -1,5 +1,8 @@
 // EMERGENCY: a script of its own, so that it works when everything else is slow or broken. One click, one touch, or Alt+E.
 (() => {
+  // English until the catalogue is there: nothing here waits for it.
+  let t = (text, values = {}) => text.replace(/\{(\w+)\}/g, (whole, name) => values[name]);
+  import("./words.js").then((words) => { t = words.t; }).catch(() => {});
   const button = document.getElementById("emergency");
   const say = document.getElementById("emergency-said");
   const meta = (name) => document.querySelector(`meta[name="heliotrope-${name}"]`)?.content;
@@ -8,7 +11,7 @@
 
   async function session() {
     const answer = await fetch("/api/v1/session", { credentials: "same-origin", cache: "no-store" });
-    if (!answer.ok) throw new Error("sign in first");
+    if (!answer.ok) throw new Error(t("sign in first"));
     csrf = (await answer.json()).csrf;
   }
 
@@ -35,16 +38,16 @@
   async function call(again) {
     button.classList.add("sent");
     say.classList.remove("failed");
-    say.textContent = "sending …";
+    say.textContent = t("sending …");
     try {
       if (!csrf) await session();
       const data = await Promise.any(ways()).catch((errors) => { throw errors.errors[0]; });
-      say.textContent = `ordered: ${data.act} of ${data.heliostats} heliostats`;
+      say.textContent = t("ordered: {act} of {n} heliostats", { act: t(data.act), n: data.heliostats });
       setTimeout(() => { say.textContent = ""; button.classList.remove("sent"); }, 15000);
     } catch (error) {
       if (error.status === 403 && again) { csrf = ""; return call(false); }
       button.classList.remove("sent");
-      say.textContent = `NOT SENT: ${error.message}. Use the hard-wired stop.`;
+      say.textContent = t("NOT SENT: {error}. Use the hard-wired stop.", { error: error.message });
       say.classList.add("failed");
     }
   }

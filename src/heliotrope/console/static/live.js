@@ -1,8 +1,9 @@
 // The page's data: the live stream, decoded into one table, and access to the API.
 // Everything that is shown comes from here; nothing is drawn here.
+import { t, word } from "./words.js";
 
-export const STATES = ["UNCONFIGURED", "STOWED", "STOWING", "APPROACHING", "IDLE", "TRACKING",
-  "DEFOCUSED", "LOCKED", "SEARCHING", "FAULT"];
+export const STATES = [word("UNCONFIGURED"), word("STOWED"), word("STOWING"), word("APPROACHING"), word("IDLE"), word("TRACKING"),
+  word("DEFOCUSED"), word("LOCKED"), word("SEARCHING"), word("FAULT")];
 export const STALE = 255;
 const ROW = 24; // bytes of a row; see docs/reference/api-http.md
 const LATE = 3000; // ms after which the last data is no longer shown as live
@@ -32,7 +33,7 @@ class Store extends EventTarget {
     this.connect(); // messages that come before the field are kept in `early`
     while (!this.field) {
       try { this.field = await api("GET", "field"); } catch (error) {
-        this.emit("said", { text: `no data from the plant, asking again: ${error.message}`, bad: true });
+        this.emit("said", { text: t("no data from the plant, asking again: {error}", { error: error.message }), bad: true });
         await new Promise((wake) => setTimeout(wake, 1000));
       }
     }
@@ -99,7 +100,7 @@ class Store extends EventTarget {
   }
 
   stateOf(row) { return this.live ? this.state[row] : STALE; }
-  stateName(row) { const s = this.stateOf(row); return s === STALE ? "stale" : STATES[s]; }
+  stateName(row) { const s = this.stateOf(row); return s === STALE ? word("stale") : STATES[s]; }
   ageOf(row) { // of the calibration, s; NaN: never
     return this.calibrated[row] && this.head ? this.head.utc - this.calibrated[row] : NaN;
   }
@@ -128,7 +129,7 @@ export async function api(method, path, body) {
   const answer = await fetch(`/api/v1/${path}`, options);
   // The page was left alone for long: the person confirms, and the order goes again.
   if (answer.status === 423 && await store.confirm()) return api(method, path, body);
-  if (answer.status === 401) { location.assign("/login"); throw new ApiError(401, "signed out"); }
+  if (answer.status === 401) { location.assign("/login"); throw new ApiError(401, t("signed out")); }
   const data = answer.status === 204 ? null : await answer.json();
   if (!answer.ok) {
     const detail = typeof data.detail === "string" ? data.detail : JSON.stringify(data.detail);
@@ -158,20 +159,23 @@ const OPERATORS = {
   "~": (a, b) => new RegExp(`^${String(b).replace(/[.+^${}()|[\]\\]/g, "\\$&").replace(/\*/g, ".*").replace(/\?/g, ".")}$`).test(a),
 };
 
+// A state by its English name, or by the one that the page shows.
+const stateSaid = (said) => [...STATES, "stale"].find((one) => t(one).toUpperCase() === said)?.toUpperCase() ?? said;
+
 export function parseQuery(text) {
   const term = /^\s*([a-z]+)\s*(<=|>=|!=|=|<|>|~)\s*("[^"]*"|[^\s"]+)\s*/i;
   const either = [[]];
   let rest = text;
   for (;;) {
     const match = term.exec(rest);
-    if (!match) throw new Error(`cannot read "${rest.trim() || text}"; write: state = TRACKING and error > 1`);
+    if (!match) throw new Error(t('cannot read "{text}"; write: state = TRACKING and error > 1', { text: rest.trim() || text }));
     const [whole, field, sign, raw] = match;
     const get = FIELDS[field.toLowerCase()];
-    if (!get) throw new Error(`no field "${field}"; there are ${Object.keys(FIELDS).join(", ")}`);
-    const word = raw.replace(/"/g, "").toUpperCase();
+    if (!get) throw new Error(t('no field "{field}"; there are {fields}', { field, fields: Object.keys(FIELDS).join(", ") }));
+    const said = raw.replace(/"/g, "").toUpperCase(), name = get === FIELDS.state ? stateSaid(said) : said;
     const number = typeof get(0) === "number";
-    const value = number && sign !== "~" ? (word === "NEVER" ? NaN : Number(word)) : word;
-    if (number && word !== "NEVER" && Number.isNaN(value)) throw new Error(`${field}: "${raw}" is not a number`);
+    const value = number && sign !== "~" ? (name === "NEVER" ? NaN : Number(name)) : name;
+    if (number && name !== "NEVER" && Number.isNaN(value)) throw new Error(t('{field}: "{value}" is not a number', { field, value: raw }));
     either.at(-1).push(Number.isNaN(value)
       ? (row) => Number.isNaN(get(row)) === (sign === "=") : (row) => OPERATORS[sign](get(row), value));
     rest = rest.slice(whole.length);
@@ -180,7 +184,7 @@ export function parseQuery(text) {
     if (joint[1].toLowerCase() === "or") either.push([]);
     rest = rest.slice(joint[0].length);
   }
-  if (rest.trim()) throw new Error(`"${rest.trim()}" is unexpected; join conditions with "and" or "or"`);
+  if (rest.trim()) throw new Error(t('"{text}" is unexpected; join conditions with "and" or "or"', { text: rest.trim() }));
   return (row) => either.some((all) => all.every((holds) => holds(row)));
 }
 
@@ -189,17 +193,20 @@ function rowsNamed(text) {
   const words = text.toUpperCase().split(/[\s,;]+/).filter(Boolean);
   if (!words.length || /[=<>]|\s~/.test(text)) return null;
   const names = store.field.names.map((name) => name.toUpperCase());
-  return [...new Set(words.flatMap((word) => {
-    const rows = names.flatMap((name, row) => (OPERATORS["~"](name, word) ? [row] : []));
-    if (!rows.length) throw new Error(`there is no heliostat "${word}"${nearest(word, names)}; write its name, or: state = TRACKING and error > 1`);
+  return [...new Set(words.flatMap((one) => {
+    const rows = names.flatMap((name, row) => (OPERATORS["~"](name, one) ? [row] : []));
+    if (!rows.length) throw new Error(missing(one, nearest(one, names)));
     return rows;
   }))];
 }
 
-function nearest(word, names) {
-  const far = names.map((name) => edits(word, name)), least = far.reduce((a, b) => Math.min(a, b), Infinity);
+const missing = (name, close) => (close ? t('there is no heliostat "{name}"; did you mean {close}?; write its name, or: state = TRACKING and error > 1', { name, close })
+  : t('there is no heliostat "{name}"; write its name, or: state = TRACKING and error > 1', { name }));
+
+function nearest(said, names) {
+  const far = names.map((name) => edits(said, name)), least = far.reduce((a, b) => Math.min(a, b), Infinity);
   const close = names.flatMap((_, row) => (far[row] === least && least <= 2 ? [store.field.names[row]] : [])).slice(0, 3);
-  return close.length ? `; did you mean ${close.join(", ")}?` : "";
+  return close.join(", ");
 }
 
 // Letters to add, leave out or change.

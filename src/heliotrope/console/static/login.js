@@ -1,3 +1,5 @@
+// Heard from the first moment on: what is typed early must not go into the address. The words come when they can.
+const words = import("./words.js");
 document.getElementById("login").addEventListener("submit", async (event) => {
   event.preventDefault();
   const said = document.getElementById("said"), form = new FormData(event.target);
@@ -14,6 +16,6 @@ document.getElementById("login").addEventListener("submit", async (event) => {
       said.textContent = (await answer.json()).detail;
     } else said.textContent = (await answer.json()).detail;
   } catch {
-    said.textContent = "the console does not answer";
+    said.textContent = (await words).t("the console does not answer");
   }
 });

@@ -1,12 +1,13 @@
 // The field from above: up to 100,000 heliostats on a canvas, north at the top.
 import { STALE, rowsWhere, store } from "./live.js";
 import { VIEWS, colourOf, dark } from "./palette.js";
+import { fixed, t, whole, word } from "./words.js";
 
 const FAULT = 9;
 const NEAR = 14; // px within which a click finds a heliostat
 const ARC = 24; // corners of each arc of a sector
 // What a drag (with Shift, or in that mode) draws, and what a click takes in its mode.
-export const SHAPES = ["lasso", "rectangle", "sector"], CLICKS = ["row", "cluster"];
+export const SHAPES = [word("lasso"), word("rectangle"), word("sector")], CLICKS = [word("row"), word("cluster")];
 const KEYS = { l: "lasso", r: "rectangle", s: "sector" };
 
 const words = new Map();
@@ -30,8 +31,8 @@ export class FieldMap {
     this.fitted = false;
     box.tabIndex = 0;
     box.setAttribute("role", "application");
-    box.setAttribute("aria-label", "Map of the field. Arrows move, plus and minus zoom, 0 shows all, " +
-      "L draws a lasso, R a rectangle, S a sector, A selects all, Escape clears.");
+    box.setAttribute("aria-label", t("Map of the field. Arrows move, plus and minus zoom, 0 shows all, L draws a lasso, R a rectangle, S a sector, A selects all, Escape clears."));
+    box.dataset.dead = t("NOT LIVE: the plant has not been heard");
     this.canvas = box.appendChild(document.createElement("canvas"));
     this.context = this.canvas.getContext("2d", { alpha: false });
     this.tip = box.appendChild(Object.assign(document.createElement("div"), { className: "hx-tip" }));
@@ -177,7 +178,7 @@ export class FieldMap {
     }
     c.fillStyle = night ? "#e8eaed" : "#202428";
     c.beginPath(); c.arc(tx, ty, 5, 0, 2 * Math.PI); c.fill();
-    c.fillText("tower", tx + 8, ty - 6);
+    c.fillText(t("tower"), tx + 8, ty - 6);
     this.drawKeepOuts(c, night);
   }
 
@@ -264,8 +265,8 @@ export class FieldMap {
     c.strokeStyle = night ? "#3a434d" : "#b9c0c7"; c.lineWidth = 1;
     c.beginPath(); c.arc(cx, cy, r, 0, 2 * Math.PI); c.stroke();
     c.fillStyle = night ? "#9aa4af" : "#57606a"; c.font = "11px sans-serif"; c.textAlign = "center";
-    c.fillText("N", cx, cy - r - 5);
-    if (!sun || !store.live) { c.fillText("sun not known", cx, cy + 4); return; }
+    c.fillText(t("N"), cx, cy - r - 5);
+    if (!sun || !store.live) { c.fillText(t("sun not known"), cx, cy + 4); return; }
     const away = r * Math.cos(Math.max(0, sun.elevation));
     const sx = cx + away * Math.sin(sun.azimuth), sy = cy - away * Math.cos(sun.azimuth);
     c.strokeStyle = c.fillStyle = sun.elevation > 0 ? (night ? "#f0e442" : "#b38f00") : "#77808a";
@@ -332,10 +333,10 @@ export class FieldMap {
     for (const { name, colour, count } of view.legend()) {
       const line = document.createElement("div"), patch = document.createElement("i");
       patch.style.background = colour;
-      line.append(patch, count === undefined ? name : `${name} ${count.toLocaleString("en")}`);
+      line.append(patch, count === undefined ? name : `${name} ${whole(count)}`);
       box.append(line);
     }
-    if (out) box.append(Object.assign(document.createElement("div"), { className: "hx-out", textContent: `⊖ out of service ${out.toLocaleString("en")}` }));
+    if (out) box.append(Object.assign(document.createElement("div"), { className: "hx-out", textContent: `⊖ ${t("out of service")} ${whole(out)}` }));
   }
 
   nearest(px, py) {
@@ -364,7 +365,7 @@ export class FieldMap {
   // Selects what a shape encloses, and says how many that are.
   tell(rows, event, shape) {
     this.choose(rows, event);
-    store.emit("said", { text: rows.length ? `${rows.length.toLocaleString("en")} heliostats in the ${shape}` : `no heliostat in the ${shape}`, bad: !rows.length });
+    store.emit("said", { text: rows.length ? t("{n} heliostats in the {shape}", { n: whole(rows.length), shape: t(shape) }) : t("no heliostat in the {shape}", { shape: t(shape) }), bad: !rows.length });
   }
 
   choose(rows, event, focus) {
@@ -429,8 +430,8 @@ export class FieldMap {
     const row = this.nearest(px, py), tip = this.tip;
     if (row < 0) { tip.style.display = "none"; return; }
     const error = 1e3 * store.error[row];
-    tip.textContent = `${store.field.names[row]} · ${store.stateName(row)}` +
-      (Number.isNaN(error) ? " · not calibrated" : ` · ±${error.toFixed(2)} mrad`) + (store.out[row] ? " · OUT OF SERVICE" : "") + (store.out[row] === 2 ? ", confirmed at the mirror" : "");
+    tip.textContent = [store.field.names[row], t(store.stateName(row)), Number.isNaN(error) ? t("not calibrated") : `±${fixed(error, 2)} mrad`,
+      store.out[row] === 2 ? t("OUT OF SERVICE, confirmed at the mirror") : store.out[row] ? t("OUT OF SERVICE") : ""].filter(Boolean).join(" · ");
     tip.style.display = "block";
     tip.style.left = `${Math.min(px + 14, this.width - 190)}px`;
     tip.style.top = `${py + 14}px`;

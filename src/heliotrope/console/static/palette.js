@@ -1,5 +1,6 @@
 // Colours that the colour-blind can tell apart: Okabe and Ito's for kinds, cividis for amounts.
 import { STALE, STATES, store } from "./live.js";
+import { fixed, t } from "./words.js";
 
 export const dark = () => !document.documentElement.classList.contains("light");
 
@@ -15,8 +16,8 @@ const CIVIDIS = ["#00224e", "#013271", "#2f426d", "#48526c", "#5e636f", "#727374
   "#b6a96f", "#cebc63", "#e7d150", "#fee838"].map((c) => [1, 3, 5].map((i) => parseInt(c.slice(i, i + 2), 16)));
 export function cividis(share) {
   const place = Math.min(1, Math.max(0, share)) * (CIVIDIS.length - 1);
-  const i = Math.min(CIVIDIS.length - 2, Math.floor(place)), t = place - i;
-  return CIVIDIS[i].map((c, k) => Math.round(c + t * (CIVIDIS[i + 1][k] - c)));
+  const i = Math.min(CIVIDIS.length - 2, Math.floor(place)), part = place - i;
+  return CIVIDIS[i].map((c, k) => Math.round(c + part * (CIVIDIS[i + 1][k] - c)));
 }
 const css = (rgb) => `rgb(${rgb.join(",")})`;
 // The dark end would be lost on a dark ground, the bright end on a light one.
@@ -29,27 +30,27 @@ const mark = (v, low, high) => Math.min(1, Math.max(0, Math.log(v / low) / Math.
 // A view of the field: what class each row is in, the colour of each class, and a legend.
 export const VIEWS = {
   state: {
-    title: "State",
+    title: t("State"),
     of: (row) => { const s = store.stateOf(row); return s === STALE ? STATES.length : s; },
     colours: () => [...STATES, "stale"].map(colourOf),
     legend: () => {
       const counts = new Uint32Array(STATES.length + 1);
       for (let row = 0; row < store.state.length; row++) counts[VIEWS.state.of(row)]++;
-      return [...STATES, "stale"].map((name, i) => ({ name, colour: colourOf(name), count: counts[i] }))
+      return [...STATES, "stale"].map((name, i) => ({ name: t(name), colour: colourOf(name), count: counts[i] }))
         .filter((entry) => entry.count);
     },
   },
-  error: amounts("Predicted error (mrad)", (row) => 1e3 * store.error[row], 0.1, 20,
-    [["0.1", 0.1], ["0.5", 0.5], ["2", 2], ["20", 20]]),
-  measured: amounts("Last measured error (mrad)", (row) => 1e3 * store.measured[row], 0.1, 20,
-    [["0.1", 0.1], ["0.5", 0.5], ["2", 2], ["20", 20]]),
-  age: amounts("Age of calibration", (row) => store.ageOf(row) / 3600, 0.05, 720,
+  error: amounts(t("Predicted error (mrad)"), (row) => 1e3 * store.error[row], 0.1, 20,
+    [[fixed(0.1, 1), 0.1], [fixed(0.5, 1), 0.5], ["2", 2], ["20", 20]]),
+  measured: amounts(t("Last measured error (mrad)"), (row) => 1e3 * store.measured[row], 0.1, 20,
+    [[fixed(0.1, 1), 0.1], [fixed(0.5, 1), 0.5], ["2", 2], ["20", 20]]),
+  age: amounts(t("Age of calibration"), (row) => store.ageOf(row) / 3600, 0.05, 720,
     [["3 min", 0.05], ["1 h", 1], ["1 d", 24], ["30 d", 720]]),
   cluster: {
-    title: "Health of the cluster",
+    title: t("Health of the cluster"),
     of: (row) => store.live ? (store.head?.clusters?.[store.field.cluster[row]] ?? 3) : 3,
     colours: () => [colourOf("TRACKING"), colourOf("DEFOCUSED"), colourOf("FAULT"), colourOf("stale")],
-    legend: () => ["healthy", "bad frames or nodes missing", "silent", "unknown"]
+    legend: () => [t("healthy"), t("bad frames or nodes missing"), t("silent"), t("unknown")]
       .map((name, i) => ({ name, colour: VIEWS.cluster.colours()[i] })),
   },
 };
@@ -63,6 +64,6 @@ function amounts(title, value, low, high, marks) {
       return Number.isNaN(v) ? STEPS : Math.round(mark(v, low, high) * (STEPS - 1));
     },
     colours: () => [...Array.from({ length: STEPS }, (_, i) => ramp(i / (STEPS - 1))), never(), colourOf("stale")],
-    legend: () => [{ name: "none yet", colour: never() }, { name: "stale", colour: colourOf("stale") }],
+    legend: () => [{ name: t("none yet"), colour: never() }, { name: t("stale"), colour: colourOf("stale") }],
   };
 }

@@ -6,23 +6,23 @@ import { act, aim, askAnd } from "./orders.js";
 import { drawFlux, fluxPoint } from "./showing.js";
 import { markCorners } from "./marking.js";
 import { compareVersions, waitingChanges, waitingView } from "./versions.js";
-import { t } from "./words.js";
+import { day as dayOf, fixed, monthDay, t, word } from "./words.js";
 
 const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
 const canCommand = () => me.role !== "viewer";
 const severe = { emergency: "bad", alarm: "bad", warning: "warn", fault: "bad" };
 
 // Names, units, their number in one of the reading's, and digits.
-const SENSORS = { dni: ["Direct sunlight", "W/m²", 1, 0], receiver_flux_nominal: ["Flux on the receiver, of the full field's", "%", 100, 0],
-  wind_gust: ["Wind gust (3 s)", "m/s", 1, 1], wind_mean: ["Mean wind (10 min)", "m/s", 1, 1], temperature: ["Air", "°C", 1, 0] };
+const SENSORS = { dni: [word("Direct sunlight"), "W/m²", 1, 0], receiver_flux_nominal: [word("Flux on the receiver, of the full field's"), "%", 100, 0],
+  wind_gust: [word("Wind gust (3 s)"), "m/s", 1, 1], wind_mean: [word("Mean wind (10 min)"), "m/s", 1, 1], temperature: [word("Air"), "°C", 1, 0] };
 
 export function plant(box) {
   const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), sensors = h("div");
   const { receivers } = store.field, figures = h("div");
   let [name] = receivers;
   const choice = h("select", { ariaLabel: t("Receiver"), onchange: () => { name = choice.value; predict(); } }, receivers.map((one) => h("option", { value: one }, one)));
-  box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light, sensors,
-    ...(name ? [h("h3", {}, t("Predicted flux on {name}", { name: receivers.length > 1 ? "" : name })), receivers.length > 1 ? choice : "", figures, flux,
+  box.append(h("h3", {}, t("Heliostats")), states, proof, h("h3", {}, t("Sun")), light, sensors,
+    ...(name ? [h("h3", {}, t("Predicted flux on the receiver")), receivers.length > 1 ? choice : "", figures, flux,
       canCommand() ? h("p", { className: "hx-hint" }, t("Click on the picture to aim the heliostats of the scope at that point.")) : ""] : []));
   let seen = null;
   const show = () => {
@@ -31,32 +31,32 @@ export function plant(box) {
     const most = head.heliostats;
     states.replaceChildren(h("div", { className: "hx-bars" }, Object.entries(head.states).map(([state, n]) => {
       const bar = h("i"); bar.style.width = `${Math.max(1, (100 * n) / most)}%`; bar.style.background = colourOf(state);
-      return h("div", {}, h("span", {}, state), h("b", {}, bar), h("em", {}, count(n)));
-    })), facts([["Clusters heard", `${count(head.clusters_alive)} of ${count(store.field.clusters.length)}`],
-      ["Waiting to join the receiver", count(head.waiting)],
-      ["Calibrated", `${count(head.calibration.done)} of ${count(most)}`],
-      ["Median error", `${mrad(head.calibration.quality?.median)} mrad`]]));
-    light.replaceChildren(facts([["Azimuth", `${degrees(head.sun.azimuth, 1)}°`], ["Elevation", `${degrees(head.sun.elevation, 1)}°`],
-      ["Shadow of the tower", head.sun.elevation > 0.02 ? `${number(store.field.tower[2] / Math.tan(head.sun.elevation), 0)} m to ${degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0)}°` : "none: the sun is down"]]));
+      return h("div", {}, h("span", {}, t(state)), h("b", {}, bar), h("em", {}, count(n)));
+    })), facts([[t("Clusters heard"), t("{n} of {all}", { n: count(head.clusters_alive), all: count(store.field.clusters.length) })],
+      [t("Waiting to join the receiver"), count(head.waiting)],
+      [t("Calibrated"), t("{n} of {all}", { n: count(head.calibration.done), all: count(most) })],
+      [t("Median error"), `${mrad(head.calibration.quality?.median)} mrad`]]));
+    light.replaceChildren(facts([[t("Azimuth"), `${degrees(head.sun.azimuth, 1)}°`], [t("Elevation"), `${degrees(head.sun.elevation, 1)}°`],
+      [t("Shadow of the tower"), head.sun.elevation > 0.02 ? t("{length} m to {azimuth}°", { length: number(store.field.tower[2] / Math.tan(head.sun.elevation), 0), azimuth: degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0) }) : t("none: the sun is down")]]));
     const readings = Object.entries(head.readings);
-    sensors.replaceChildren(...(readings.length ? [h("h3", {}, "Sensors"), facts(readings.map(([of, value]) => {
+    sensors.replaceChildren(...(readings.length ? [h("h3", {}, t("Sensors")), facts(readings.map(([of, value]) => {
       const [label, unit, size, digits] = SENSORS[of] ?? [of.replaceAll("_", " "), "", 1, 2];
-      return [label, value === null ? "no reading" : `${number(size * value, digits)} ${unit}`];
+      return [t(label), value === null ? t("no reading") : `${number(size * value, digits)} ${unit}`];
     }))] : []));
     proof.replaceChildren(...(head.order.on ? [h("p", { className: "hx-said bad" },
-      `${head.order.act} of the field, ordered by ${head.order.who}: ${head.order.acknowledged} of ${head.order.heliostats} acknowledged, ${head.order.done} done. ${head.order.text}`), facts([
-      ["Measured", head.order.measured ? "the flux, below its limit" : "nothing since the order"],
-      ["Seen to move today", Object.entries(head.order.followed).map(([by, n]) => `${count(n)} by ${by}`).join(", ") || "none"],
-      ["Believed by reports alone", head.order.believed.join(", ") + (head.order.believed_count > head.order.believed.length ? `, … (${count(head.order.believed_count)})` : "") || "none"]])] : []));
+      t("{act} of the field, ordered by {who}: {acknowledged} of {all} acknowledged, {done} done. {text}", { act: t(head.order.act), who: head.order.who, acknowledged: count(head.order.acknowledged), all: count(head.order.heliostats), done: count(head.order.done), text: head.order.text })), facts([
+      [t("Measured"), head.order.measured ? t("the flux, below its limit") : t("nothing since the order")],
+      [t("Seen to move today"), Object.entries(head.order.followed).map(([by, n]) => t("{n} by {by}", { n: count(n), by })).join(", ") || t("none")],
+      [t("Believed by reports alone"), head.order.believed.join(", ") + (head.order.believed_count > head.order.believed.length ? `, … (${count(head.order.believed_count)})` : "") || t("none")]])] : []));
   };
   const draw = () => { if (seen) drawFlux(flux, seen); };
   const off = [store.on("frame", show), store.on("theme", () => { show(); draw(); })];
   const predict = async () => {
     seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`);
     const peak = Math.max(0, ...seen.flux.flat());
-    figures.replaceChildren(facts([["Power", `${number(seen.power / 1e6, 2)} MW`],
-      ["Intercept", seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],
-      ["Peak", `${number(peak / 1e3, 0)} kW/m²`], ["Heliostats on it", count(seen.heliostats)]]));
+    figures.replaceChildren(facts([[t("Power"), `${number(seen.power / 1e6, 2)} MW`],
+      [t("Intercept"), seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],
+      [t("Peak"), `${number(peak / 1e3, 0)} kW/m²`], [t("Heliostats on it"), count(seen.heliostats)]]));
     draw();
   };
   if (name) off.push(refreshed(predict, { every: 10 }));
@@ -74,8 +74,8 @@ export function heliostat(box) {
   const load = async () => {
     if (store.focus < 0) {
       body.replaceChildren(h("p", { className: "hx-hint" }, store.selection.size
-        ? `${count(store.selection.size)} heliostats are selected. Click one on the map to see it here.`
-        : "Click a heliostat on the map to see it here."));
+        ? t("{n} heliostats are selected. Click one on the map to see it here.", { n: count(store.selection.size) })
+        : t("Click a heliostat on the map to see it here.")));
       return;
     }
     const name = encodeURIComponent(store.field.names[store.focus]);
@@ -94,20 +94,20 @@ export function heliostat(box) {
 
 // What the button of an explanation does, and its title.
 const ACTS = {
-  automatic: ["Give to automatic control", (name) => api("POST", "automatic", { heliostats: [name] })],
-  unlock: ["Unlock", (name) => api("POST", "commands", { command: "UNLOCK", heliostats: [name] })],
-  clear_fault: ["Clear fault", (name) => api("POST", "commands", { command: "CLEAR_FAULT", heliostats: [name] })],
-  return_lock: ["Return your lock", (name) => api("POST", "holds/release", { heliostats: [name] })],
-  resume: ["Resume", () => api("POST", "automatic/resume")],
-  withdraw: ["Withdraw your emergency order", () => api("DELETE", "emergency")],
+  automatic: [word("Give to automatic control"), (name) => api("POST", "automatic", { heliostats: [name] })],
+  unlock: [word("Unlock"), (name) => api("POST", "commands", { command: "UNLOCK", heliostats: [name] })],
+  clear_fault: [word("Clear fault"), (name) => api("POST", "commands", { command: "CLEAR_FAULT", heliostats: [name] })],
+  return_lock: [word("Return your lock"), (name) => api("POST", "holds/release", { heliostats: [name] })],
+  resume: [word("Resume"), () => api("POST", "automatic/resume")],
+  withdraw: [word("Withdraw your emergency order"), () => api("DELETE", "emergency")],
 };
 
 function whyView(why) {
   const [title, does] = ACTS[why.button] ?? [];
   return h("section", { className: `hx-why ${why.tracks ? "" : "off"}` }, h("p", {}, h("b", {}, why.text)),
     why.follows ? h("p", {}, why.follows) : "",
-    why.remedy || title ? h("p", {}, `${why.remedy} `, title && canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => does(why.heliostat), title) }, title) : "") : "",
-    why.order ? h("p", { className: "hx-hint" }, `Last order: ${why.order.what} by ${why.order.who} at ${clock(why.order.at)} UTC, ${why.order.text}.`) : "",
+    why.remedy || title ? h("p", {}, `${why.remedy} `, title && canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => does(why.heliostat), t(title)) }, t(title)) : "") : "",
+    why.order ? h("p", { className: "hx-hint" }, t("Last order: {what} by {who} at {time} UTC, {text}.", { what: why.order.what, who: why.order.who, time: clock(why.order.at), text: why.order.text })) : "",
     ...why.alarms.map((a) => h("p", { className: severe[a.severity] ?? "" }, a.text)));
 }
 
@@ -131,7 +131,7 @@ function calibrationView(one, kept, ticket) {
   if (last && !running) {
     const mine = kept.filter((p) => p.at <= last.at + 1 && p.at > (before?.at ?? 0)).toSorted((a, b) => a.at - b.at), pictures = [...new Set([mine[0], mine.at(-1)])].filter(Boolean);
     const sighting = (p) => one.history.find((s) => Math.abs(s.at - p.at) < 0.5);
-    parts.push(facts([[t("Result"), last.outcome.replaceAll("_", " "), last.outcome === "calibrated" ? "" : "warn"], [t("At"), `${moment(last.at)}, ${last.target}`], [t("Beam error before"), `${mrad(last.before)} mrad`], [t("after"), `${mrad(last.after)} mrad`], [t("Photographs used"), count(last.new)]]),
+    parts.push(facts([[t("Result"), t(last.outcome.replaceAll("_", " ")), last.outcome === "calibrated" ? "" : "warn"], [t("Time and target"), `${moment(last.at)}, ${last.target}`], [t("Beam error before"), `${mrad(last.before)} mrad`], [t("after"), `${mrad(last.after)} mrad`], [t("Photographs used"), count(last.new)]]),
       h("p", { className: "hx-hint" }, last.text),
       pictures.length ? h("div", { className: "hx-two" }, pictures.map((p, i) => h("figure", {}, h("a", { href: `/api/v1/photographs/${p.identity}`, target: "_blank", rel: "noopener" }, h("img", { src: `/api/v1/photographs/${p.identity}`, alt: t("Photograph of {target} at {at}", { target: p.target, at: clock(p.at) }), loading: "lazy" })),
         h("figcaption", { className: "hx-hint" }, `${i ? t("last") : t("first")}, ${clock(p.at)}${sighting(p) ? `, ${mrad(sighting(p).error)} mrad` : ""}`)))) : "");
@@ -140,34 +140,34 @@ function calibrationView(one, kept, ticket) {
 }
 
 function heliostatView(one, why, calibration) {
-  const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none" : p.map((v) => number(v, 1)).join(", "));
+  const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? t("none") : p.map((v) => number(v, 1)).join(", "));
   return [
-    h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
+    h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? t(one.state) : t("stale: {age} old", { age: span(one.age) }))),
     ...why,
-    canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: "Automatic control calibrates it as soon as a target is free",
-      onclick: () => act(() => calibrate(one.name, false), `calibrate ${one.name}`) }, "Calibrate now"),
-    h("button", { className: "hx-button", title: "Automatic control searches its beam on a target until the camera sees it move with its aim; nothing is changed",
-      onclick: () => act(() => calibrate(one.name, true), `search ${one.name}`) }, "Search its beam")) : "",
+    canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: t("Automatic control calibrates it as soon as a target is free"),
+      onclick: () => act(() => calibrate(one.name, false), t("calibrate {name}", { name: one.name })) }, t("Calibrate now")),
+    h("button", { className: "hx-button", title: t("Automatic control searches its beam on a target until the camera sees it move with its aim; nothing is changed"),
+      onclick: () => act(() => calibrate(one.name, true), t("search {name}", { name: one.name })) }, t("Search its beam"))) : "",
     calibration,
-    facts([["Cluster", one.cluster], ["Heard", one.live ? `${number(one.age, 1)} s ago` : `${span(one.age)} ago`],
-      ["Fault", one.live ? one.fault : "unknown", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
-      ["Aim E, N, U (m)", point(one.aim)], ["Standby E, N, U (m)", point(one.standby)],
-      ["Position E, N, U (m)", one.position.map((v) => number(v, 1)).join(", ")], ["Mirror", `${number(one.width, 1)} × ${number(one.height, 1)} m`],
-      ["Predicted error", one.error === null ? "never calibrated" : `${mrad(one.error)} mrad`],
-      one.truth_error !== null ? ["True error (twin)", `${mrad(one.truth_error)} mrad`] : null,
-      ["Supply voltage", one.supply === null ? "–" : `${number(one.supply, 1)} V`], ["Temperature", one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
-      ["Next measurement", one.planned ? `${clock(one.planned.at)} on ${one.planned.target}` : "not planned"],
-      one.locked ? ["Locked", one.locked, "warn"] : null,
-      one.hold ? ["Out of service", `${one.hold}; ${one.state === "STOWED" || one.flags.includes("AT_STOW") ? "in stow" : "NOT IN STOW"}${one.flags.includes("LOCAL_SWITCH") ? "; confirmed at the mirror" : ""}`, "warn"] : null,
-      one.flags.includes("LOCAL_SWITCH") ? ["Switch at the mirror", "drives off: nothing moves it", "warn"] : null]),
-    h("h3", {}, "Drives"),
-    one.drives.length ? table([["Axis", (d) => d.axis], ["Count", (d) => count(d.count), "num"], ["Goal", (d) => count(d.goal), "num"],
-      ["Angle (°)", (d) => degrees(d.angle, 3), "num"], ["Goal (°)", (d) => degrees(d.goal_angle, 3), "num"]],
-      one.drives.map((d, i) => ({ ...d, axis: ["primary", "secondary"][i] }))) : h("p", { className: "hx-hint" }, "unknown while stale"),
+    facts([[t("Cluster"), one.cluster], [t("Heard"), t("{age} ago", { age: one.live ? `${number(one.age, 1)} s` : span(one.age) })],
+      [t("Fault"), one.live ? t(one.fault) : t("unknown"), one.live && one.fault !== "none" ? "bad" : stale], [t("Aims at"), one.on === "elsewhere" ? t("elsewhere") : one.on || t("nothing")],
+      [t("Aim E, N, U (m)"), point(one.aim)], [t("Standby E, N, U (m)"), point(one.standby)],
+      [t("Position E, N, U (m)"), one.position.map((v) => number(v, 1)).join(", ")], [t("Mirror"), `${number(one.width, 1)} × ${number(one.height, 1)} m`],
+      [t("Predicted error"), one.error === null ? t("never calibrated") : `${mrad(one.error)} mrad`],
+      one.truth_error !== null ? [t("True error (twin)"), `${mrad(one.truth_error)} mrad`] : null,
+      [t("Supply voltage"), one.supply === null ? "–" : `${number(one.supply, 1)} V`], [t("Temperature"), one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
+      [t("Next measurement"), one.planned ? t("{time} on {target}", { time: clock(one.planned.at), target: one.planned.target }) : t("not planned")],
+      one.locked ? [t("Locked"), one.locked, "warn"] : null,
+      one.hold ? [t("Out of service"), [one.hold, one.state === "STOWED" || one.flags.includes("AT_STOW") ? t("in stow") : t("NOT IN STOW"), one.flags.includes("LOCAL_SWITCH") ? t("confirmed at the mirror") : ""].filter(Boolean).join("; "), "warn"] : null,
+      one.flags.includes("LOCAL_SWITCH") ? [t("Switch at the mirror"), t("drives off: nothing moves it"), "warn"] : null]),
+    h("h3", {}, t("Drives")),
+    one.drives.length ? table([[t("Axis"), (d) => t(d.axis)], [t("Count"), (d) => count(d.count), "num"], [t("Goal"), (d) => count(d.goal), "num"],
+      [t("Angle (°)"), (d) => degrees(d.angle, 3), "num"], [t("Goal (°)"), (d) => degrees(d.goal_angle, 3), "num"]],
+      one.drives.map((d, i) => ({ ...d, axis: [word("primary"), word("secondary")][i] }))) : h("p", { className: "hx-hint" }, t("unknown while stale")),
     h("div", { className: "hx-row" }, h("h3", {}, t("Parameters")), h("button", { className: "hx-button", onclick: () => act(() => compareVersions(one.name), t("versions"), false) }, t("Versions…"))),
-    table([["Name", (p) => p[0]], ["Value", (p) => parameter(p[1].value, p[1].unit), "num"], ["σ", (p) => parameter(p[1].sigma, p[1].unit), "num"],
-      ["Nominal", (p) => parameter(p[1].nominal, p[1].unit), "num"], ["", (p) => (p[1].unit === "rad" ? "mrad" : p[1].unit)]], Object.entries(one.parameters)),
-    h("h3", {}, `Errors of its sightings (${one.history.length}), mrad`), h("canvas", { className: "hx-chart small" }),
+    table([[t("Name"), (p) => p[0]], [t("Value"), (p) => parameter(p[1].value, p[1].unit), "num"], ["σ", (p) => parameter(p[1].sigma, p[1].unit), "num"],
+      [t("Nominal"), (p) => parameter(p[1].nominal, p[1].unit), "num"], ["", (p) => (p[1].unit === "rad" ? "mrad" : p[1].unit)]], Object.entries(one.parameters)),
+    h("h3", {}, t("Errors of its sightings ({n}), mrad", { n: count(one.history.length) })), h("canvas", { className: "hx-chart small" }),
     one.flags.length ? h("p", { className: "hx-hint" }, one.flags.join(" · ")) : "",
   ];
 }
@@ -175,32 +175,32 @@ function heliostatView(one, why, calibration) {
 // The kept photographs, each with the error of its sighting: a sighting has the time of its photograph.
 function keptView(kept, history) {
   const sighting = (p) => history.find((s) => Math.abs(s.at - p.at) < 0.5);
-  return [h("h3", {}, `Kept photographs (${kept.length})`), kept.length
-    ? table([["Time", (p) => h("a", { href: `/api/v1/photographs/${p.identity}`, target: "_blank", rel: "noopener" }, clock(p.at))], ["Target", (p) => p.target],
-      ["Sighting (mrad)", (p) => { const s = sighting(p); return s ? mrad(s.error) : "–"; }, "num"],
-      ["Result of its visit", (p) => h("span", { className: p.outcome === "calibrated" ? "good" : "warn", title: `${p.text}\n${p.reading.join("\n")}` }, p.used ? p.outcome.replaceAll("_", " ") : `not used: ${p.reading.at(-1) ?? ""}`)]], kept)
-    : h("p", { className: "hx-hint" }, "None yet.")];
+  return [h("h3", {}, t("Kept photographs ({n})", { n: count(kept.length) })), kept.length
+    ? table([[t("Time"), (p) => h("a", { href: `/api/v1/photographs/${p.identity}`, target: "_blank", rel: "noopener" }, clock(p.at))], [t("Target"), (p) => p.target],
+      [t("Sighting (mrad)"), (p) => { const s = sighting(p); return s ? mrad(s.error) : "–"; }, "num"],
+      [t("Result of its visit"), (p) => h("span", { className: p.outcome === "calibrated" ? "good" : "warn", title: `${p.text}\n${p.reading.join("\n")}` }, p.used ? t(p.outcome.replaceAll("_", " ")) : t("not used: {why}", { why: p.reading.at(-1) ?? "" }))]], kept)
+    : h("p", { className: "hx-hint" }, t("None yet."))];
 }
-const parameter = (value, unit) => (value === null ? "–" : unit === "rad" ? (1e3 * value).toFixed(3) : value.toFixed(4));
+const parameter = (value, unit) => (value === null ? "–" : unit === "rad" ? fixed(1e3 * value, 3) : fixed(value, 4));
 
 export function targets(box) {
   const off = [], shown = new Map();
   for (const name of store.field.targets) {
-    const image = h("img", { alt: `Photograph of ${name}` }), said = h("p", { className: "hx-reading" }), at = h("span", { className: "hx-chip" }, "no photograph yet");
+    const image = h("img", { alt: t("Photograph of {name}", { name }) }), said = h("p", { className: "hx-reading" }), at = h("span", { className: "hx-chip" }, t("no photograph yet"));
     box.append(h("h3", {}, name, at), canCommand() ? h("div", { className: "hx-row" }, h("button", { className: "hx-button",
-      onclick: () => act(() => api("POST", `targets/${encodeURIComponent(name)}/photograph`), `photograph ${name}`) }, "Photograph now"),
-      me.role === "engineer" ? h("button", { className: "hx-button", title: "Click the corners and marks of the target in its camera's picture: the perspective of later photographs",
-        onclick: () => act(() => markCorners(name), `mark corners of ${name}`, false) }, "Mark corners…") : "") : "", h("div", { className: "hx-photo" }, image), said);
+      onclick: () => act(() => api("POST", `targets/${encodeURIComponent(name)}/photograph`), t("photograph {name}", { name })) }, t("Photograph now")),
+      me.role === "engineer" ? h("button", { className: "hx-button", title: t("Click the corners and marks of the target in its camera's picture: the perspective of later photographs"),
+        onclick: () => act(() => markCorners(name), t("mark corners of {name}", { name }), false) }, t("Mark corners…")) : "") : "", h("div", { className: "hx-photo" }, image), said);
     shown.set(name, { image, said, at });
     off.push(refreshed(async () => {
       if (!store.head?.cameras?.[name]) return;
       const view = await api("GET", `targets/${encodeURIComponent(name)}`);
       image.src = `/api/v1/targets/${encodeURIComponent(name)}/photograph?${view.version}`;
       said.textContent = view.reading.join("\n");
-      at.textContent = `${clock(view.at)} · no. ${view.version}`;
+      at.textContent = t("{time} · no. {n}", { time: clock(view.at), n: count(view.version) });
     }, { key: () => store.head?.cameras?.[name] }));
   }
-  if (!shown.size) box.append(h("p", { className: "hx-hint" }, "This plant has no calibration target."));
+  if (!shown.size) box.append(h("p", { className: "hx-hint" }, t("This plant has no calibration target.")));
   return () => off.forEach((end) => end());
 }
 
@@ -213,35 +213,35 @@ function flights(box) {
     const shared = (r) => r.shared.map(([word, value, sigma]) => (word.endsWith(", m")
       ? `${word.slice(0, -3)} ${number(1e3 * value, 1)} ± ${number(1e3 * sigma, 1)} mm` : `${word.split(",")[0]} ${number(1e6 * value, 0)} ± ${number(1e6 * sigma, 0)} ppm`));
     body.replaceChildren(
-      h("div", { className: "hx-row" }, h("h3", {}, "Flights of a drone"),
-        me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => file.click() }, "Take a flight…") : ""),
-      rows.length ? table([["Taken", (r) => clock(r.at)], ["Flight", (r) => h("span", { title: shared(r).join("\n") }, r.name)], ["By", (r) => r.person],
-        ["Heliostats", (r) => count(r.heliostats), "num"], ["In use", (r) => count(r.in_use), "num"],
-        ["At stow", (r) => h("span", { title: "Small changes, taken when the heliostat next stands at stow" }, count(r.at_stow)), "num"],
-        ["Photograph", (r) => h("span", { title: "Large changes and first calibrations, verified on a target first" }, count(r.at_target)), "num"],
-        ["Unchanged", (r) => h("span", { className: r.unchanged ? "warn" : "", title: r.problems.join("\n") }, count(r.unchanged)), "num"],
-        ["Shared errors", (r) => shared(r).slice(0, 3).join(", ")]], rows)
-        : h("p", { className: "hx-hint" }, "No flight has been taken."));
+      h("div", { className: "hx-row" }, h("h3", {}, t("Flights of a drone")),
+        me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => file.click() }, t("Take a flight…")) : ""),
+      rows.length ? table([[t("Taken"), (r) => clock(r.at)], [t("Flight"), (r) => h("span", { title: shared(r).join("\n") }, r.name)], [t("By"), (r) => r.person],
+        [t("Heliostats"), (r) => count(r.heliostats), "num"], [t("In use"), (r) => count(r.in_use), "num"],
+        [t("At stow"), (r) => h("span", { title: t("Small changes, taken when the heliostat next stands at stow") }, count(r.at_stow)), "num"],
+        [t("Photograph"), (r) => h("span", { title: t("Large changes and first calibrations, verified on a target first") }, count(r.at_target)), "num"],
+        [t("Unchanged"), (r) => h("span", { className: r.unchanged ? "warn" : "", title: r.problems.join("\n") }, count(r.unchanged)), "num"],
+        [t("Shared errors"), (r) => shared(r).slice(0, 3).join(", ")]], rows)
+        : h("p", { className: "hx-hint" }, t("No flight has been taken.")));
   };
   file.onchange = () => act(async () => {
     const chosen = file.files[0];
     file.value = "";
     let document;
-    try { document = JSON.parse(await chosen.text()); } catch { throw new Error(`${chosen.name} is not a flight.json of drone evaluate`); }
+    try { document = JSON.parse(await chosen.text()); } catch { throw new Error(t("{name} is not a flight.json of drone evaluate", { name: chosen.name })); }
     await api("POST", "flights", document);
     await shown();
-  }, "flight");
+  }, t("flight"));
   return refreshed(shown, { every: 5 });
 }
 
 // What the plant predicted for this day, and what has come true since the first prediction.
 const OUTLOOKS = ["LOCKED", "SEARCHING"], TRUE = "APPROACHING";
 function outlookView(view, canvas, key) {
-  if (!view.outlooks.length) return h("p", { className: "hx-hint" }, "No prediction yet: it is made once calibration runs and half of the field is up.");
-  const keys = view.outlooks.map((o, i) => [`predicted at ${clock(o.made).slice(0, 5)}`, colourOf(OUTLOOKS[i])]);
+  if (!view.outlooks.length) return h("p", { className: "hx-hint" }, t("No prediction yet: it is made once calibration runs and half of the field is up."));
+  const keys = view.outlooks.map((o, i) => [t("predicted at {time}, median", { time: clock(o.made).slice(0, 5) }), colourOf(OUTLOOKS[i])]);
   return h("div", { className: "hx-outlook" }, canvas, h("p", { className: "hx-keys" },
-    [["came true", colourOf(TRUE)], ...keys].flatMap(([text, colour]) => [key(`${text}, median`, colour), key("90th percentile", colour, true)])),
-  h("p", { className: "hx-hint" }, `Predicted at ${clock(view.outlooks.at(-1).made).slice(0, 5)}: ${view.outlooks.at(-1).text}.`));
+    [[t("came true, median"), colourOf(TRUE)], ...keys].flatMap(([text, colour]) => [key(text, colour), key(t("90th percentile"), colour, true)])),
+  h("p", { className: "hx-hint" }, t("Predicted at {time}: {text}.", { time: clock(view.outlooks.at(-1).made).slice(0, 5), text: view.outlooks.at(-1).text })));
 }
 
 function outlookLines(view) {
@@ -256,11 +256,11 @@ function learning(box) {
   box.append(body);
   const shown = async () => {
     const rows = await api("GET", "learning");
-    const learn = (group) => act(async () => { await api("POST", "learning", { group }); await shown(); }, `learn ${group}`);
-    body.replaceChildren(h("h3", {}, "Learnt at night"),
-      table([["Group", (r) => r.group], ["Version", (r) => (r.version ? h("span", { title: `${count(r.sightings)} photographs of ${count(r.heliostats)} heliostats` }, `${r.version}, ${new Date(1e3 * r.at).toISOString().slice(0, 16).replace("T", " ")}`) : "defaults")],
-        ["In force", (r) => r.drift], ["", (r) => h("span", { className: "hx-hint" }, r.said)],
-        ["", (r) => (me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => learn(r.group) }, "Learn now") : "")]], rows));
+    const learn = (group) => act(async () => { await api("POST", "learning", { group }); await shown(); }, t("learn {group}", { group }));
+    body.replaceChildren(h("h3", {}, t("Learnt at night")),
+      table([[t("Group"), (r) => r.group], [t("Version"), (r) => (r.version ? h("span", { title: t("{n} photographs of {all} heliostats", { n: count(r.sightings), all: count(r.heliostats) }) }, `${r.version}, ${dayOf(r.at)} ${clock(r.at).slice(0, 5)}`) : t("defaults"))],
+        [t("In force"), (r) => r.drift], ["", (r) => h("span", { className: "hx-hint" }, r.said)],
+        ["", (r) => (me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => learn(r.group) }, t("Learn now")) : "")]], rows));
   };
   return refreshed(shown, { every: 5 });
 }
@@ -271,7 +271,7 @@ function several(names, key, shown) {
   if (names.length <= FEW + 1) return h("b", {}, names.join(", "));
   const rest = names.slice(FEW);
   const box = h("details", { className: "hx-several", open: shown.has(key) },
-    h("summary", { title: names.join(", ") }, h("b", {}, names.slice(0, FEW).join(", ")), ` and ${count(rest.length)} more`), rest.join(", "));
+    h("summary", { title: names.join(", ") }, h("b", {}, names.slice(0, FEW).join(", ")), " ", t("and {n} more", { n: count(rest.length) })), rest.join(", "));
   box.ontoggle = () => (box.open ? shown.add(key) : shown.delete(key));
   return box;
 }
@@ -290,22 +290,22 @@ export function calibration(box) {
   const draw = () => {
     if (!view) return;
     const quality = recent(view.quality), truth = quality.some((p) => p.truth_median !== null);
-    const running = view.running.map((r) => h("li", {}, several([r.heliostat, ...r.others], r.target, shown), ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
+    const running = view.running.map((r) => h("li", {}, several([r.heliostat, ...r.others], r.target, shown), " ", t("on {target}: {stage}", { target: r.target, stage: r.stage }), h("em", {}, " ", t("since {time}", { time: clock(r.since) }))));
     const key = (text, colour, dashed) => h("span", {}, h("i", { className: dashed ? "dashed" : "", style: `color:${colour}` }), text);
     body.replaceChildren(
-      h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? "Running" : `Off: ${view.reason}`),
-        canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("PUT", "calibration", { on: !view.on }), "calibration") }, view.on ? "Switch off" : "Switch on") : ""),
-      facts([["Calibrated", count(view.done)], ["Waiting", count(view.waiting)], ["Failed", count(view.failed)]]),
-      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement in progress"), view.asked.length ? h("li", {}, "asked for next: ", several(view.asked, "", shown)) : ""),
+      h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? t("Running") : t("Off: {reason}", { reason: view.reason })),
+        canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("PUT", "calibration", { on: !view.on }), t("calibration")) }, view.on ? t("Switch off") : t("Switch on")) : ""),
+      facts([[t("Calibrated"), count(view.done)], [t("Waiting"), count(view.waiting)], [t("Failed"), count(view.failed)]]),
+      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, t("no measurement in progress")), view.asked.length ? h("li", {}, t("asked for next:"), " ", several(view.asked, "", shown)) : ""),
       ...waiting.map((one) => waitingView(one)),
-      h("h3", {}, "Error of the calibrated heliostats (mrad)"), lines,
-      h("p", { className: "hx-keys" }, key("predicted, median", colourOf("APPROACHING")), key("90th percentile", colourOf("APPROACHING"), true),
-        truth ? [key("true (twin), median", colourOf("SEARCHING")), key("90th percentile", colourOf("SEARCHING"), true)] : ""),
-      h("h3", {}, "Error of all heliostats over the year (mrad), UTC"), outlookView(view, ahead, key),
-      h("h3", {}, "Last measurements"),
-      table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target, "more"],
-        ["Before", (r) => mrad(r.before), "num"], ["After", (r) => mrad(r.after), "num"], ["Predicted", (r) => mrad(r.predicted), "num"],
-        ...(truth ? [["True before → after", (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"]] : []),
+      h("h3", {}, t("Error of the calibrated heliostats (mrad)")), lines,
+      h("p", { className: "hx-keys" }, key(t("predicted, median"), colourOf("APPROACHING")), key(t("90th percentile"), colourOf("APPROACHING"), true),
+        truth ? [key(t("true (twin), median"), colourOf("SEARCHING")), key(t("90th percentile"), colourOf("SEARCHING"), true)] : ""),
+      h("h3", {}, t("Error of all heliostats over the year (mrad), UTC")), outlookView(view, ahead, key),
+      h("h3", {}, t("Last measurements")),
+      table([[t("Time"), (r) => clock(r.at)], [t("Heliostat"), (r) => r.heliostat], [t("Target"), (r) => r.target, "more"],
+        [t("Before"), (r) => mrad(r.before), "num"], [t("After"), (r) => mrad(r.after), "num"], [t("Predicted"), (r) => mrad(r.predicted), "num"],
+        ...(truth ? [[t("True before → after"), (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"]] : []),
         ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
     chart(lines, [["median", "APPROACHING"], ["percentile_90", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_percentile_90", "SEARCHING", [5, 4]]]
       .map(([field, colour, dash]) => ({ points: quality.filter((p) => p[field] !== null).map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
@@ -324,11 +324,11 @@ export function clusters(box) {
     const rows = await api("GET", "clusters");
     const rank = (r) => (r.alive ? (r.live < r.heliostats ? 1 : 2) : 0);
     rows.sort((a, b) => rank(a) - rank(b) || a.name.localeCompare(b.name));
-    body.replaceChildren(facts([["Heard", `${rows.filter((r) => r.alive).length} of ${rows.length}`]]),
-      table([["Cluster", (r) => r.name], ["", (r) => h("span", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? "● healthy" : "▲ degraded") : "✕ silent")],
-        ["Heliostats", (r) => `${r.live}/${r.heliostats}`, "num"], ["Heard", (r) => (r.age === null ? "never" : `${number(r.age, 1)} s`), "num"],
-        ["Poll (ms)", (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "num"], ["Answered", (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
-        ["Lease (s)", (r) => number(r.lease_left, 1), "num"], ["Clock", (r) => r.time_quality], ["Settings", (r) => r.settings || "not known"], ["", (r) => [r.acts.join(", "), r.problem].filter(Boolean).join("; ")]],
+    body.replaceChildren(facts([[t("Heard"), t("{n} of {all}", { n: count(rows.filter((r) => r.alive).length), all: count(rows.length) })]]),
+      table([[t("Cluster"), (r) => r.name], ["", (r) => h("span", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? t("● healthy") : t("▲ degraded")) : t("✕ silent"))],
+        [t("Heliostats"), (r) => `${r.live}/${r.heliostats}`, "num"], [t("Heard"), (r) => (r.age === null ? t("never") : `${number(r.age, 1)} s`), "num"],
+        [t("Poll (ms)"), (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "num"], [t("Answered"), (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
+        [t("Lease (s)"), (r) => number(r.lease_left, 1), "num"], [t("Clock"), (r) => r.time_quality], [t("Settings"), (r) => r.settings || t("not known")], ["", (r) => [r.acts.join(", "), r.problem].filter(Boolean).join("; ")]],
       rows, (r) => { const place = store.field.clusters.indexOf(r.name); store.select(store.field.cluster.flatMap((c, row) => (c === place ? [row] : [])), -1); }));
   }, { every: 3 });
 }
@@ -354,15 +354,15 @@ export function alarms(box) {
     const acknowledge = async (those) => {
       const refused = [];
       for (const r of those) await api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }).catch((error) => refused.push(error.message));
-      if (refused.length) throw new Error(those.length === 1 ? refused[0] : `${refused.length} of ${those.length} refused: ${refused[0]}`);
+      if (refused.length) throw new Error(those.length === 1 ? refused[0] : t("{n} of {all} refused: {why}", { n: count(refused.length), all: count(those.length), why: refused[0] }));
     };
-    body.replaceChildren(h("div", { className: "hx-row" }, h("b", {}, `${open.length} not acknowledged, ${rows.filter((r) => r.active).length} active`),
-      canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(open), "acknowledge all") }, "Acknowledge all") : ""),
+    body.replaceChildren(h("div", { className: "hx-row" }, h("b", {}, t("{open} not acknowledged, {active} active", { open: count(open.length), active: count(rows.filter((r) => r.active).length) })),
+      canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(open), t("acknowledge all")) }, t("Acknowledge all")) : ""),
     rows.length ? table([["", (r) => h("span", { className: r.active ? (severe[r.severity] ?? "warn") : "" }, r.active ? (severe[r.severity] === "bad" ? "✕" : "▲") : "○")],
-      ["Time", (r) => clock(r.at)], ["What", (r) => h("div", {}, h("b", {}, r.condition, r.subject ? " · " : ""), r.subject ? several(r.rows.map((one) => one.subject), r.like, shown) : "", h("div", { className: "hx-hint" }, r.said))],
-      ["", (r) => (r.active ? "active" : "over")],
-      ["", (r) => (r.acknowledged_by ? `✓ ${r.acknowledged_by}` : canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(r.rows), "acknowledge") }, "Acknowledge") : "not acknowledged")],
-      ["×", (r) => r.rows.reduce((sum, one) => sum + one.count, 0), "num"]], alike(rows)) : h("p", { className: "hx-hint" }, "No alarms."));
+      [t("Time"), (r) => clock(r.at)], [t("What"), (r) => h("div", {}, h("b", {}, r.condition, r.subject ? " · " : ""), r.subject ? several(r.rows.map((one) => one.subject), r.like, shown) : "", h("div", { className: "hx-hint" }, r.said))],
+      ["", (r) => (r.active ? t("active") : t("over"))],
+      ["", (r) => (r.acknowledged_by ? `✓ ${r.acknowledged_by}` : canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(r.rows), t("acknowledge")) }, t("Acknowledge")) : t("not acknowledged"))],
+      ["×", (r) => r.rows.reduce((sum, one) => sum + one.count, 0), "num"]], alike(rows)) : h("p", { className: "hx-hint" }, t("No alarms.")));
   }, { key: () => store.head?.alarms, every: 4 });
 }
 
@@ -381,13 +381,13 @@ function eventText(r) {
 
 export function logs(box) {
   let which = "events", filter = "";
-  const body = h("div"), past = journal(), tabs = ["events", "journal", "packets", "commands"].map((name) => h("button", { className: "hx-button", onclick: () => { which = name; mark(); load(); } }, name));
-  const find = h("input", { type: "search", placeholder: "filter", oninput: () => { filter = find.value.toLowerCase(); load(); } });
-  const mark = () => tabs.forEach((tab) => tab.classList.toggle("main", tab.textContent === which));
+  const body = h("div"), past = journal(), tabs = [word("events"), word("journal"), word("packets"), word("commands")].map((name) => h("button", { className: "hx-button", type: "button", value: name, onclick: () => { which = name; mark(); load(); } }, t(name)));
+  const find = h("input", { type: "search", placeholder: t("filter"), oninput: () => { filter = find.value.toLowerCase(); load(); } });
+  const mark = () => tabs.forEach((tab) => tab.classList.toggle("main", tab.value === which));
   const columns = {
-    events: [["Time", (r) => moment(r.at)], ["Kind", (r) => r.kind], ["Who", (r) => r.who], ["", eventText]],
-    packets: [["Time", (r) => clock(r.at)], ["Cluster", (r) => `${r.way === "to" ? "→" : "←"} ${r.cluster}`], ["Kind", (r) => r.kind], ["Bytes", (r) => r.size, "num"], ["", (r) => h("code", {}, r.text)]],
-    commands: [["Command", (r) => r.command], ["Heliostats", (r) => count(r.heliostats), "num"], ["", (r) => h("span", { className: r.finished ? (r.good ? "good" : "warn") : "" }, r.text)]],
+    events: [[t("Time"), (r) => moment(r.at)], [t("Kind"), (r) => t(r.kind)], [t("Who"), (r) => r.who], ["", eventText]],
+    packets: [[t("Time"), (r) => clock(r.at)], [t("Cluster"), (r) => `${r.way === "to" ? "→" : "←"} ${r.cluster}`], [t("Kind"), (r) => r.kind], [t("Bytes"), (r) => r.size, "num"], ["", (r) => h("code", {}, r.text)]],
+    commands: [[t("Command"), (r) => r.command], [t("Heliostats"), (r) => count(r.heliostats), "num"], ["", (r) => h("span", { className: r.finished ? (r.good ? "good" : "warn") : "" }, r.text)]],
   };
   const load = async () => {
     find.hidden = which === "journal";
@@ -405,65 +405,65 @@ export function logs(box) {
 function journal() {
   const day = (back) => new Date(1e3 * (store.head.utc - 86400 * back)).toISOString().slice(0, 10);
   const field = (label, given) => { const input = h("input", given); return [h("label", { className: "hx-field" }, label, input), input]; };
-  const [fromLabel, from] = field("From", { type: "date", value: day(1) }), [toLabel, to] = field("To", { type: "date", value: day(0) });
-  const [whoLabel, who] = field("Person", { type: "search", maxLength: 64 }), [nameLabel, name] = field("Heliostat", { type: "search", maxLength: 64 });
-  const [textLabel, text] = field("Text", { type: "search", maxLength: 100 });
-  const kind = h("select", { ariaLabel: "Kind" }, ["all kinds", "event", "alarm", "command"].map((one) => h("option", { value: one === "all kinds" ? "" : one }, one)));
-  const all = h("input", { type: "checkbox" }), allLabel = h("label", { className: "hx-field" }, all, "commands of automatic control too");
-  const found = h("div"), said = h("p", { className: "hx-hint" }, "Events, alarms and commands of all days, over restarts."), most = 1000;
+  const [fromLabel, from] = field(t("From"), { type: "date", value: day(1) }), [toLabel, to] = field(t("To"), { type: "date", value: day(0) });
+  const [whoLabel, who] = field(t("Person"), { type: "search", maxLength: 64 }), [nameLabel, name] = field(t("Heliostat"), { type: "search", maxLength: 64 });
+  const [textLabel, text] = field(t("Text"), { type: "search", maxLength: 100 });
+  const kind = h("select", { ariaLabel: t("Kind") }, [["", t("all kinds")], ["event", t("event")], ["alarm", t("alarm")], ["command", t("command")]].map(([value, text]) => h("option", { value }, text)));
+  const all = h("input", { type: "checkbox" }), allLabel = h("label", { className: "hx-field" }, all, t("commands of automatic control too"));
+  const found = h("div"), said = h("p", { className: "hx-hint" }, t("Events, alarms and commands of all days, over restarts.")), most = 1000;
   let rows = [];
   const unfolded = new Set();
   const search = async () => {
     const seconds = (date, more) => (date ? { [more ? "until" : "since"]: Date.parse(`${date}T00:00:00Z`) / 1e3 + (more ? 86400 : 0) } : {});
     const query = new URLSearchParams({ ...seconds(from.value, false), ...seconds(to.value, true), kind: kind.value, person: who.value.trim(), heliostat: name.value.trim(), text: text.value.trim(), but: all.checked ? "" : "automatic control", limit: most });
     rows = await api("GET", `journal?${query}`);
-    said.textContent = rows.length === most ? `The latest ${count(most)}; choose fewer days or a text.` : `${count(rows.length)} entries.`;
-    found.replaceChildren(table([["Time (UTC)", (r) => moment(r.at)], ["Kind", (r) => h("span", { className: severe[r.severity] ?? "" }, r.kind)], ["What", (r) => r.what], ["", (r) => (r.heliostats.length ? h("span", {}, several(r.heliostats, `${r.at}${r.what}`, unfolded), " ", r.text) : r.text)]], rows));
+    said.textContent = rows.length === most ? t("The latest {n}; choose fewer days or a text.", { n: count(most) }) : t("{n} entries.", { n: count(rows.length) });
+    found.replaceChildren(table([[t("Time (UTC)"), (r) => moment(r.at)], [t("Kind"), (r) => h("span", { className: severe[r.severity] ?? "" }, t(r.kind))], [t("What"), (r) => (r.kind === "event" ? t(r.what) : r.what)], ["", (r) => (r.heliostats.length ? h("span", {}, several(r.heliostats, `${r.at}${r.what}`, unfolded), " ", r.text) : r.text)]], rows));
   };
-  const form = h("form", { className: "hx-row hx-search", onsubmit: (event) => { event.preventDefault(); act(search, "journal", false); } },
-    fromLabel, toLabel, kind, whoLabel, nameLabel, textLabel, allLabel, h("button", { className: "hx-button main" }, "Search"),
-    h("button", { className: "hx-button", type: "button", onclick: () => saveCsv("journal.csv", ["time", "kind", "what", "text"], rows.map((r) => [new Date(1e3 * r.at).toISOString(), r.kind, r.what, r.text])) }, "Save as CSV"));
+  const form = h("form", { className: "hx-row hx-search", onsubmit: (event) => { event.preventDefault(); act(search, t("journal"), false); } },
+    fromLabel, toLabel, kind, whoLabel, nameLabel, textLabel, allLabel, h("button", { className: "hx-button main" }, t("Search")),
+    h("button", { className: "hx-button", type: "button", onclick: () => saveCsv("journal.csv", ["time", "kind", "what", "text"], rows.map((r) => [new Date(1e3 * r.at).toISOString(), r.kind, r.what, r.text])) }, t("Save as CSV")));
   return h("div", {}, form, said, found);
 }
 
-const minute = (at) => (at ? new Date(1e3 * at).toISOString().slice(5, 16).replace("T", " ") : "–");
-const stateOf = (name) => h("span", { className: store.stateName(store.index.get(name)) === "STOWED" ? "good" : "bad" }, store.stateName(store.index.get(name)));
+const minute = (at) => (at ? `${monthDay(at)} ${clock(at).slice(0, 5)}` : "–");
+const stateOf = (name) => h("span", { className: store.stateName(store.index.get(name)) === "STOWED" ? "good" : "bad" }, t(store.stateName(store.index.get(name))));
 // What is locked: a heliostat by its bare name, else with its kind.
-const lockedName = (one) => (one.kind === "heliostat" || one.kind === "tower" ? one.name : `${one.kind} ${one.name}`);
+const lockedName = (one) => (one.kind === "tower" ? t("tower") : one.kind === "heliostat" ? one.name : `${t(one.kind)} ${one.name}`);
 const places = (kind, name) => (kind === "tower" ? { tower: true } : { [`${kind}s`]: [name] });
 // Each person returns their own lock; an engineer may remove another's by the owner's name.
 async function giveBack(one) {
   const own = one.who === me.name, name = lockedName(one);
-  const v = own ? await ask(`Return your lock on ${name} (${one.reason})? Make sure that you and your tools are away.`, [], "Return lock")
-    : await ask(`Remove the lock of ${one.who} on ${name} (${one.reason})? Make sure that ${one.who} is not there.`, [{ name: "reason", label: "Why its owner cannot return it" }], "Remove lock");
-  if (v) await act(() => api("POST", "holds/release", { ...places(one.kind, one.name), ...(own ? {} : { owner: one.who, reason: v.reason }) }), `return the lock on ${name}`);
+  const v = own ? await ask(t("Return your lock on {name} ({reason})? Make sure that you and your tools are away.", { name, reason: one.reason }), [], t("Return lock"))
+    : await ask(t("Remove the lock of {who} on {name} ({reason})? Make sure that {who} is not there.", { who: one.who, name, reason: one.reason }), [{ name: "reason", label: t("Why its owner cannot return it") }], t("Remove lock"));
+  if (v) await act(() => api("POST", "holds/release", { ...places(one.kind, one.name), ...(own ? {} : { owner: one.who, reason: v.reason }) }), t("return the lock on {name}", { name }));
 }
 async function lockPlace() {
   const { targets, receivers } = store.field;
-  const named = new Map([...targets.map((name) => [`target ${name}`, ["target", name]]), ...receivers.map((name) => [`receiver ${name}`, ["receiver", name]]), ["tower", ["tower", "tower"]]]);
-  await askAnd("Lock a target, a receiver or the tower? Heliostats whose beams are aimed there stow, and none comes until everybody has returned their lock; under a locked tower all stow.", [
-    { name: "place", label: "Place", options: [...named.keys()] }, { name: "reason", label: "Reason" }, { name: "hours", label: "Expected back in (hours)", type: "number", value: "4", required: false }], "Lock",
-  (v) => api("POST", "holds", { ...places(...named.get(v.place)), reason: v.reason, hours: Number(v.hours) || null }), "lock");
+  const named = new Map([...targets.map((name) => [`${t("target")} ${name}`, ["target", name]]), ...receivers.map((name) => [`${t("receiver")} ${name}`, ["receiver", name]]), [t("tower"), ["tower", "tower"]]]);
+  await askAnd(t("Lock a target, a receiver or the tower? Heliostats whose beams are aimed there stow, and none comes until everybody has returned their lock; under a locked tower all stow."), [
+    { name: "place", label: t("Place"), options: [...named.keys()] }, { name: "reason", label: t("Reason") }, { name: "hours", label: t("Expected back in (hours)"), type: "number", value: "4", required: false }], t("Lock"),
+  (v) => api("POST", "holds", { ...places(...named.get(v.place)), reason: v.reason, hours: Number(v.hours) || null }), t("lock"));
 }
 
 // The operator's own timetable: heliostats calibrated at times of day or at intervals.
 const listed = (text) => text.split(",").map((one) => one.trim()).filter(Boolean);
 async function putTimetable(entries, what) { await act(() => api("PUT", "timetable", { entries }), what); }
 const asGiven = ({ name, heliostats, target, at, every_s, rule }) => ({ name, heliostats, target, at, every_s, rule });
-const RULES = { "at its times": "", "first: before others whenever a visit is worth it": "first", "never: only persons calibrate them": "never" };
+const RULES = [["", t("at its times")], ["first", t("first: before others whenever a visit is worth it")], ["never", t("never: only persons calibrate them")]];
 async function addEntry(rows) {
-  await askAnd("Calibrate heliostats at times of day, at an interval, or both; or have automatic control take them first, or never?", [
-    { name: "name", label: "Name of the entry" }, { name: "heliostats", label: "Heliostats, separated by commas", value: store.selected().slice(0, 200).join(", ") },
-    { name: "rule", label: "When", options: Object.keys(RULES) },
-    { name: "target", label: "Target", options: ["any", ...store.field.targets] },
-    { name: "at", label: "Times of day with zone (08:30Z, 10:30+02:00)", required: false },
-    { name: "every", label: "Interval from midnight UTC (minutes)", type: "number", required: false }], "Put in force", (v) => {
-    const entry = { name: v.name, heliostats: listed(v.heliostats), target: v.target === "any" ? "" : v.target, at: listed(v.at || ""), every_s: v.every ? 60 * Number(v.every) : null, rule: RULES[v.rule] };
+  await askAnd(t("Calibrate heliostats at times of day, at an interval, or both; or have automatic control take them first, or never?"), [
+    { name: "name", label: t("Name of the entry") }, { name: "heliostats", label: t("Heliostats, separated by commas"), value: store.selected().slice(0, 200).join(", ") },
+    { name: "rule", label: t("When"), options: RULES },
+    { name: "target", label: t("Target"), options: [["", t("any")], ...store.field.targets] },
+    { name: "at", label: t("Times of day with zone (08:30Z, 10:30+02:00)"), required: false },
+    { name: "every", label: t("Interval from midnight UTC (minutes)"), type: "number", required: false }], t("Put in force"), (v) => {
+    const entry = { name: v.name, heliostats: listed(v.heliostats), target: v.target, at: listed(v.at || ""), every_s: v.every ? 60 * Number(v.every) : null, rule: v.rule };
     return api("PUT", "timetable", { entries: [...rows.filter((one) => one.name !== v.name).map(asGiven), entry] });
-  }, "timetable");
+  }, t("timetable"));
 }
 async function removeEntry(rows, name) {
-  if (await ask(`Remove ${name} from the timetable? What it has asked for goes on.`, [], "Remove")) await putTimetable(rows.filter((one) => one.name !== name).map(asGiven), `remove ${name} from the timetable`);
+  if (await ask(t("Remove {name} from the timetable? What it has asked for goes on.", { name }), [], t("Remove"))) await putTimetable(rows.filter((one) => one.name !== name).map(asGiven), t("remove {name} from the timetable", { name }));
 }
 
 export function schedule(box) {
@@ -471,27 +471,27 @@ export function schedule(box) {
   box.append(body);
   return refreshed(async () => {
     const [plan, retries, holds, progress, timed] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "retries"), api("GET", "holds"), api("GET", "calibration"), api("GET", "timetable")]);
-    body.replaceChildren(h("h3", {}, "Next measurements"),
-      progress.reason || progress.choice ? h("p", { className: "hx-hint" }, `Automatic control: ${progress.reason || progress.choice}`) : "",
-      plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
-        : h("p", { className: "hx-hint" }, "No measurement is planned."),
-      h("h3", {}, "Timetable"),
-      canCommand() ? h("button", { className: "hx-button", onclick: () => addEntry(timed) }, "Calibrate at times, first or never…") : "",
-      timed.length ? table([["Entry", (r) => r.name], ["Heliostats", (r) => r.heliostats.join(", ")], ["Target", (r) => r.target || "any"],
-        ["At", (r) => r.rule || [...r.at, ...(r.every_s ? [`every ${span(r.every_s)}`] : [])].join(", ")], ["Next", (r) => minute(r.next)], ["Last", (r) => minute(r.last)], ["Result", (r) => r.text],
-        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => removeEntry(timed, r.name) }, "Remove…") : "")]], timed)
-        : h("p", { className: "hx-hint" }, "Empty."),
-      h("h3", {}, `Tried again, or given up (${count(retries.length)})`),
-      retries.length ? table([["Work", (r) => r.work], ["Of", (r) => r.subject], ["Failed", (r) => `${r.count} of ${r.most}`, "num"], ["Reason", (r) => r.reason],
-        ["Next try", (r) => h("span", { className: r.given_up ? "warn" : "" }, r.given_up ? "given up" : "", r.left === null ? "" : ` ${r.left > 0 ? `in ${span(r.left)}` : "at the next turn"}`)],
-        ["Then", (r) => r.following]], retries.slice(0, 100), (r) => look(r.subject))
-        : h("p", { className: "hx-hint" }, "Nothing."),
-      h("h3", {}, "Out of service"),
-      canCommand() ? h("button", { className: "hx-button", onclick: lockPlace }, "Lock a target, receiver or the tower…") : "",
-      holds.length ? table([["Locked", lockedName], ["State", (r) => (r.kind === "heliostat" ? stateOf(r.name) : "–")], ["Owner", (r) => r.who], ["Since", (r) => minute(r.since)],
-        ["Expected back", (r) => h("span", { className: r.until && r.until < store.head.utc ? "warn" : "" }, r.until ? minute(r.until) : "–", r.until && r.until < store.head.utc ? " overdue" : "")], ["Why", (r) => r.reason],
-        ["", (r) => (r.who === me.name || me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => giveBack(r) }, r.who === me.name ? "Return lock…" : "Remove lock…") : "")]], holds, (r) => r.kind === "heliostat" && look(r.name))
-        : h("p", { className: "hx-hint" }, "None."));
+    body.replaceChildren(h("h3", {}, t("Next measurements")),
+      progress.reason || progress.choice ? h("p", { className: "hx-hint" }, t("Automatic control: {text}", { text: progress.reason || progress.choice })) : "",
+      plan.length ? table([[t("Time"), (r) => clock(r.at)], [t("Heliostat"), (r) => r.heliostat], [t("Target"), (r) => r.target], [t("Gain (mrad)"), (r) => mrad(r.gain), "num"], [t("Why"), (r) => r.reason]], plan, (r) => look(r.heliostat))
+        : h("p", { className: "hx-hint" }, t("No measurement is planned.")),
+      h("h3", {}, t("Timetable")),
+      canCommand() ? h("button", { className: "hx-button", onclick: () => addEntry(timed) }, t("Calibrate at times, first or never…")) : "",
+      timed.length ? table([[t("Entry"), (r) => r.name], [t("Heliostats"), (r) => r.heliostats.join(", ")], [t("Target"), (r) => r.target || t("any")],
+        [t("When"), (r) => (r.rule ? t(r.rule) : [...r.at, ...(r.every_s ? [t("every {time}", { time: span(r.every_s) })] : [])].join(", "))], [t("Next"), (r) => minute(r.next)], [t("Last"), (r) => minute(r.last)], [t("Result"), (r) => r.text],
+        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => removeEntry(timed, r.name) }, t("Remove…")) : "")]], timed)
+        : h("p", { className: "hx-hint" }, t("Empty.")),
+      h("h3", {}, t("Tried again, or given up ({n})", { n: count(retries.length) })),
+      retries.length ? table([[t("Work"), (r) => r.work], [t("Of"), (r) => r.subject], [t("Failed"), (r) => t("{n} of {all}", { n: count(r.count), all: count(r.most) }), "num"], [t("Reason"), (r) => r.reason],
+        [t("Next try"), (r) => h("span", { className: r.given_up ? "warn" : "" }, r.given_up ? t("given up") : "", " ", r.left === null ? "" : r.left > 0 ? t("in {time}", { time: span(r.left) }) : t("at the next turn"))],
+        [t("Then"), (r) => r.following]], retries.slice(0, 100), (r) => look(r.subject))
+        : h("p", { className: "hx-hint" }, t("Nothing.")),
+      h("h3", {}, t("Out of service")),
+      canCommand() ? h("button", { className: "hx-button", onclick: lockPlace }, t("Lock a target, receiver or the tower…")) : "",
+      holds.length ? table([[t("Locked"), lockedName], [t("State"), (r) => (r.kind === "heliostat" ? stateOf(r.name) : "–")], [t("Owner"), (r) => r.who], [t("Since"), (r) => minute(r.since)],
+        [t("Expected back"), (r) => h("span", { className: r.until && r.until < store.head.utc ? "warn" : "" }, r.until ? minute(r.until) : "–", r.until && r.until < store.head.utc ? ` ${t("overdue")}` : "")], [t("Why"), (r) => r.reason],
+        ["", (r) => (r.who === me.name || me.role === "engineer" ? h("button", { className: "hx-button", onclick: () => giveBack(r) }, r.who === me.name ? t("Return lock…") : t("Remove lock…")) : "")]], holds, (r) => r.kind === "heliostat" && look(r.name))
+        : h("p", { className: "hx-hint" }, t("None.")));
   }, { every: 5 });
 }
 

@@ -1,8 +1,8 @@
 // What the page and the wall screen both show: the head, what is open, and the flux on a receiver.
 import { store } from "./live.js";
 import { cividis, dark } from "./palette.js";
-import { count, degrees, h, local } from "./dom.js";
-import { t } from "./words.js";
+import { count, degrees, h, local, number } from "./dom.js";
+import { day as dayOf, t } from "./words.js";
 
 export function headOf(box) {
   const day = h("b", { className: "hx-day" }), time = h("b"), speed = h("span", { className: "hx-hint" }), sun = h("span", { className: "hx-sun" }), live = h("span", { className: "hx-live" });
@@ -10,13 +10,13 @@ export function headOf(box) {
   const show = () => {
     const now = store.head;
     if (!now) return;
-    day.textContent = now.at.slice(0, 10);
+    day.textContent = dayOf(Date.parse(`${now.at.slice(0, 10)}T00:00:00Z`) / 1e3);
     const here = local(now.utc);
     time.textContent = `${now.at.slice(11, 19)} UTC${here && ` · ${here} ${t("local")}`}`;
-    speed.textContent = Math.abs(now.pace - 1) > 0.05 ? `simulated at ${now.pace.toPrecision(2)} × real time` : "";
+    speed.textContent = Math.abs(now.pace - 1) > 0.05 ? t("simulated at {pace} × real time", { pace: number(now.pace, now.pace < 10 ? 1 : 0) }) : "";
     sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
   };
-  const mark = () => { live.textContent = store.live ? "● live" : "✕ NOT LIVE"; live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };
+  const mark = () => { live.textContent = store.live ? t("● live") : t("✕ NOT LIVE"); live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };
   store.on("frame", show);
   store.on("live", mark);
   mark(); show();
@@ -28,7 +28,9 @@ export function alertText(box, text = h("span")) {
   store.on("frame", (now) => {
     box.classList.toggle("on", now.emergency || Boolean(now.resume));
     box.classList.toggle("waits", !now.emergency);
-    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)} · ${now.order.basis}${now.order.calls.length ? "" : " · when the causes have gone, Resume ends it and gives the field back to automatic control"}` : now.resume;
+    text.textContent = now.emergency ? [t("EMERGENCY {act} by {who}", { act: t(now.order.act), who: now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || t("the safety table") }),
+      t("acknowledged {n} of {all}", { n: count(now.order.acknowledged), all: count(now.order.heliostats) }), t("done {n}", { n: count(now.order.done) }), now.order.basis,
+      now.order.calls.length ? "" : t("when the causes have gone, Resume ends it and gives the field back to automatic control")].filter(Boolean).join(" · ") : now.resume;
   });
 }
 
@@ -57,6 +59,6 @@ export function drawFlux(canvas, view) {
   const ink = dark() ? "#c9d1d9" : "#24292f";
   for (let i = 0; i < high; i++) { c.fillStyle = `rgb(${cividis(1 - i / high).join(",")})`; c.fillRect(wide + 12, i, 12, 1); }
   c.fillStyle = ink; c.font = "11px system-ui, sans-serif"; c.textAlign = "left";
-  c.fillText(`${(peak / 1e3).toFixed(0)}`, wide + 28, 10); c.fillText("kW/m²", wide + 28, 24); c.fillText("0", wide + 28, high);
-  c.fillText(`${(2 * halfOf(view.right)).toFixed(1)} × ${(2 * halfOf(view.up)).toFixed(1)} m, seen from the field`, 0, high + 16);
+  c.fillText(number(peak / 1e3, 0), wide + 28, 10); c.fillText("kW/m²", wide + 28, 24); c.fillText("0", wide + 28, high);
+  c.fillText(t("{width} × {height} m, seen from the field", { width: number(2 * halfOf(view.right), 1), height: number(2 * halfOf(view.up), 1) }), 0, high + 16);
 }

@@ -2,10 +2,10 @@
 import { api, me, store } from "./live.js";
 import { count, h, lay, moment, number, table } from "./dom.js";
 import { act, askAnd } from "./orders.js";
-import { t } from "./words.js";
+import { fixed, t } from "./words.js";
 
 const UNITS = { rad: ["mrad", 1e3], m: ["mm", 1e3], 1: ["", 1] };
-const shown = (value, unit) => (value === null ? "–" : (value * UNITS[unit][1]).toFixed(3));
+const shown = (value, unit) => (value === null ? "–" : fixed(value * UNITS[unit][1], 3));
 
 // The changes that wait for a second engineer; those of one heliostat if it is named.
 export async function waitingChanges(name) {

@@ -20,7 +20,7 @@ function figures(box) {
       large(t("Direct sunlight"), reading("dni", 0, "W/m²")), large(t("Wind gust"), reading("wind_gust", 1, "m/s")));
     states.replaceChildren(h("div", { className: "hx-bars" }, Object.entries(head.states).map(([state, n]) => {
       const bar = h("i"); bar.style.width = `${Math.max(1, (100 * n) / head.heliostats)}%`; bar.style.background = colourOf(state);
-      return h("div", {}, h("span", {}, state), h("b", {}, bar), h("em", {}, count(n)));
+      return h("div", {}, h("span", {}, t(state)), h("b", {}, bar), h("em", {}, count(n)));
     })));
   };
   store.on("frame", show);

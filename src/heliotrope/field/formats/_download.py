@@ -1,9 +1,9 @@
-"""Downloads one file: resumed where it broke off, and on the disk whole or not at all.
+"""Downloads one file, resumes after an interruption, and stores only complete files.
 
-A file grows under its name with the suffix ``.part`` and gets its own name when it is complete
-and checked. Its ETag, date and size are kept in a journal, one line of JSON per file, so
-that a later run only asks whether the file has changed, and a broken one resumes only if it
-has not. `docs/decisions` says why pooch does not do this job.
+A download is written to the file name with the suffix ``.part`` and renamed when it is complete and
+verified. ETag, date and size are kept in a journal, one line of JSON per file, so that a later run
+only asks the server whether the file has changed, and an interrupted download resumes only if it
+has not. `docs/decisions` explains why pooch is not used.
 """
 
 import errno

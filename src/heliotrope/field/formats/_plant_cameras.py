@@ -1,4 +1,4 @@
-"""Marks and cameras of a plant file: from tables to objects, and back."""
+"""Marks and cameras in a plant file: from tables to objects, and back."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Settings of joint and of receiver visits in a plant's TOML file, read and written."""
+"""Settings of joint and receiver visits in the plant file, read and written."""
 
 from dataclasses import MISSING, fields
 from typing import Any

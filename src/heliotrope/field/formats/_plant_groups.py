@@ -1,4 +1,4 @@
-"""Groups of a plant file: from tables to mechanisms and machines, and back number by number."""
+"""Groups in a plant file: from tables to mechanisms and machines, and back without loss."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Tables of a plant's TOML file as pydantic models, used at the boundary only."""
+"""Tables of the plant file as pydantic models, used only at the file boundary."""
 
 from collections.abc import Callable
 from dataclasses import fields

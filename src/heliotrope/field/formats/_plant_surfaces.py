@@ -1,7 +1,8 @@
-"""Targets and receivers in the text of a plant file: moved and turned as rigid bodies.
+"""Targets and receivers in the text of a plant file, moved and rotated as rigid bodies.
 
-A surface moves with all that stands on it: its corners, its further known points and its marks. The
-tables are those of tomlkit, so that comments and the layout of the file stay.
+A surface moves together with everything attached to it: its corners, its additional known points
+and its marks. The tables are tomlkit tables, so that comments and the layout of the file are
+preserved.
 """
 
 from collections.abc import Iterator, Mapping

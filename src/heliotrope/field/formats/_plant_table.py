@@ -1,4 +1,4 @@
-"""The table of heliostats beside a plant file: CSV or Parquet, column by column."""
+"""The heliostat table beside a plant file: CSV or Parquet, column by column."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Keep-out volumes of a plant's TOML file, read and written."""
+"""Keep-out volumes in the plant file, read and written."""
 
 import math
 from typing import Any

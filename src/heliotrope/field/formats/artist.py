@@ -1,8 +1,8 @@
-"""ARTIST's scenarios (HDF5, version 2.0): calibrated mechanisms written into one.
+"""ARTIST scenarios (HDF5, version 2.0): writes calibrated mechanisms into a scenario.
 
-ARTIST makes a scenario from PAINT's files and takes all joint tilts for 0 there. Here the scenario
-gets the calibrated mechanisms of its heliostats: position, translations, all four tilts and the
-actuators. Its surfaces, targets and sun remain as they are.
+ARTIST creates a scenario from PAINT's files and sets all joint tilts to 0. This module writes the
+calibrated mechanisms of the heliostats into the scenario: position, translations, all four tilts
+and the actuators. Surfaces, targets and sun remain unchanged.
 """
 
 import io

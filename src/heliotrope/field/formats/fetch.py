@@ -1,17 +1,17 @@
-"""Downloads heliostats and the tower from PAINT's public database.
+"""Downloads heliostat and tower data from PAINT's public database.
 
-The database is a tree of static files after the STAC convention. A heliostat has a
-catalogue, which links to collections (properties, calibration, deflectometry), these to
-items, and an item names its files::
+The database is a tree of static files that follows the STAC convention. Each heliostat has a
+catalogue, which links to collections (properties, calibration, deflectometry); these link to items,
+and an item lists its files::
 
     WRI1030197-catalog-stac.json                     all heliostats
     AA39/AA39-heliostat-catalog-stac.json            one
     AA39/Calibration/AA39-calibration-collection-stac.json
     AA39/Calibration/123456-calibration-item-stac.json    an item: files by address
 
-Files are stored as PAINT's own client stores them: ``AA39/Properties/…`` and
-``AA39/Calibration/…`` below the given folder, the tower's beside the heliostats. An
-interrupted run resumes where it stopped; files that have not changed are not fetched again.
+Files are stored as PAINT's own client stores them: ``AA39/Properties/…`` and ``AA39/Calibration/…``
+below the given folder, with the tower's files beside the heliostats. An interrupted run resumes
+where it stopped, and unchanged files are not downloaded again.
 
 The data are published by DLR and KIT under CDLA-Permissive-2.0.
 """

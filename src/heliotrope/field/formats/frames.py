@@ -1,4 +1,4 @@
-"""The mirror's frame in a mechanism's last frame, and Euler angles of files."""
+"""The mirror frame within the last frame of a mechanism, and Euler angles in files."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,7 +1,7 @@
 """HelioK XML: heliostats with arbitrary axes, nested nodes and facets (Grigoriev et al. 2021).
 
-`read` gives the file as a tree of elements, with its attributes unchanged. The
-functions below read its meaning::
+`read` returns the file as a tree of elements with unchanged attributes. The functions below
+interpret the tree::
 
     HelioK   version, unitLength, unitAngle
       World    Location (name, longitude, latitude); Sun (azimuth, elevation, irradiance)
@@ -11,15 +11,15 @@ functions below read its meaning::
                without Secondary: a single-axis tracker
       Scene    Node (name, translation, rotation), nested; in it ShapeKit or HeliostatKit ref
 
-The frame is ENU; the sun's azimuth is clockwise from north. ``Aiming`` is a point of ENU for
-global aiming; the same element holds a point of the heliostat's frame for local aiming, and the
-file does not say which it is. A rotation is three Euler
-angles about the fixed axes x, then y, then z: R = Rz·Ry·Rx. A mirror or another surface
-lies in x and y of its own frame, its normal along z.
+The frame is ENU; the sun's azimuth is clockwise from north. For global aiming ``Aiming`` is a point
+in ENU; for local aiming the same element holds a point in the heliostat frame, and the file does
+not state which of the two it is. A rotation is given by three Euler angles about the fixed axes x,
+then y, then z: R = Rz·Ry·Rx. A mirror or any other surface lies in the x-y plane of its own frame,
+with its normal along z.
 
-A number may carry its own unit behind a space ("1.000 mrad"). HelioK itself reads
-``Angles`` without one as radians, less their last digit, and ignores ``unitLength``; here
-the units of the root hold for all numbers.
+A number may be followed by a space and its own unit ("1.000 mrad"). HelioK itself reads ``Angles``
+without a unit as radians, drops their last digit, and ignores ``unitLength``; here the units of the
+root element apply to all numbers.
 """
 
 from collections.abc import Iterator
@@ -73,11 +73,11 @@ class DrivenAxis:
     Attributes
     ----------
     origin
-        Point on it in its parent's frame, m, (3,).
+        Point on the axis in the parent frame, m, (3,).
     direction
-        Unit vector in its parent's frame, (3,).
+        Unit vector in the parent frame, (3,).
     stops
-        Least and largest angle, rad, (2,).
+        Minimum and maximum angle, rad, (2,).
     """
 
     origin: FloatArray
@@ -87,14 +87,14 @@ class DrivenAxis:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A rectangular mirror or another surface.
+    """A rectangular mirror or other surface.
 
     Attributes
     ----------
     center
-        Centre of the rectangle in the parent's frame, m, (3,).
+        Centre of the rectangle in the parent frame, m, (3,).
     axes
-        Columns x (width), y (height) and z (normal) in the parent's frame, (3, 3).
+        Columns x (width), y (height) and z (normal) in the parent frame, (3, 3).
     width, height
         m.
     """
@@ -107,7 +107,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A heliostat of the factory, that nodes of the scene refer to.
+    """A heliostat model of the factory, to which nodes of the scene refer.
 
     Attributes
     ----------
@@ -122,8 +122,8 @@ class Model:
     point, normal
         Vertex (m) and unit normal that tracking uses, beyond the last axis, (3,).
     aim
-        Aim point in metres, ENU (global aiming) or in the heliostat's frame at zero angles (local
-        aiming), (3,); None if the file gives none.
+        Aim point in metres, ENU (global aiming) or in the heliostat frame at zero angles (local
+        aiming), (3,); None if the file does not specify one.
     """
 
     name: str
@@ -154,7 +154,7 @@ class PlacedModel:
     position
         ENU metres, (3,).
     orientation
-        Rotation from the heliostat's frame to ENU, (3, 3).
+        Rotation from the heliostat frame to ENU, (3, 3).
     """
 
     name: str
@@ -165,12 +165,12 @@ class PlacedModel:
 
 @dataclass(frozen=True, eq=False)
 class PlacedSurface:
-    """A surface of the scene that is no part of a heliostat.
+    """A surface of the scene that does not belong to a heliostat.
 
     Attributes
     ----------
     path
-        Names of its nodes from the outermost to its own.
+        Names of the nodes that contain it, from the outermost to its own.
     surface
         In ENU metres.
     """
@@ -185,8 +185,8 @@ def read(path: str | Path) -> Document:
     Raises
     ------
     FormatError
-        If the file cannot be read, is not well-formed, defines entities, is no HelioK
-        file or names no units.
+        If the file cannot be read, is not well-formed, defines entities, is not a HelioK file or
+        specifies no units.
     """
     document = read_xml(path, "a HelioK file")
     Values(document)
@@ -194,7 +194,7 @@ def read(path: str | Path) -> Document:
 
 
 def models(document: Document) -> dict[str, Model]:
-    """Return the heliostats of the factory by name.
+    """Return the heliostat models of the factory by name.
 
     Raises
     ------
@@ -343,8 +343,7 @@ def heliostats(document: Document) -> list[PlacedModel]:
     Raises
     ------
     FormatError
-        As `models`, and if a node has no name, a name occurs twice or a model is
-        not known.
+        As for `models`, and if a node has no name, a name occurs twice or a model is unknown.
     """
     values, known = Values(document), models(document)
     by_name: dict[str, PlacedModel] = {}
@@ -379,12 +378,12 @@ def surfaces(document: Document) -> list[PlacedSurface]:
 
 
 def has_location(document: Document) -> bool:
-    """Return whether the document names the place on Earth, as `site` needs."""
+    """Return whether the document specifies a location on Earth, as `site` needs."""
     return any(True for w in document.root.elements("World") for _ in w.elements("Location"))
 
 
 def site(document: Document, height: float) -> Site:
-    """Return the site that ``Location`` names, at ``height`` m, which the file does not hold.
+    """Return the site in ``Location``, at ``height`` m, which the file does not contain.
 
     Raises
     ------
@@ -403,7 +402,7 @@ def site(document: Document, height: float) -> Site:
 
 
 def sun(document: Document) -> FloatArray:
-    """Return the unit vector to the document's sun, ENU, (3,).
+    """Return the unit vector to the sun of the document, ENU, (3,).
 
     Raises
     ------
@@ -419,24 +418,24 @@ def sun(document: Document) -> FloatArray:
 def to_plant(document: Document, site: Site) -> Plant:
     """Return the plant that a document describes.
 
-    Heliostats become mechanisms of kind "two_axis", or "single_axis" where there is no secondary
-    axis, with angles as counts; those of one kind with parallel primary axes and the same number
-    of facets share a group. Surfaces below a
-    node named "Targets" become targets, all others receivers. Materials, curved
-    shapes, the sun and starting angles have no place in a plant and stay in the document.
+    Heliostats become mechanisms of kind "two_axis", or "single_axis" if they have no secondary
+    axis, with angles as counts. Heliostats of the same kind with parallel primary axes and the same
+    number of facets share a group. Surfaces below a node named "Targets" become targets, all others
+    receivers. Materials, curved shapes, the sun and starting angles are not part of a plant and
+    stay in the document.
 
     Parameters
     ----------
     document
         From `read`.
     site
-        The plant's reference point; see `site`.
+        Reference point of the plant; see `site`.
 
     Raises
     ------
     FormatError
-        As `heliostats` and `surfaces`, and if a mirror has no facet, axes are
-        parallel or a name occurs twice.
+        As for `heliostats` and `surfaces`, and if a mirror has no facet, axes are parallel or a
+        name occurs twice.
     """
     path = document.path or "HelioK document"
     members: dict[tuple[int, int, int], list[PlacedModel]] = {}

@@ -1,7 +1,7 @@
-"""Camera-target measurements: positions of heliostats' beams on a target.
+"""Camera-target measurements: positions of heliostat beams on a target.
 
-Read from ``measurements.csv`` or from PAINT's calibration properties. A row that cannot
-be used is left out and named.
+The measurements are read from ``measurements.csv`` or from PAINT's calibration properties. A record
+that cannot be used is left out and named.
 """
 
 from dataclasses import dataclass

@@ -1,20 +1,20 @@
-"""OpenCSP's heliostat fields: one table of heliostats and one of facet centroids.
+"""OpenCSP heliostat fields: a table of heliostats and a table of facet centroids.
 
-The table of heliostats has a row each and these columns, found by name::
+The heliostat table has one row per heliostat and these columns, found by name::
 
     Name, X, Y, Z, Num. Facets, Num. Rows, Num. Cols, Pivot Height, Pivot Offset,
     Facet Width, Facet Height
 
-X is east, Y north, Z up, in m. They are those of the pivot (the torque tube), not of the
-foot, and the pivot height is information only. The mirror's face stands the pivot offset
-in front of the pivot. Azimuth is clockwise from north, elevation from the horizon.
+X is east, Y north, Z up, in m. The position is that of the pivot (the torque tube), not of the
+foot, and the pivot height is for information only. The mirror surface is in front of the pivot by
+the pivot offset. Azimuth is clockwise from north, elevation from the horizon.
 
-The table of centroids (Facet id, X, Y, Z) holds for all heliostats of the field, in the
-frame of a mirror that lies face up and is turned to look south: X to the right as seen
-from the front, Y up, Z out of the mirror. Facets are listed from the upper left, row by
-row, and are neither canted nor curved in these files.
+The centroid table (Facet id, X, Y, Z) applies to all heliostats of the field. Its frame is that of
+a mirror that lies face up and is rotated to face south: X to the right as seen from the front, Y
+up, Z out of the mirror. Facets are listed from the upper left, row by row, and are neither canted
+nor curved in these files.
 
-Facts from the sources and data of OpenCSP (Sandia National Laboratories).
+These facts come from the sources and data of OpenCSP (Sandia National Laboratories).
 """
 
 import csv

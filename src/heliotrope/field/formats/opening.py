@@ -1,4 +1,4 @@
-"""Opens a plant, whatever file or folder it comes in."""
+"""Opens a plant from a file or folder in any supported format."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,31 +20,32 @@ def open_plant(
     centroids: str | Path | None = None,
     templates: Mapping[int, solarpilot.Template] | None = None,
 ) -> Plant:
-    """Return the plant of a file or folder, whatever its format.
+    """Return the plant from a file or folder, whatever its format.
 
-    Plant files (TOML), folders in PAINT's form, HelioK scenes (XML), SolarPILOT layouts and
-    OpenCSP fields (both .csv, .txt or .tsv) are told apart by their names and first lines.
+    Plant files (TOML), folders in PAINT's format, HelioK scenes (XML), SolarPILOT layouts and
+    OpenCSP fields (the last two as .csv, .txt or .tsv) are recognised by their names and first
+    lines.
 
     Parameters
     ----------
     path
         The file or folder.
     site
-        The plant's reference point, for the formats that give none: SolarPILOT, OpenCSP, and
-        HelioK without ``<Location>``. HelioK gives no height; without ``site`` it is 0 m.
+        Reference point of the plant, for formats that do not contain one: SolarPILOT, OpenCSP, and
+        HelioK without ``<Location>``. HelioK contains no height; without ``site`` it is 0 m.
     centroids
-        OpenCSP's table of facet centroids; without it the facets stand edge to edge.
+        OpenCSP's table of facet centroids; without it the facets are placed edge to edge.
     templates
-        Dimensions of SolarPILOT's heliostats by template number. A layout does not give them;
-        without them mirrors are 12.2 m × 12.2 m, SolarPILOT's default, and ``notes`` say so.
+        Dimensions of SolarPILOT's heliostats by template number. A layout does not contain them; by
+        default mirrors are 12.2 m × 12.2 m, SolarPILOT's default, and ``notes`` say so.
 
     Raises
     ------
     FormatError
-        If it does not exist, cannot be used, or needs a site; the text names file, place, value
-        and limit.
+        If the file does not exist, cannot be used, or needs a site; the message names file, place,
+        value and limit.
     InputError
-        If ``site`` is something else.
+        If ``site`` is not a `Site`.
     """
     require("path", path, (str, Path), "the path of a file or folder")
     place = Path(path)

@@ -1,7 +1,7 @@
 """PAINT: the published data of the Jülich solar tower (DLR, KIT), as JSON files.
 
-Heliostat properties, tower measurements and calibration properties, in the variants that
-have been published. Positions are WGS84; they are converted exactly.
+Heliostat properties, tower measurements and calibration properties, in all published variants.
+Positions are WGS84 and are converted exactly.
 """
 
 import json
@@ -318,7 +318,7 @@ def find_tower(folder: str | Path) -> Path:
 
 
 def read_plant(folder: str | Path) -> Plant:
-    """Return the plant of a folder with the tower's file and heliostat properties.
+    """Return the plant from a folder with the tower file and heliostat properties.
 
     Raises
     ------

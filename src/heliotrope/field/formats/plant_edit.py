@@ -1,8 +1,8 @@
-"""Changes of a plant file by name: the values of one heliostat, target or receiver.
+"""Edits a plant file by name: the values of one heliostat, target or receiver.
 
-The changed file is checked as a whole before it takes the place of the old one, which is kept: each
-stored version is a folder that holds a plant file and its table, as they were. Comments, and the
-cells of all other heliostats, stay as they are.
+The edited file is checked as a whole before it replaces the old file, which is kept: each stored
+version is a folder that contains a plant file and its table, unchanged. Comments, and the cells of
+all other heliostats, are preserved.
 """
 
 import getpass

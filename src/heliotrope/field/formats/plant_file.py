@@ -1,8 +1,8 @@
-"""Our own format: one TOML file for the plant, and a table of its heliostats beside it.
+"""Our own format: one TOML file for the plant, with a table of its heliostats beside it.
 
-The TOML holds what all heliostats share (site, tower, kinds of mechanism, machines); the table
-holds what differs: name, group, position, and any number of the group in a column of its dotted
-name. Files are written with every digit, so that a plant reads back exactly as it was.
+The TOML file contains what all heliostats share (site, tower, kinds of mechanism, machines); the
+table contains what differs: name, group, position, and any number of the group in a column with its
+dotted name. Files are written at full precision, so that a plant reads back exactly as it was.
 """
 
 import itertools
@@ -55,13 +55,13 @@ class Finding:
 
 
 def read_plant(path: str | Path) -> Plant:
-    """Return the plant of a TOML file and of the table that it names.
+    """Return the plant from a TOML file and the table that the file names.
 
     Raises
     ------
     FormatError
-        Something cannot be used; the text names file, place, value and limit, and how
-        many more problems there are.
+        If a value cannot be used; the message names file, place, value and limit, and how many more
+        problems there are.
     """
     document = read_document(path, "plant", PlantDocument, _MODELS)
     table = read_table(Path(path).parent / document.heliostats)
@@ -276,8 +276,8 @@ def rectangle(center: FloatArray, width: float, height: float, facing: float) ->
 def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"] = "csv") -> None:
     """Write the TOML file and, beside it, the table of the heliostats.
 
-    Both are written under another name and then renamed, the table first: a reader never
-    sees half a file.
+    Both are written under temporary names and then renamed, the table first, so that a reader never
+    sees an incomplete file.
 
     Parameters
     ----------
@@ -291,7 +291,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
     Raises
     ------
     InputError
-        The folder cannot be written to.
+        If the folder cannot be written to.
     """
     import tomli_w
 

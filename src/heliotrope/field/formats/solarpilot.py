@@ -1,25 +1,24 @@
-"""Field layouts: text tables with one heliostat a line, with a header or as SolarPILOT has them.
+"""Field layouts: text tables with one heliostat per line, with a header or in SolarPILOT's form.
 
-A header is read: names or ids, and positions in metres (``id,x,y,z``) or in degrees
-(``id,latitude,longitude,altitude``); one that gives no positions is refused. SolarPILOT reads
-a layout by position, so without a header the columns are::
+A header, if present, is read: names or ids, and positions in metres (``id,x,y,z``) or in degrees
+(``id,latitude,longitude,altitude``); a header without positions is rejected. SolarPILOT identifies
+columns by position, so without a header the columns are::
 
     14 columns   template, enabled, in layout, x, y, z, focus x, focus y,
                  cant i, cant j, cant k, aim x, aim y, aim z
     12 columns   the same without the two flags (older versions)
      6 and 4     the columns up to z of either
 
-x is east, y north, z up, in m; z = 0 is the height of the pivots on level ground, so a
-location is that of the pivot and an aim point counts from there. The optional groups
-focus, cant and aim are numbers, or NULL for "to be computed". The separator is a comma, a
-semicolon, a tab or spaces; in the text that other programs hand over, records may end
-with a semicolon instead of a line end.
+x is east, y north, z up, in m; z = 0 is the height of the pivots on level ground, so a location is
+that of the pivot, and an aim point is measured from the same zero. The optional groups focus, cant
+and aim are numbers, or NULL for "to be computed". The separator is a comma, a semicolon, a tab or
+spaces; in text passed on by other programs, records may end with a semicolon instead of a line end.
 
-Its exports begin with two lines (names, units). Of the 14 columns they name "In layout"
-before "Enabled", but what follows is enabled before in layout, as it is read: the flags are taken
-in that order whatever their names.
+SolarPILOT's exports begin with two lines (names, units). With 14 columns the names list "In layout"
+before "Enabled", but in the data "enabled" comes first, as SolarPILOT reads it; the flags are
+therefore taken in that order whatever their names.
 
-Facts from the sources of SolarPILOT and of the library behind it (National Renewable
+These facts come from the sources of SolarPILOT and of its underlying library (National Renewable
 Energy Laboratory).
 """
 

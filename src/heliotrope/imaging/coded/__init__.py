@@ -1,9 +1,9 @@
-"""Many beams on one target at once, told apart by their own small coded movements.
+"""Several beams on one target at once, identified by small coded movements.
 
-- `codes`: the movements, orthogonal and mean-free.
-- `stack`: photographs of one surface and the light in each.
-- `beams`: beams as they are expected and found, each with a verdict.
-- `separation`: from a stack and its codes to each mirror's beam.
+- `codes`: the movements, orthogonal and zero-mean.
+- `stack`: photographs of one surface and the light in each photograph.
+- `beams`: expected beams and the beams found, each with a verdict.
+- `separation`: from a stack and its codes to the beam of each heliostat.
 """
 
 from heliotrope.imaging.coded.beams import ExpectedBeam, SeparatedBeam, Verdict

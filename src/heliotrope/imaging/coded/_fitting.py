@@ -1,4 +1,4 @@
-"""Beams fitted to the pictures of their movements."""
+"""Fits beams to the pictures of their movements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The verdict of a stack about each mirror."""
+"""The verdict of a stack on each heliostat."""
 
 from collections.abc import Sequence
 

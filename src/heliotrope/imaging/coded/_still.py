@@ -1,4 +1,4 @@
-"""Light at rest: what the mean picture shows at each mirror's place, and beams without a code."""
+"""Static light: the mean picture at each beam's position, and beams without a code."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The place of a beam in the pictures of its movement, by a matched filter."""
+"""The position of a beam in the pictures of its movement, by a matched filter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

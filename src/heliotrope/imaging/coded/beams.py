@@ -1,4 +1,4 @@
-"""Beams of a stack, as they are expected and as they are found."""
+"""Beams of a stack: those expected, and those found."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -7,7 +7,7 @@ from heliotrope.geometry import FloatArray
 
 
 class Verdict(Enum):
-    """The verdict of a stack about a mirror."""
+    """The verdict of a stack on one heliostat."""
 
     PROVEN = "follows its own code at its place"
     STUCK = "its light does not move"
@@ -20,23 +20,23 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class ExpectedBeam:
-    """The beam of a mirror before a stack is taken.
+    """The expected beam of a heliostat before a stack is taken.
 
     Attributes
     ----------
     heliostat
         Name.
     place
-        Its place without movement, metres right of and above the surface's centre, (2,).
+        Position without movement, metres to the right of and above the surface centre, (2,).
     covariance
-        Of the place, m², (2, 2).
+        Covariance of the position, m², (2, 2).
     second_moments
-        Of its light, m², (2, 2).
+        Second moments of the light, m², (2, 2).
     power
-        Brightness m² at the stack's exposure; NaN if unknown. Needed where other light rests
-        on the surface.
+        Brightness m² at the exposure of the stack; NaN if unknown. Needed if there is other, static
+        light on the surface.
     power_sigma
-        Standard deviation of ``power``, relative.
+        Relative standard deviation of ``power``.
     """
 
     heliostat: str
@@ -49,27 +49,28 @@ class ExpectedBeam:
 
 @dataclass(frozen=True)
 class SeparatedBeam:
-    """The beam of one mirror in a stack.
+    """The beam of one heliostat in a stack.
 
     Attributes
     ----------
     heliostat
-        Name of the mirror that had the code.
+        Name of the heliostat to which the code was assigned.
     verdict
-        Only a proven beam is a sighting.
+        Only a proven beam becomes a sighting.
     centroid
-        Place of its light without movement, m, (2,); NaN if nothing follows its code.
+        Position of its light without movement, m, (2,); NaN if no light follows the code.
     covariance
-        Of the centroid, m², (2, 2).
+        Covariance of the centroid, m², (2, 2).
     second_moments
-        Of its light, m², (2, 2).
+        Second moments of the light, m², (2, 2).
     power
-        Light that follows its code, brightness m².
+        Light that follows the code, brightness m².
     gain, gain_sigma
-        Light that follows its code over light at its place: 1 if it follows its own code, 0 if it
-        does not move; and standard deviation. NaN if the light at its place is unknown.
+        Ratio of the light that follows the code to all light at that position (1 if the light
+        follows its own code, 0 if it does not move), and its standard deviation. NaN if the light
+        at that position is unknown.
     other
-        The heliostat that it is exchanged with; empty otherwise.
+        The heliostat with which it is swapped; empty otherwise.
     """
 
     heliostat: str

@@ -1,4 +1,4 @@
-"""Codes: small movements of many mirrors that no sum of other mirrors' movements imitates."""
+"""Codes: small movements of many heliostats that no sum of other movements can reproduce."""
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +14,10 @@ APART = 4.5
 
 
 def photographs_for(mirrors: int, along: int | None = None) -> int:
-    """Return the fewest photographs with orthogonal codes for a number of mirrors.
+    """Return the smallest number of photographs with orthogonal codes for a number of heliostats.
 
-    Each mirror takes two rows of a Hadamard matrix, one for each axis, or one if all move along the
-    same axis; the row of ones stays free.
+    Each heliostat takes two rows of a Hadamard matrix, one per axis, or one row if all move along
+    the same axis; the row of ones stays unused.
     """
     if mirrors < 1:
         raise InputError(f"codes: {mirrors} mirrors; give 1 or more")
@@ -28,26 +28,28 @@ def photographs_for(mirrors: int, along: int | None = None) -> int:
 def coded_movements(
     mirrors: int, photographs: int | None = None, along: int | None = None
 ) -> FloatArray:
-    """Return the movements of mirrors over photographs, -1 or 1, (photographs, mirrors, 2).
+    """Return the movements of heliostats over photographs, -1 or 1, (photographs, heliostats, 2).
 
-    Columns are rows of Sylvester's Hadamard matrix without the row of ones: mean-free and
-    orthogonal to each other. A beam that moves along both axes at once also changes with the
-    product of its two codes, which is a row of the matrix, too: the rows are chosen so that it is
-    the same unused row for all mirrors. The photographs are shuffled, always alike.
+    The columns are rows of Sylvester's Hadamard matrix without the row of ones, and are therefore
+    zero-mean and mutually orthogonal. A beam that moves along both axes at once also changes with
+    the product of its two codes, which is itself a row of the matrix. The rows are chosen so that
+    this product is the same unused row for all heliostats. The photographs are shuffled, always in
+    the same order.
 
     Parameters
     ----------
     mirrors
-        Number of mirrors.
+        Number of heliostats.
     photographs
         Power of two; None: `photographs_for`.
     along
-        The only axis of all movements, 0 or 1; None: both.
+        The single axis of all movements, 0 or 1; None: both axes.
 
     Raises
     ------
     InputError
-        If there are too few photographs for orthogonal codes, or they are no power of two.
+        If there are too few photographs for orthogonal codes, or their number is not a power of
+        two.
     """
     from scipy.linalg import hadamard
 
@@ -81,17 +83,17 @@ def shared_codes(
     Parameters
     ----------
     places
-        Expected places, m, (M, 2).
+        Expected positions, m, (M, 2).
     moments
-        Second moments of the beams with the covariances of their places, m², (M, 2, 2).
+        Second moments of the beams including the covariances of their positions, m², (M, 2, 2).
     groups
         Number of codes.
     apart
-        Least distance of two beams of one code, in standard deviations of a beam.
+        Minimum distance between two beams with the same code, in standard deviations of a beam.
 
     Returns
     -------
-        None if no code is free for a beam.
+        None if no code is free for some beam.
     """
     at, spread = np.asarray(places, dtype=np.float64), np.asarray(moments, dtype=np.float64)
     away = distances(at, spread)

@@ -1,13 +1,13 @@
-"""From a stack of photographs and the codes of its mirrors to the beam of each mirror.
+"""From a stack of photographs and the codes of its heliostats to the beam of each heliostat.
 
-The regression of each pixel's series on the codes gives two pictures for each mirror: the change
-by its movement along either axis. Orthogonal codes separate them even where beams overlap, and
-light that rests is in none of them. A beam of power p at x₀ has the pictures G = -p ∇f(x - x₀);
-their moments give power, ∫ x Gₓ = p, and place, ½ ∫ x² Gₓ = p x₀, without any assumption about its
-shape. Where mirrors move along one axis only, half as many photographs are enough: the one picture
-gives the other coordinate, too, ∫ x y Gₓ = p y₀. A Gaussian is fitted first, which takes care of
-the finite size of the movements and of codes that lost photographs; the moments of what it leaves
-correct its place.
+Regressing the time series of each pixel on the codes yields two pictures per heliostat, one for the
+change caused by its movement along each axis. Orthogonal codes separate the pictures even where
+beams overlap, and static light appears in none of them. A beam of power p at x₀ has the pictures G
+= -p ∇f(x - x₀); their moments yield the power, ∫ x Gₓ = p, and the position, ½ ∫ x² Gₓ = p x₀,
+without any assumption about the beam shape. If the heliostats move along one axis only, half as
+many photographs are enough, because the single picture also yields the other coordinate, ∫ x y Gₓ =
+p y₀. A Gaussian is fitted first, which accounts for the finite size of the movements and for codes
+with missing photographs; the moments of the residual then correct the position.
 """
 
 from collections.abc import Sequence
@@ -30,18 +30,18 @@ from heliotrope.imaging.coded.stack import Stack, light_of
 
 @dataclass(frozen=True)
 class Separation:
-    """A stack taken apart.
+    """The result of separating a stack.
 
     Attributes
     ----------
     beams
-        One for each mirror, in the order given.
+        One per heliostat, in the order given.
     factors
-        Light of each photograph, 1 at the median, (K,).
+        Relative light level of each photograph, 1 at the median, (K,).
     used
-        Photographs used, (K,).
+        Mask of the photographs used, (K,).
     uncoded
-        Places of other beams that rest on the surface, m, (U, 2).
+        Positions of other, static beams on the surface, m, (U, 2).
     """
 
     beams: tuple[SeparatedBeam, ...]
@@ -56,28 +56,28 @@ class Separation:
 
 
 def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) -> Separation:
-    """Take a stack of photographs apart into the beam of each mirror.
+    """Separate a stack of photographs into the beams of the heliostats.
 
     Parameters
     ----------
     stack
         K photographs.
     moves
-        Displacements on the surface that were ordered, m, (K, M, 2): of all mirrors along both
-        axes, or of all along the same one.
+        Commanded displacements on the surface, m, (K, M, 2): of all heliostats along both axes, or
+        of all along the same axis.
     expected
         M mirrors.
 
     Raises
     ------
     InputError
-        If shapes do not fit, or mirrors have no orthogonal codes.
+        If shapes do not fit, or the codes of the heliostats are not orthogonal.
 
     Notes
     -----
-    The covariance holds all that changes between photographs, and what is not corrected of the
-    beam's shape. The error of the rectified pictures themselves (camera,
-    survey) is to be added, as for ordinary spots.
+    The covariance includes everything that changes between photographs, and the uncorrected effect
+    of the beam shape. Add the error of the rectified pictures themselves (camera, survey), as for
+    ordinary spots.
     """
     count = len(expected)
     _check(stack, moves, expected)

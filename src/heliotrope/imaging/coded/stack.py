@@ -1,4 +1,4 @@
-"""Photographs of one surface on which many beams move, and the light in each photograph."""
+"""Photographs of one surface on which several beams move, and the light in each photograph."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.targets.rectify import Mask
 
-#: A photograph with less than this share of the usual light is left out.
+#: A photograph whose light is below this fraction of the usual light is left out.
 DARK = 0.5
 #: Pixels across the longer side that beams of decimetres need.
 _ACROSS = 96
@@ -16,23 +16,25 @@ _ACROSS = 96
 
 @dataclass(frozen=True)
 class Stack:
-    """K photographs of one surface, seen from its front.
+    """K photographs of one surface, as seen from its front.
 
     Attributes
     ----------
     values
-        Brightness, in proportion to the light, (K, H, W); row 0 at the top.
+        Brightness, proportional to the light, (K, H, W); row 0 at the top.
     step
         Size of a pixel, m.
     first
-        Place of the first pixel's centre, metres right of and above the surface's centre, (2,).
+        Position of the first pixel's centre, metres to the right of and above the surface centre,
+        (2,).
     seen
-        Pixels that measure light: on the surface, on no mark, never at full scale, (H, W).
+        Pixels that measure light, (H, W): on the surface, not on a mark, never at full scale.
     exposures
-        Exposure times gain of each photograph, (K,); None: all alike.
+        Exposure times gain of each photograph, (K,); None: equal for all.
     empty
-        Brightness without beams at an exposure of 1 (of the photographs, if all are alike),
-        (H, W). None: other light than that of the coded beams is on the surface, as on a receiver.
+        Brightness without beams at an exposure of 1 (or at that of the photographs, if it is equal
+        for all), (H, W). None: the surface carries other light than that of the coded beams, as a
+        receiver does.
     """
 
     values: FloatArray
@@ -63,7 +65,7 @@ class Stack:
 
     @property
     def axes(self) -> tuple[FloatArray, FloatArray]:
-        """Metres right of the centre of columns (W,), and above it of rows (H,)."""
+        """Metres right of the centre for columns (W,), and above it for rows (H,)."""
         _, rows, columns = self.values.shape
         return (
             self.first[0] + self.step * np.arange(columns),
@@ -71,7 +73,7 @@ class Stack:
         )
 
     def prepared(self) -> "Stack":
-        """Return the stack at one exposure, on a grid that is just fine enough for beams."""
+        """Return the stack at one exposure, on a grid that is just fine enough for the beams."""
         values = np.asarray(self.values, dtype=np.float64)
         if self.exposures is not None:
             values = values / np.asarray(self.exposures)[:, None, None]

@@ -1,12 +1,12 @@
-"""Where frames come from: folders, videos, streams, devices, simulations; and where they are kept.
+"""Frame sources: folders, videos, streams, devices, simulations; and archiving of frames.
 
-A source is a context manager and an iterable of frames::
+A source is a context manager that yields frames::
 
     with open_source("rtsp://10.0.0.5/target", limit=8) as source:
         frame = average(source)
 
-Begin with `open_source`, which takes the text of a plant file's camera. `average` lowers noise,
-`keep` archives a frame with its result.
+Begin with `open_source`, which accepts the source text of a camera in the plant file. `average`
+reduces noise, `keep` archives a frame with its result.
 """
 
 from heliotrope.imaging.sources.folder import FolderSource

@@ -14,28 +14,28 @@ from heliotrope.imaging.sources.source import Source
 
 @dataclass
 class FolderSource(Source):
-    """The images of a folder in natural order and, if it is watched, those that arrive later.
+    """The images in a folder in natural order and, if it is watched, images that arrive later.
 
-    A file in a watched folder is read once it has been unchanged for one poll and is whole. A file
-    that changes later is read again, so a camera may always write the same file. If the folder
-    disappears, as a network folder may, the source waits for it.
+    A file in a watched folder is read once it is complete and has not changed between two polls. A
+    file that changes later is read again, so a camera may always overwrite the same file. If the
+    folder disappears, as a network folder may, the source waits for it to return.
 
     Attributes
     ----------
     path
         The folder, or one image.
     watch
-        Whether to go on with files that appear later.
+        Whether to continue with files that appear later.
     poll, patience
-        Interval between looks at the folder, and time after which an unreadable file in a
-        watched folder counts as broken, s.
+        Interval between polls of the folder, and time after which an unreadable file in a watched
+        folder counts as broken, s.
     skip_broken
-        Leave out broken files and note them in ``skipped``, rather than raise FormatError;
-        None: leave them out if the folder is watched.
+        Whether to leave out broken files and list them in ``skipped`` instead of raising
+        FormatError; None: leave them out if the folder is watched.
     read
-        Reads a file; by default `heliotrope.imaging.files.read_image`.
+        Function that reads a file; by default `heliotrope.imaging.files.read_image`.
     wait
-        Waits for a number of seconds; by default until ``stop`` is set.
+        Function that waits for a number of seconds; by default it waits until ``stop`` is set.
     """
 
     path: str | Path

@@ -1,4 +1,4 @@
-"""Average and archive the frames of a source."""
+"""Averages and archives the frames from a source."""
 
 import json
 import math
@@ -23,27 +23,26 @@ from heliotrope.imaging.motion import find_shift
 
 
 def average(frames: Iterable[Frame], max_shift: float = 1.0) -> Frame:
-    """Return the mean of frames, which lowers the noise by the root of their number.
+    """Return the mean of several frames, which divides the noise by the root of their number.
 
     Parameters
     ----------
     frames
-        Frames of one camera, size and depth.
+        Frames of the same camera, size and depth.
     max_shift
-        Greatest shift against the first frame, px, where
-        `motion.find_shift` can measure it.
+        Largest shift relative to the first frame, px, where `motion.find_shift` can measure it.
 
     Returns
     -------
     Frame
-        uint16; for 8-bit frames 257 times the mean, so that full scale stays full scale. Its
-        time is the mean of their times, its deviation the RMS of theirs: the errors of one
-        clock do not average out.
+        uint16; for 8-bit frames 257 times the mean, so that full scale stays full scale. Its time
+        is the mean of the frame times, with the RMS of their standard deviations, because the
+        errors of one clock do not average out.
 
     Raises
     ------
     InputError
-        If there is no frame, they differ in size or depth, or the camera moved.
+        If there are no frames, they differ in size or depth, or the camera moved.
     """
     first: Frame | None = None
     total: Any = 0.0
@@ -84,17 +83,17 @@ def average(frames: Iterable[Frame], max_shift: float = 1.0) -> Frame:
 
 
 def keep(frame: Frame, result: Mapping[str, Any], folder: str | Path) -> Path:
-    """Archive a frame as a PNG and what was found in it as a JSON of the same name.
+    """Archive a frame as a PNG, and its result as a JSON file of the same name.
 
     Parameters
     ----------
     frame
-        Its time in UTC and its source name the files.
+        The frame; its time in UTC and its source determine the file names.
     result
         Numbers, texts, arrays, times and paths; numbers that are not finite become null.
     folder
-        Created if needed. Nothing in it is overwritten: a second frame of the same name gets a
-        number. The JSON is written last, so where it is present the PNG is whole.
+        Folder, created if needed. Nothing in it is overwritten; a second frame with the same name
+        gets a number. The JSON file is written last, so if it is present the PNG is complete.
 
     Returns
     -------
@@ -103,7 +102,7 @@ def keep(frame: Frame, result: Mapping[str, Any], folder: str | Path) -> Path:
     Raises
     ------
     InputError
-        If the files cannot be written, or the result holds values that JSON cannot.
+        If the files cannot be written, or the result contains values that JSON cannot represent.
     """
     source = re.sub(r"[^A-Za-z0-9]+", "-", re.sub(r"\.\w+$", "", Path(frame.name).name)).strip("-")
     when = frame.time.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ") if frame.time else "undated"

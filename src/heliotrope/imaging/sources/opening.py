@@ -1,4 +1,4 @@
-"""The source that a line of text names."""
+"""Opens the frame source specified by a line of text."""
 
 import re
 import threading
@@ -29,16 +29,16 @@ def open_source(
     limit: int | None = None,
     stop: threading.Event | None = None,
 ) -> Source:
-    """Return the source that a text names, as the plant file does for a camera.
+    """Return the source specified by a text, as in the plant file's camera entries.
 
     Parameters
     ----------
     text
         Folder, image or video file; rtsp://…, http://… (MJPEG, or …/now.jpg); usb:0, /dev/video0.
     folder
-        Where relative paths start: the plant file's folder.
+        Folder to which relative paths refer: that of the plant file.
     start, size, watch
-        Time of a video's first frame; frame size requested of a device; whether to watch a
+        Time of a video's first frame; frame size requested from a device; whether to watch a
         folder.
     limit, stop
         See `Source`.
@@ -46,7 +46,7 @@ def open_source(
     Raises
     ------
     InputError
-        If the text names no source.
+        If the text does not specify a source.
     """
     text, stop = text.strip(), stop or threading.Event()
     scheme, _, rest = text.partition(":")

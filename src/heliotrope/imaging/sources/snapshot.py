@@ -30,18 +30,18 @@ def is_snapshot(text: str) -> bool:
 class SnapshotSource(Source):
     """Photographs that a camera takes on request.
 
-    A frame's time is the one in the file, if there is one; otherwise the middle between request and
-    answer, with half of the time between them as its deviation. A user and a password in the
-    address are sent as credentials and never shown.
+    A frame's time is that stored in the file, if any; otherwise the midpoint between request and
+    response, with half of the interval as its standard deviation. A user name and password in the
+    address are sent as credentials and never displayed.
 
     Attributes
     ----------
     url
         Address of the image.
     interval
-        Time between requests while nobody waits for a frame, s.
+        Interval between requests while no caller is waiting for a frame, s.
     timeout
-        For an answer, s.
+        Timeout of a request, s.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The common base of all sources of frames, and a source of frames made by a function."""
+"""The common base class of all frame sources, and a source whose frames a function creates."""
 
 import re
 import threading
@@ -20,13 +20,14 @@ class Source(ABC):
     Attributes
     ----------
     name
-        Used in errors and frames; by default the folder, file, address or device.
+        Name used in errors and frames; by default the folder, file, address or device.
     limit
-        Number of frames after which it ends; None: no limit.
+        Number of frames after which the source ends; None: no limit.
     stop
-        Ends it when set.
+        Event that ends the source when set.
     wanted
-        Set when somebody waits for a frame: a source that takes frames at intervals takes one now.
+        Event that is set when a caller waits for a frame; a source that takes frames at intervals
+        then takes one at once.
     """
 
     name: str = ""
@@ -59,7 +60,7 @@ class Source(ABC):
 
 @dataclass
 class SimulatedSource(Source):
-    """Frames that ``function`` makes for the present of ``clock``, which is also their time."""
+    """Frames that ``function`` creates for the time of ``clock``, which is also theirs."""
 
     function: Callable[[datetime], Frame]
     clock: Callable[[], datetime]

@@ -1,4 +1,4 @@
-"""Frames that OpenCV decodes: video files, network streams and USB cameras."""
+"""Frames decoded by OpenCV: video files, network streams and USB cameras."""
 
 import math
 import os
@@ -28,18 +28,18 @@ PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443}
 
 @dataclass
 class VideoSource(Source):
-    """The frames of a video file that OpenCV's FFmpeg can read.
+    """The frames of a video file that OpenCV's FFmpeg can decode.
 
-    A frame's time is ``start`` plus its position, rounded to the interval between frames. A
-    truncated file ends early without an error: afterwards ``missing`` is the number of frames by
-    which it fell short of what the container announced (an estimate in some formats).
+    A frame's time is ``start`` plus its position, rounded to the frame interval. A truncated file
+    ends early without an error; afterwards ``missing`` is the number of frames missing compared
+    with what the container announced (an estimate in some formats).
 
     Attributes
     ----------
     path
         The file.
     start, start_deviation
-        Time of the first frame, with its zone (without it frames have no time), and its
+        Time of the first frame with its time zone (without it frames have no time), and its
         standard deviation, s.
     """
 
@@ -106,23 +106,24 @@ def _capture(place: str, backend: int, options: list[int] | None = None) -> Any:
 
 @dataclass
 class CameraSource(Source):
-    """The newest frame of a camera that runs freely.
+    """The newest frame from a free-running camera.
 
-    A thread reads all frames and keeps the last, so a slow reader gets fewer frames but never old
-    ones (``dropped`` counts the rest). If the camera breaks off, it is opened again after pauses
-    that double (``reconnects`` counts). If that fails too often, or at the first attempt, reading
-    raises FetchError (a stream) or InputError (a device).
+    A thread reads all frames and keeps the last, so a slow reader gets fewer frames but never
+    outdated ones (``dropped`` counts the rest). If the connection to the camera is lost, it is
+    reopened after pauses that double each time (``reconnects`` counts). If that fails too often, or
+    at the first attempt, reading raises FetchError (a stream) or InputError (a device).
 
     Attributes
     ----------
     latency, latency_deviation
-        Time from the middle of the exposure to the arrival of the frame, and its standard
-        deviation, s. A frame's time is its arrival minus ``latency``. Streams take 0.1 s to 2 s;
-        measure it.
+        Delay from the middle of the exposure to the arrival of the frame, and its standard
+        deviation, s. A frame's time is its arrival minus ``latency``. Streams have 0.1 s to 2 s,
+        which should be measured.
     retries, pause, longest_pause
-        Consecutive failures before it gives up; first and longest pause before a retry, s.
+        Number of consecutive failures before it gives up; first and longest pause before a retry,
+        s.
     clock
-        Present time with its zone.
+        Function that returns the current time with its time zone.
     exposure, gain
         Copied into the frames; NaN if unknown.
     """
@@ -220,9 +221,9 @@ class StreamSource(CameraSource):
     Attributes
     ----------
     url
-        Address, with user:password@ where the camera needs it; they are never shown.
+        Address, with user:password@ if the camera requires it; the credentials are never displayed.
     timeout
-        For opening, and for one frame, s.
+        Timeouts for opening and for one frame, s.
     """
 
     url: str = field(repr=False)
@@ -256,17 +257,17 @@ class StreamSource(CameraSource):
 
 @dataclass
 class UsbSource(CameraSource):
-    """A camera attached to this machine, by Video4Linux.
+    """A camera attached to this computer, via Video4Linux.
 
     ``exposure`` is set in steps of 100 µs, ``gain`` in the camera's own steps; NaN leaves them
-    automatic. A value that the camera does not accept raises InputError.
+    automatic. If the camera does not accept a value, InputError is raised.
 
     Attributes
     ----------
     device
         Number, or /dev/videoN.
     width, height
-        Requested frame size, px; 0 for the camera's own.
+        Requested frame size, px; 0 for the camera's default.
     """
 
     device: int | str

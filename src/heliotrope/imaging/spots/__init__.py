@@ -1,9 +1,9 @@
-"""Spots on a face: the background without beams, the spots above it, and reasons against them.
+"""Spots on a face: the background without beams, the spots above it, and their defects.
 
-- `background`: what a target looks like without beams, from one frame, from an empty frame or
-  from a learnt model.
+- `background`: what a target looks like without beams, estimated from one frame, from an empty
+  frame or from a learnt model.
 - `spot`: centroid, covariance and shape of each spot.
-- `placed`: the place of a spot on its target; `centroid`: an own centroid instead.
+- `placed`: the position of a spot on its target; `centroid`: a user-defined centroid function.
 - `quality`: named reasons against a spot, with measured values and limits.
 """
 

@@ -1,4 +1,4 @@
-"""Estimate the light of a beam beyond a target's border from its decline at the border."""
+"""Estimates the light of a beam beyond the target border from its decline at the border."""
 
 from dataclasses import dataclass
 

@@ -1,6 +1,6 @@
-"""Straight edges of shadows across a face: find them, and adjust them in a background fit.
+"""Straight shadow edges across a face: finds them, and refines them in a background fit.
 
-Places are columns and rows from the middle of the grid on which backgrounds are fitted; rows run
+Positions are columns and rows from the middle of the grid on which backgrounds are fitted; rows run
 downwards.
 """
 

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: the top of a picture from which each pixel descends."""
+"""Compiled: the local maximum of a picture from which each pixel descends."""
 
 import numpy as np
 from numba import njit

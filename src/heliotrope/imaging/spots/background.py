@@ -1,4 +1,4 @@
-"""Estimate what a target would look like without beams."""
+"""Estimates what a target would look like without beams."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -58,31 +58,32 @@ _NEAR = 3
 
 @dataclass(frozen=True)
 class Background:
-    """A face without its beams, with its covariance.
+    """A face without its beams, with covariance.
 
     Attributes
     ----------
     values
-        Brightness over full scale, (H, W).
+        Brightness as a fraction of full scale, (H, W).
     deviation
-        Standard deviation of the residuals of the smoothed paint, of full scale.
+        Standard deviation of the residuals of the smoothed paint, as a fraction of full scale.
     noise
-        Standard deviation of a pixel, of full scale.
+        Standard deviation of a pixel, as a fraction of full scale.
     patch
         Area over which the residuals are correlated, m².
     basis
-        Derivatives of the values by the parameters of the fit, on the fit's grid, (h, w, K).
+        Derivatives of the values with respect to the fit parameters, on the grid of the fit, (h, w,
+        K).
     covariance
         Covariance of the parameters, (K, K).
     stride
-        Pixels between rows of the fit's grid.
+        Pixels between rows of the fit grid.
     method
         "frame", "difference" or "model".
     seen
-        Share of the paint that was free of beams.
+        Fraction of the paint that was free of beams.
     reflectance
-        Reflectance of the paint relative to the usual one, (H, W), or None. Light divided by it is
-        the light that falls on the face.
+        Reflectance of the paint relative to the usual value, (H, W), or None. Dividing the light by
+        it yields the light that falls on the face.
     """
 
     values: Image
@@ -98,10 +99,10 @@ class Background:
 
 
 def from_frame(picture: Rectified) -> Background:
-    """Return the background from one frame alone: smooth light on even paint.
+    """Return the background from one frame alone, assuming smooth light on uniform paint.
 
-    A polynomial is fitted to the paint that no beam lights. Beams are bright and stand out above
-    the fit. They are left out with their surroundings, and the fit is repeated until nothing
+    A polynomial is fitted to the paint that no beam illuminates. Beams are bright and stand out
+    above the fit. They are excluded with their surroundings, and the fit is repeated until nothing
     changes.
     """
     return _fit(picture, np.ones(picture.shape, dtype=np.float32), _orders(picture), "frame")
@@ -110,12 +111,13 @@ def from_frame(picture: Rectified) -> Background:
 def from_difference(picture: Rectified, without: Rectified) -> Background:
     """Return the background from a second frame that shows the target without the beam.
 
-    A plane of ratios is fitted, because the light may have changed between the frames.
+    A plane is fitted to the brightness ratios, because the light may have changed between the
+    frames.
 
     Raises
     ------
     InputError
-        If the two do not show the same face on the same grid.
+        If the two frames do not show the same face on the same grid.
     """
     if without.shape != picture.shape or not np.allclose(without.first, picture.first):
         raise InputError(
@@ -132,9 +134,9 @@ class EmptyTarget:
     Attributes
     ----------
     reflectance
-        Brightness over that of the smooth light, (H, W).
+        Brightness relative to that of the smooth light, (H, W).
     weight
-        Number of frames behind each pixel, old ones counting less, (H, W).
+        Number of frames behind each pixel, with lower weight for old frames, (H, W).
     memory
         Frames after which the weight of a frame falls to 1/e.
     targets
@@ -154,15 +156,15 @@ class EmptyTarget:
         return EmptyTarget(ones, np.zeros_like(ones), memory, names)
 
     def learn(self, picture: Rectified, spots: Mask | None = None) -> "EmptyTarget":
-        """Return the model after another frame.
+        """Return the model updated with another frame.
 
         Parameters
         ----------
         picture
             A frame, with or without beams.
         spots
-            Where beams are in it, (H, W); nothing is learnt there. By default they are
-            searched for.
+            Mask of the beams in the frame, (H, W), where the model is not updated. By default the
+            beams are searched for.
         """
         self._check(picture)
         known = self.ready
@@ -180,7 +182,7 @@ class EmptyTarget:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the model to a file (.npz), whole or not at all.
+        """Write the model to a file (.npz), completely or not at all.
 
         Raises
         ------
@@ -200,7 +202,7 @@ class EmptyTarget:
 
     @staticmethod
     def load(path: str | Path) -> "EmptyTarget":
-        """Return a model that `save` wrote.
+        """Return a model from a file written by `save`.
 
         Raises
         ------
@@ -231,11 +233,11 @@ class EmptyTarget:
 
     @property
     def ready(self) -> bool:
-        """Whether it knows the paint better than a single frame does."""
+        """Whether the model knows the paint better than a single frame does."""
         return float(np.median(self.weight)) >= _KNOWN
 
     def fits(self, picture: Rectified) -> bool:
-        """Return whether it is a model of exactly the targets and the grid of a picture."""
+        """Return whether the model has exactly the targets and the grid of a picture."""
         names = {target.name for target in picture.face.targets}
         same = not self.targets or set(self.targets) == names
         return same and picture.shape == self.reflectance.shape
@@ -257,12 +259,12 @@ class EmptyTarget:
 def from_model(picture: Rectified, model: EmptyTarget) -> Background:
     """Return the background of a frame from a model of the empty target.
 
-    Light on stained paint is later divided by its reflectance.
+    The light on stained paint is later divided by its reflectance.
 
     Raises
     ------
     InputError
-        If the model is of another grid or target.
+        If the model has a different grid or target.
     """
     model._check(picture)  # noqa: SLF001 (its own module)
     columns, rows = _orders(picture)

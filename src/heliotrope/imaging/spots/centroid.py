@@ -1,4 +1,4 @@
-"""An own centroid: the picture of a beam in, its place and covariance out."""
+"""User-defined centroids: from the picture of a beam to its position and covariance."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,30 +18,30 @@ from heliotrope.imaging.targets.rectify import Mask, Rectified
 
 @dataclass(frozen=True)
 class BeamPicture:
-    """A beam on its target, seen from the front: what an own centroid works on.
+    """A beam on its target, seen from the front: the input of a user-defined centroid.
 
-    Brightness is of full scale; row 0 is at the top. Where other targets lie in the same plane,
-    the picture shows them too, because a beam may reach them.
+    Brightness is relative to full scale; row 0 is at the top. If other targets lie in the same
+    plane, the picture shows them too, because a beam may extend onto them.
 
     Attributes
     ----------
     target
         The target.
     picture, background
-        Brightness with the beam, and without it as far as the frame shows, (H, W).
+        Brightness with the beam, and without it as far as the frame reveals, (H, W).
     light
-        Their difference, as paint of the usual reflectance would show it, (H, W); on marks it is
-        interpolated.
+        Their difference, as paint of the usual reflectance would show it, (H, W); interpolated on
+        marks.
     mask
-        Pixels of this beam, tails included, (H, W).
+        Pixels of this beam, including its tails, (H, W).
     paint
         Pixels of bare paint, (H, W).
     clipped
-        Share of each pixel at full scale, (H, W).
+        Fraction of each pixel that is at full scale, (H, W).
     right, up
-        Metres right of and above the target's centre, (H, W).
+        Metres to the right of and above the target centre, (H, W).
     noise
-        Standard deviation of a pixel's light, noise and uneven paint, as if pixels were
+        Standard deviation of a pixel's light from noise and uneven paint, as if pixels were
         independent.
     """
 
@@ -57,8 +57,8 @@ class BeamPicture:
     noise: float
 
 
-#: A function of a picture that gives the beam's place, metres right of and above the target's
-#: centre, (2,), and the covariance of that place, m², (2, 2).
+#: A function that takes a picture and returns the beam position, metres to the right of and above
+#: the target centre, (2,), and its covariance, m², (2, 2).
 Centroid = Callable[[BeamPicture], tuple[npt.ArrayLike, npt.ArrayLike]]
 
 

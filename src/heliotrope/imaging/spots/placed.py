@@ -1,4 +1,4 @@
-"""A spot's place on its target, with the covariance of spot, view and survey."""
+"""The position of a spot on its target, with the covariance of spot, view and survey."""
 
 from dataclasses import dataclass
 
@@ -13,28 +13,28 @@ from heliotrope.imaging.targets.view import Face
 
 @dataclass(frozen=True)
 class PlacedSpot:
-    """A spot and its place.
+    """A spot and its position.
 
     Attributes
     ----------
     spot
-        Its shape, on its face.
+        Shape of the spot, on its face.
     target
-        The target under its centroid; None beside all targets.
+        The target under its centroid; None if it is beside all targets.
     plane
-        Metres right of and above the target's centre (of the face's origin if there is no
+        Metres to the right of and above the target centre (or the face origin if there is no
         target), (2,).
     covariance
-        Covariance of ``plane``: spot, view and survey, m², (2, 2).
+        Covariance of ``plane`` from spot, view and survey, m², (2, 2).
     point
         ENU metres, (3,).
     covariance_enu
-        Covariance of the point, m², (3, 3); 0 across the plane.
+        Covariance of the point, m², (3, 3); 0 perpendicular to the plane.
     pixel
         Pixel of the frame, (2,).
     flux
-        Its light over the frame's exposure and gain, full scales m² per second at gain 1,
-        which makes frames of one camera comparable; NaN if exposure or gain is unknown.
+        Light divided by the frame's exposure and gain, full scales m² per second at gain 1, which
+        makes frames from one camera comparable; NaN if exposure or gain is unknown.
     """
 
     spot: Spot
@@ -53,7 +53,7 @@ class PlacedSpot:
 
 
 def place(picture: Rectified, spot: Spot, gathered: float = float("nan")) -> PlacedSpot:
-    """Place a spot on its target, and add the covariance of the view.
+    """Locate a spot on its target, and add the covariance of the view.
 
     Parameters
     ----------

@@ -32,43 +32,44 @@ REASONS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Tolerances of the checks.
+    """Limits of the checks.
 
     Attributes
     ----------
     second_spot
-        Power of another spot on the same target, over that of the first.
+        Largest power of another spot on the same target, relative to the first.
     edge
-        Brightness at the target's border over the peak. Within this limit the light beyond
-        the border is estimated to about a third of the shift it causes.
+        Brightness at the target border relative to the peak. Within this limit the light beyond the
+        border is estimated to about a third of the shift that it causes.
     cut
-        That shift, m.
+        Largest such shift, m.
     clipped
-        Share of the light in clipped pixels.
+        Fraction of the light in clipped pixels.
     mark_contrast
-        Brightness of the marks over that of their surroundings.
+        Brightness of the marks relative to their surroundings.
     power
-        Least power over the expected.
+        Smallest power relative to the expected power.
     surprise
-        Standard deviations that a beam may exceed its expectation in power, length or width.
+        Number of standard deviations by which a beam may exceed its expected power, length or
+        width.
     skewness
-        Two overlapping beams are more skewed than the beam of one heliostat (98 % of the
-        measured beams of Jülich are below 0.28).
+        Largest skewness; two overlapping beams are more skewed than the beam of one heliostat (98 %
+        of the measured beams at Jülich are below 0.28).
     contrast
-        Least peak over background, if nothing is expected.
+        Smallest peak relative to the background, if nothing is expected.
     motion
-        Blur of the marks in one direction over that in the other.
+        Largest ratio of the blur of the marks in one direction to that in the other.
     blur
-        Blur of the marks, m.
+        Largest blur of the marks, m.
     covered
-        Share of a spot under marks.
+        Fraction of a spot that is covered by marks.
     deviation
         Standard deviation of the centroid along its worse axis, m.
     free
-        Least share of the face without light of beams.
+        Smallest fraction of the face that is free of beams.
     unexplained
-        Share of the face, beside its spots, that is brighter or darker than it should be:
-        shadows with more than one edge, stray light, obstacles.
+        Fraction of the face, outside its spots, that is brighter or darker than it should be:
+        shadows with several edges, stray light, obstacles.
     """
 
     second_spot: float = 0.15
@@ -95,16 +96,16 @@ class Expectation:
     Attributes
     ----------
     power
-        Power as in `Spot`, over the ambient light, m²; NaN if unknown.
+        Power as in `Spot`, relative to the ambient light, m²; NaN if unknown.
     flux
         Flux as in `PlacedSpot`, full scales m²/s at gain 1; NaN if unknown. It depends on the sun
-        alone and is preferred to ``power`` where exposure and gain of a frame are known.
+        alone and is preferred to ``power`` if the exposure and gain of a frame are known.
     length, width
         Standard deviations along its major and minor axis, m; NaN if unknown.
     deviation
         Relative standard deviation of power, flux, length and width.
     place
-        Expected place, metres right of and above the target's centre, (2,), or None; of
+        Expected position, metres to the right of and above the target centre, (2,), or None; of
         several spots the nearest is taken.
     """
 
@@ -116,7 +117,7 @@ class Expectation:
     deviation: float = 0.15
 
     def most(self, limits: Limits) -> float:
-        """Return the greatest tolerated ratio to the expected value."""
+        """Return the largest tolerated ratio to the expected value."""
         return float(np.exp(limits.surprise * self.deviation))
 
 
@@ -129,7 +130,7 @@ class Reason:
     name
         One of `REASONS`.
     value, limit
-        Measured and tolerated; NaN where there is nothing to measure.
+        Measured and tolerated value; NaN if there is nothing to measure.
     text
         The reason in words.
     """
@@ -157,11 +158,11 @@ def judge(
     found
         The target in its frame; None for a crop.
     spots
-        Spots on this target, the intended one first.
+        Spots on this target, the intended spot first.
     deviation
-        Standard deviation of its centroid along its worse axis, target included, m.
+        Standard deviation of its centroid along its worse axis, including that of the target, m.
     free
-        Share of the face that no beam lights.
+        Fraction of the face that is free of beams.
     limits
         Tolerances.
     expectation
@@ -169,7 +170,7 @@ def judge(
     flux
         Flux of the first spot, full scales m²/s at gain 1; NaN if unknown.
     unexplained
-        Share of the face beside its spots that is not as it should be.
+        Fraction of the face, outside its spots, that is brighter or darker than it should be.
     """
     reasons = [] if found is None else _of_frame(found, limits)
     if not spots:

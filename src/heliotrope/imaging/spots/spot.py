@@ -1,4 +1,4 @@
-"""Spots on a face: which pixels belong to each, and where its centroid is."""
+"""Spots on a face: which pixels belong to each spot, and where its centroid is."""
 
 from dataclasses import dataclass
 
@@ -54,33 +54,33 @@ class Spot:
         Centroid of its light, plane coordinates of the face, m, (2,); includes the estimated light
         beyond the target's border.
     covariance
-        Covariance of the centroid, m², (2, 2): background, noise, tails, border and clipping.
+        Covariance of the centroid, m², (2, 2), from background, noise, tails, border and clipping.
     second_moments
-        Second moments of its light on the target about that light's centre, m², (2, 2).
+        Second moments of its light on the target about the centre of that light, m², (2, 2).
     power
-        Sum of its brightness over that of the background, m².
+        Sum of its brightness relative to that of the background, m².
     peak
-        Greatest brightness above the background, of full scale.
+        Largest brightness above the background, as a fraction of full scale.
     contrast
-        Peak over the background there.
+        Peak relative to the background at that point.
     deviation
-        Standard deviation of the background's residuals, of full scale.
+        Standard deviation of the background residuals, as a fraction of full scale.
     clipped
-        Share of its light in clipped pixels.
+        Fraction of its light in clipped pixels.
     edge
-        Brightness at the border of the visible target, over its peak.
+        Brightness at the border of the visible target, relative to its peak.
     covered
-        Share of its area that marks cover.
+        Fraction of its area that marks cover.
     area
         m².
     region
-        Its pixels, (H, W), tails included.
+        Its pixels, (H, W), including tails.
     cut
-        Shift of ``centroid`` by the light beyond the border, m.
+        Shift of ``centroid`` due to the light beyond the border, m.
     light
         Sum of its brightness, full scales m².
     skewness
-        Norm of the third moments of its body, in its standard deviations; 0 if symmetric.
+        Norm of the third moments of its core, in units of its standard deviations; 0 if symmetric.
     """
 
     centroid: FloatArray
@@ -101,7 +101,7 @@ class Spot:
 
     @property
     def axes(self) -> tuple[float, float, float]:
-        """Standard deviations along its major and minor axis, m, and the major one's angle.
+        """Standard deviations along the major and minor axis, m, and the angle of the major axis.
 
         The angle is counterclockwise from the right, rad.
         """
@@ -115,8 +115,8 @@ class Spot:
 def find_spots(picture: Rectified, background: Background) -> list[Spot]:
     """Return the spots on a face, the most powerful first.
 
-    Every pixel above the background belongs to the top from which it descends. Tops are
-    separate beams if brightness falls between them.
+    Every pixel above the background belongs to the local maximum from which it descends. Maxima are
+    separate beams if the brightness drops between them.
     """
     light = beam_light(picture, background)
     soft = smooth(picture, light, max(0.07 / picture.step, 1.0))

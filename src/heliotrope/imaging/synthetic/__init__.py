@@ -1,7 +1,7 @@
-"""Synthetic frames with exact truth, for tests, figures and simulated cameras.
+"""Synthetic frames with exact ground truth, for tests, figures and simulated cameras.
 
-`scenes` describes target, light, paint, lens and sensor; `rendering` makes a frame of a scene.
-Nothing that reads real photographs imports this room. Begin with `example_target`,
+`scenes` describes target, light, paint, lens and sensor; `rendering` renders a frame from a scene.
+No code that evaluates real photographs imports this package. Begin with `example_target`,
 `example_camera`, `Scene` and `render`.
 """
 

@@ -1,4 +1,4 @@
-"""The constant part of frames: where pixels look, and the paint that they see there."""
+"""The constant part of frames: what each pixel looks at, and the paint that it sees there."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache

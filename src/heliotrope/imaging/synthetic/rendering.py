@@ -1,8 +1,8 @@
-"""Synthetic frames: a camera's view of a target with beams, and the truth.
+"""Synthetic frames: a camera's view of a target with beams, and the ground truth.
 
-Light is expressed as the irradiance (W/m²) on perfectly white diffuse paint of equal brightness.
-Paint, borders and marks cover pixels by exact areas; beams are averaged over pixels.
-See docs/explanation/rendering.md.
+Light is expressed as the irradiance (W/m²) that would make perfectly white diffuse paint equally
+bright. Paint, borders and marks cover pixels by exact areas; beams are averaged over pixels. See
+docs/explanation/rendering.md.
 """
 
 from dataclasses import dataclass, replace
@@ -60,23 +60,23 @@ LIT, COVERED = 0.5, 3.0
 
 @dataclass(frozen=True)
 class BeamTruth:
-    """The true place of a beam.
+    """The true position of a beam.
 
     Attributes
     ----------
     target
         Name of the target.
     centroid, point, pixel
-        Centre of the energy on the plane, including that beyond the border: metres right of
-        and above the target's centre (2,), ENU metres (3,), and the pixel of that point (2,).
+        Centre of the energy on the plane, including light beyond the border: metres to the right of
+        and above the target centre (2,), ENU metres (3,), and the pixel of that point (2,).
     centroid_on_target, pixel_on_target
-        The same for the energy on the target; NaN if there is none.
+        The same for the energy on the target; NaN if no energy falls on it.
     share_on_target
-        Share of the energy on the target.
+        Fraction of the energy on the target.
     share_clipped
-        Share of its light in the frame that is on clipped pixels.
+        Fraction of its light in the frame that is on clipped pixels.
     peak
-        Reading at its strongest light, in full scales, before clipping.
+        Pixel value at its brightest point, in full scales, before clipping.
     """
 
     target: str
@@ -103,13 +103,13 @@ class MarkTruth:
     in_frame
         Whether the pixel is in the frame.
     light
-        Mean flux of the beams on it over the ambient light.
+        Mean flux of the beams on the mark relative to the ambient light.
     contrast
-        Mean reading of the paint minus that of the mark, after clipping, in full scales.
+        Mean pixel value of the paint minus that of the mark, after clipping, in full scales.
     lit
         Whether ``light`` is above one half.
     covered
-        Whether the contrast is below three standard deviations of a pixel's noise.
+        Whether the contrast is below three standard deviations of the pixel noise.
     """
 
     target: str
@@ -124,7 +124,7 @@ class MarkTruth:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A frame and its truth.
+    """A frame and its ground truth.
 
     Attributes
     ----------
@@ -133,10 +133,10 @@ class Rendered:
     beams, marks
         Truth of beams and marks, in the order of the scene.
     clipped
-        Share of the readings at full scale.
+        Fraction of the pixel values at full scale.
     level
-        Readings without noise, clipping and encoding, in full scales, float32, in the shape
-        of the frame; None unless requested.
+        Pixel values without noise, clipping and encoding, in full scales, float32, in the shape of
+        the frame; None unless requested.
     """
 
     frame: Frame
@@ -154,7 +154,7 @@ def render(
     time: datetime | None = None,
     level: bool = False,
 ) -> Rendered:
-    """Return a frame of a scene with its truth; equal seeds give equal noise.
+    """Return a frame of a scene with its ground truth; equal seeds give equal noise.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def render(
     name, time
         Name and time of the frame.
     level
-        Whether to return the readings without noise too.
+        Whether to return the pixel values without noise too.
 
     Raises
     ------
@@ -289,7 +289,7 @@ def _bell(sigma: float) -> FloatArray:
 
 
 def point_spread(lens: LensEffects) -> FloatArray:
-    """Return the kernel (K, K) of a lens's disc or Gaussian with its shake; symmetric, sum 1."""
+    """Return the kernel (K, K) of a lens's disk or Gaussian with its shake; symmetric, sum 1."""
     from scipy.signal import convolve2d
 
     spread = np.ones((1, 1))

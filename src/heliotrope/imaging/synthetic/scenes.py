@@ -15,7 +15,7 @@ from heliotrope.optics.mirror_image import Beam
 
 @dataclass(frozen=True)
 class Paint:
-    """The paint of a target and its age.
+    """The paint of a target and its ageing.
 
     Attributes
     ----------
@@ -28,11 +28,11 @@ class Paint:
     wear
         Standard deviation of the reflectance over decimetres, relative.
     stains, stain
-        Number of stains, and greatest relative loss of reflectance in one.
+        Number of stains, and largest relative loss of reflectance in a stain.
     patch
-        Reflectance of a repaired patch; 0: none.
+        Reflectance of a repaired patch; 0: no patch.
     seed
-        For the places of stains, wear and patch.
+        Seed for the positions of stains, wear and patch.
     """
 
     reflectance: float = 0.85
@@ -64,7 +64,7 @@ class Surroundings:
     wall
         Extent of the wall beyond the target to the left, right, up and down, m.
     reflectance
-        Reflectance of the wall, which catches the light of beams that misses the target.
+        Reflectance of the wall, on which light that misses the target falls.
     sky
         Brightness of the sky, W/m² on white.
     texture
@@ -72,7 +72,7 @@ class Surroundings:
     clutter
         Number of light and dark boxes on the wall.
     seed
-        For their places.
+        Seed for their positions.
     """
 
     wall: tuple[float, float, float, float] = (1.5, 1.5, 3.0, 30.0)
@@ -106,7 +106,7 @@ class Shadow:
     softness
         Width of the edge, m.
     left
-        Share of the light that remains in the shadow.
+        Fraction of the light that remains in the shadow.
     """
 
     point: tuple[float, float] = (0.0, 0.0)
@@ -127,17 +127,17 @@ class LensEffects:
     Attributes
     ----------
     defocus
-        Standard deviation of a Gaussian, or radius of a disc, px.
+        Standard deviation of a Gaussian, or radius of a disk, px.
     disc
-        Whether it is a disc, which is added to a Gaussian of 0.5 px.
+        Whether the blur is a disk, which is combined with a Gaussian of 0.5 px.
     shake
-        Movement of the camera during the exposure, to the right and down, px; the truth
-        refers to its middle.
+        Movement of the camera during the exposure, to the right and down, px; the ground truth
+        refers to the middle of the exposure.
     veil
-        Stray light everywhere, as a share of the frame's mean light.
+        Stray light everywhere, as a fraction of the frame's mean light.
     ghost, ghost_at, ghost_radius
-        A reflection in the lens: peak as a share of the full scale, place and standard
-        deviation, px.
+        A reflection in the lens: peak as a fraction of full scale, position and standard deviation,
+        px.
     """
 
     defocus: float = 0.6
@@ -166,7 +166,7 @@ class LensEffects:
 
     @property
     def rest(self) -> "LensEffects":
-        """The blur that remains for the frame."""
+        """The remaining blur, which is applied to the frame."""
         if self.disc:
             return self
         return replace(self, defocus=float(np.sqrt(self.defocus**2 - self.base**2)))
@@ -174,7 +174,7 @@ class LensEffects:
 
 @dataclass(frozen=True)
 class Sensor:
-    """The conversion of light to numbers.
+    """The conversion of light to pixel values.
 
     Attributes
     ----------
@@ -185,17 +185,17 @@ class Sensor:
     exposure
         s.
     gain
-        Relative: electrons / gain fill the scale.
+        Relative gain: electrons / gain fill the scale.
     read_noise
         Standard deviation, electrons.
     offset
-        Reading in darkness, as a share of the full scale.
+        Pixel value in darkness, as a fraction of full scale.
     bits
-        8, or 12 spread over 16 so that 4095 reads 65535.
+        8, or 12 spread over 16 so that 4095 becomes 65535.
     srgb
-        Encode by the sRGB curve instead of linearly.
+        Whether to encode by the sRGB curve instead of linearly.
     colour
-        Blue, green, red with light of two tints, instead of grey.
+        Whether to produce blue, green, red with light of two tints, instead of grey.
     """
 
     electrons: float = 10_000.0
@@ -222,7 +222,7 @@ class Sensor:
 
     @property
     def scale(self) -> float:
-        """Share of the full scale per W/m² on white."""
+        """Fraction of full scale per W/m² on white."""
         return self.sensitivity * self.exposure * self.gain / self.electrons
 
 
@@ -235,11 +235,11 @@ class Thrown:
     target
         Name of the target.
     beam
-        Flux in its plane, at the middle of the exposure.
+        Flux in the target plane, at the middle of the exposure.
     strength
-        Factor of the flux.
+        Factor on the flux.
     motion
-        During the exposure, metres right and up.
+        Movement during the exposure, metres right and up.
     """
 
     target: str
@@ -267,11 +267,12 @@ class Scene:
     ambient
         Irradiance of the targets without beams, W/m².
     gradient
-        Its relative increase to the right and upwards, 1/m, about each target's centre.
+        Relative increase of the ambient irradiance to the right and upwards, 1/m, about each
+        target's centre.
     shadow
         Shadow on each target's plane.
     cloud
-        Factor of all beams; 1 under a clear sky.
+        Factor on all beams; 1 under a clear sky.
     paint, surroundings, lens, sensor
         See their classes.
     """
@@ -308,14 +309,15 @@ class Scene:
 
 
 def exposed(scene: Scene, peak: float = 0.8) -> Scene:
-    """Return the scene exposed such that its brightest beam reads ``peak``.
+    """Return the scene with the exposure set so that its brightest beam reads ``peak``.
 
     Parameters
     ----------
     scene
-        Scene with beams, or with ambient light alone; then the paint reads ``peak``.
+        Scene with beams; with ambient light alone the paint reads ``peak``.
     peak
-        Reading of the target's paint at the peak of the strongest beam, of the full scale.
+        Pixel value of the target paint at the peak of the strongest beam, as a fraction of full
+        scale.
     """
     sensor = scene.sensor
     if not peak > sensor.offset:
@@ -333,7 +335,7 @@ def example_target(
 ) -> Target:
     """Return a square target that faces north, with eight marks just inside its border.
 
-    Corners stand at its four corners and tees half-way between. For a side of 8 m they measure
+    Corner marks are at its four corners and tees half-way between. For a side of 8 m they measure
     0.6 m with strokes of 0.12 m, otherwise in proportion.
     """
     middle, half = as_float(center), 0.5 * side
@@ -369,24 +371,24 @@ def example_camera(
     distortion: float = 0.004,
     name: str = "camera",
 ) -> Camera:
-    """Return a camera that sees a target from below and from the side, with distortion.
+    """Return a camera that sees a target from below and from one side, with distortion.
 
     Parameters
     ----------
     target
-        Target in view; its centre is a little off the middle of the frame.
+        Target in view; its centre is slightly off the middle of the frame.
     distance
         Distance from the target's centre, m.
     size
         Width and height of a frame, pixels.
     side, below
-        Angles off the target's normal, to the right as seen from its front and downwards, rad.
+        Angles off the target normal, to the right as seen from its front and downwards, rad.
     roll
-        Turn about the line of sight, rad.
+        Rotation about the line of sight, rad.
     fill
-        Share of the frame's shorter side that the target takes up.
+        Fraction of the frame's shorter side that the target occupies.
     distortion
-        Inward shift of the frame's corners, as a share of their distance from the middle.
+        Inward shift of the frame corners, as a fraction of their distance from the middle.
     name
         Name of the camera.
     """

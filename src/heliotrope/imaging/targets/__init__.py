@@ -1,11 +1,11 @@
-"""Find targets in frames by their marks, and teach a camera its targets.
+"""Finds targets in frames by their marks, and teaches a camera its targets.
 
 - `marks` and `detection`: drawings of marks, and candidates for them in a frame.
-- `constellation` and `refinement`: which candidate is which mark, and its exact place.
-- `finding`: targets in a frame, or why they were not found, by one `attempt` after another. `view`
-  maps a target's plane to a frame, `rectify` shows it from the front.
-- `teaching` and `click_page`: marks and camera from points that a person gives. `sights`: how well
-  a camera sees its targets.
+- `constellation` and `refinement`: which candidate is which mark, and its exact position.
+- `finding`: targets in a frame, or why they were not found, through successive `attempt`s. `view`
+  maps a target plane to a frame, `rectify` shows it from the front.
+- `teaching` and `click_page`: marks and camera from points that a user clicks. `sights`: how well a
+  camera sees its targets.
 
 Begin with `find_targets`.
 """

@@ -1,4 +1,4 @@
-"""One attempt to see a face in a frame: its marks, the view that they give, and why to doubt it."""
+"""One attempt to locate a face in a frame: its marks, the resulting view, and reasons for doubt."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

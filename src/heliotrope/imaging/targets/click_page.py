@@ -1,7 +1,7 @@
-"""A page, for this machine alone, on which a person clicks points in a picture.
+"""A page, served only to this computer, on which a user clicks points in a picture.
 
 OpenCV is used without windows, so a browser shows the picture: one address on 127.0.0.1 that ends
-in a random word, one self-contained page, one answer.
+in a random word, one self-contained page, one reply.
 """
 
 import json

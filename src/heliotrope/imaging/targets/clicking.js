@@ -1,8 +1,9 @@
 // Clicking the points of a target in a picture: `heliotrope camera teach --click` and the console.
 // `parts`: canvases picture, glass and sketch, the element ask, and the list (ol).
 // `data`: size of the picture (px), points ({name, place, expected?}), given ({name, at}), and the target's aspect.
-// `told` is called after every change. Pixels: the centre of the first one is 0, 0.
-export function clicking(parts, data, image, told) {
+// `told` is called after every change; `t` puts values into the {names} of a text, and may translate it. Pixels: the centre of the first one is 0, 0.
+const inEnglish = (text, values = {}) => text.replace(/\{(\w+)\}/g, (whole, name) => values[name] ?? whole);
+export function clicking(parts, data, image, told, t = inEnglish) {
   const [width, height] = data.size;
   const found = new Map();          // name -> [x, y]
   const history = [];
@@ -87,8 +88,8 @@ export function clicking(parts, data, image, told) {
   const tell = () => {
     const hint = document.createElement("span");
     const point = data.points[state.now];
-    parts.ask.textContent = point ? `Click on ${point.name}` : "That was all";
-    hint.textContent = point ? `${state.now + 1} of ${data.points.length}` : "Look once more, then go on";
+    parts.ask.textContent = point ? t("Click on {name}", { name: point.name }) : t("That was all");
+    hint.textContent = point ? t("{n} of {all}", { n: state.now + 1, all: data.points.length }) : t("Look once more, then go on");
     parts.ask.append(hint);
     parts.list.textContent = "";
     const row = (name, at, kind, pick) => {

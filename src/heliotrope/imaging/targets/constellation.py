@@ -1,4 +1,4 @@
-"""Assign candidates to marks, by their looks and their arrangement."""
+"""Assigns candidates to marks, by their appearance and their arrangement."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,9 @@
-"""Candidates for marks: dark drawings on a light ground, anywhere in a frame.
+"""Candidates for marks: dark drawings on a light background, anywhere in a frame.
 
-Seen from far, a flat drawing appears as an affine map of itself. A part of a frame and a drawing
-are compared after their second moments have been made round. What remains is a rotation, which
-follows from the brightness around the middle. So each candidate gives a complete affine map,
-whatever the roll of the camera and its position to the side.
+Seen from a distance, a flat drawing appears as an affine image of itself. Before a part of a frame
+is compared with a drawing, both are transformed so that their second moments are circular. What
+remains is a rotation, which follows from the brightness around the centre. Each candidate therefore
+yields a complete affine map, whatever the roll of the camera and however oblique its view.
 """
 
 from collections.abc import Mapping, Sequence

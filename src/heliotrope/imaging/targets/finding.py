@@ -1,7 +1,7 @@
-"""Find targets in a raw frame by their marks: where, how well, or why not.
+"""Finds targets in a raw frame by their marks, and reports where, how well, or why not.
 
-A search for one face makes attempts (`attempt.py`). Attempts follow each other, the quick ones
-first, until a view is good enough.
+The search for one face makes attempts (`attempt.py`) one after the other, the quick ones first,
+until a view is good enough.
 """
 
 from collections.abc import Iterator, Sequence
@@ -59,17 +59,17 @@ class FoundMark:
     mark
         The mark.
     pixel
-        Where it was seen, (2,), or where it should be if it was not seen.
+        Position where the mark was seen, (2,), or where it should be if it was not seen.
     covariance
-        px², (2, 2); NaN if it was not seen.
+        Covariance, px², (2, 2); NaN if it was not seen.
     used
-        Whether the view was fitted to it.
+        Whether it was used to fit the view.
     reason
         Why it was not used; empty if it was.
     contrast
-        Its brightness over that of its surroundings; NaN for a tag.
+        Brightness relative to its surroundings; NaN for a tag.
     blur
-        Blur of its upright and level edges, m, (2,); NaN for a tag.
+        Blur of its vertical and horizontal edges, m, (2,); NaN for a tag.
     """
 
     mark: Mark
@@ -94,7 +94,7 @@ class FoundTarget:
     reason
         Why it was not found; empty if it was.
     marks
-        Its marks that were searched for.
+        Marks of the target that were searched for.
     view
         How its face lies in the frame; None if it was not found.
     """
@@ -118,23 +118,23 @@ def find_targets(
     Parameters
     ----------
     frame
-        The frame as the camera gives it.
+        The frame as delivered by the camera.
     targets
         Targets with known marks. Targets in one plane are found together.
     camera
-        Its lens is used; if its pose is known too, marks are searched for at their expected
-        places first, and a target that is where the pose has it only in a turned or mirrored
-        frame is refused. The lens of a camera of another frame size is ignored.
+        Its lens is used. If its pose is known too, marks are first searched for at their expected
+        positions, and a target that agrees with the pose only in a rotated or mirrored frame is
+        rejected. The lens of a camera with a different frame size is ignored.
     previous
-        Views of earlier frames of the same camera, tried first.
+        Views from earlier frames of the same camera, tried first.
     pictures
         Pictures of taught marks, by their code.
 
     Notes
     -----
-    If the marks look the same after a quarter or half a turn of the target, they cannot tell a
-    turned camera from an upright one. Without a pose or an earlier view, the more upright
-    solution is taken.
+    If the marks look the same after rotating the target by 90° or 180°, they cannot distinguish a
+    rotated camera from an upright one. Without a pose or an earlier view, the solution closer to
+    upright is taken.
     """
     look = FrameSearch(frame, camera, pictures or {})
     searches = []

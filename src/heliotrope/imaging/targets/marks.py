@@ -10,12 +10,12 @@ from heliotrope.geometry import FloatArray
 
 
 def polygons(mark: Mark) -> list[FloatArray]:
-    """Return the dark polygons of a mark, metres right of and above its point, each (K, 2).
+    """Return the dark polygons of a mark, metres to the right of and above its point, each (K, 2).
 
     Raises
     ------
     InputError
-        If a tag's dictionary is unknown, or the mark is a picture, which has no polygons.
+        If the dictionary of a tag is unknown, or the mark is a picture, which has no polygons.
     """
     shapes = _upright(mark)
     cos, sin = np.cos(mark.turn), np.sin(mark.turn)

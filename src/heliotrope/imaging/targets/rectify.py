@@ -1,4 +1,4 @@
-"""A face seen from its front: the frame's brightness on a grid of metres."""
+"""A face seen from the front: the brightness of the frame on a metric grid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,15 +36,15 @@ class Rectified:
     face
         The plane.
     values
-        Brightness over full scale, (H, W) of float32, row 0 at the top.
+        Brightness relative to full scale, (H, W) of float32, row 0 at the top.
     step
         Size of a pixel, m.
     first
         Plane coordinates of the first pixel's centre, m, (2,).
     surface
-        Where a target's surface is in the frame, (H, W).
+        Where the surface of a target is visible, (H, W).
     marks
-        Where marks are printed, (H, W).
+        Where marks are painted, (H, W).
     clipped
         How much each pixel is clipped, 0 to 1, (H, W); see `Frame.clipped`.
     view
@@ -67,7 +67,7 @@ class Rectified:
 
     @cached_property
     def paint(self) -> Mask:
-        """Where bare paint is seen: on a target and not on a mark."""
+        """Where bare paint is visible: on a target but not on a mark."""
         return np.asarray(self.surface & ~self.marks)
 
     @cached_property
@@ -75,7 +75,7 @@ class Rectified:
         return {}
 
     def share(self, sigma: float) -> Image:
-        """Return the share of bare paint around each pixel, (H, W), smoothed by ``sigma`` px."""
+        """Return the fraction of bare paint around each pixel, (H, W), smoothed by ``sigma`` px."""
         import cv2
 
         if sigma not in self._shares:
@@ -93,7 +93,7 @@ class Rectified:
 
     @cached_property
     def axes(self) -> tuple[Image, Image]:
-        """Plane coordinates of columns (W,) and rows (H,), m."""
+        """Plane coordinates of the columns (W,) and rows (H,), m."""
         rows, columns = self.shape
         x = self.first[0] + self.step * np.arange(columns)
         y = self.first[1] - self.step * np.arange(rows)
@@ -110,18 +110,18 @@ def rim_of(results: Sequence[FoundTarget]) -> int:
 
 
 def rectify(frame: Frame, view: FaceView, grey: Image | None = None, *, rim: int = 0) -> Rectified:
-    """Return a face of a frame on a grid of metres.
+    """Return a face in a frame on a metric grid.
 
     Parameters
     ----------
     frame
         The photograph.
     view
-        How the face lies in it.
+        How the face lies in the frame.
     grey
-        Its brightness, if already computed.
+        Brightness of the frame, if already computed.
     rim
-        Width of the rim that the surface leaves out, pixels of the grid; see `rim_of`.
+        Width of the rim that is excluded from the surface, pixels of the grid; see `rim_of`.
     """
     import cv2
 
@@ -167,7 +167,7 @@ def from_crop(frame: Frame, target: Target, *, rim: int = 0) -> Rectified:
     target
         The target that it shows.
     rim
-        Width of the rim that the surface leaves out, pixels of the grid.
+        Width of the rim that is excluded from the surface, pixels of the grid.
     """
     import cv2
 

@@ -1,8 +1,8 @@
-"""Locate a mark to a fraction of a pixel by fitting its drawing to the frame.
+"""Locates a mark to a fraction of a pixel by fitting its drawing to the frame.
 
-A pixel sees a + b·x + c·y + (d + e·x + f·y)·drawing of a mark: light that changes evenly over
-paint and print, and stray light. Second derivatives of the drawing account for blur that differs
-from that of the drawing, so that blur does not move the mark.
+The pixel values at a mark follow a + b·x + c·y + (d + e·x + f·y)·drawing, which accounts for light
+that varies evenly over paint and print, and for stray light. Second derivatives of the drawing
+account for blur that differs from that of the drawing, so blur does not shift the mark.
 """
 
 from dataclasses import dataclass, replace

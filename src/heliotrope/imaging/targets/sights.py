@@ -1,4 +1,4 @@
-"""What cameras see of targets: distance, resolution, obliquity, and the part in the frame."""
+"""What cameras see of targets: distance, resolution, obliquity, and the fraction in the frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ class TargetView:
     distance
         Distance from the camera to its centre, m.
     metres_per_pixel
-        At its centre: the root of the area of a pixel, m.
+        Resolution at the centre, as the square root of the area of a pixel, m.
     obliquity
-        Angle between the line of sight and its normal, rad.
+        Angle between the line of sight and the target normal, rad.
     share
-        Share of it in the frame.
+        Fraction of the target in the frame.
     marks
         Number of its marks in the frame.
     """
@@ -40,7 +40,7 @@ class TargetView:
 
 
 def sights(camera: Camera, targets: Sequence[Target]) -> list[TargetView]:
-    """Return the views of a camera's targets, or of all, that face it and are in its frame."""
+    """Return the views of the targets that face a camera and are in its frame."""
     if camera.position is None:
         return []
     views = []

@@ -1,7 +1,8 @@
-"""Teaching: a person points out the known points of a target in one picture.
+"""Teaching: a user marks the known points of a target in one picture.
 
-Where there is a mark of a known kind, the point is refined to a fraction of a pixel. Otherwise the
-part of the picture around it becomes a mark. The points also locate the camera.
+If there is a mark of a known kind at a point, the point is refined to a fraction of a pixel.
+Otherwise the part of the picture around the point becomes a mark. The points also locate the
+camera.
 """
 
 import hashlib
@@ -68,20 +69,20 @@ class Wish:
 
 @dataclass(frozen=True)
 class TaughtPoint:
-    """One point of the target in the picture.
+    """One known point of the target in the picture.
 
     Attributes
     ----------
     name
         Name of the point.
     pixel, covariance
-        Its place, (2,), with covariance, px² (2, 2).
+        Position, (2,), with covariance, px² (2, 2).
     mark
-        The target's new mark there; None if nothing there could be found again.
+        The new mark of the target at this point; None if nothing there could be recognised again.
     refined
-        Whether the place was refined by the mark's drawing; otherwise it is as given.
+        Whether the position was refined by the drawing of the mark; otherwise it is as specified.
     note
-        Why it differs from the wish; empty if it does not.
+        Why the mark differs from the request; empty if it does not.
     """
 
     name: str
@@ -107,7 +108,7 @@ class Taught:
     points
         Points in the order given.
     pictures
-        Taught pictures (N, N), uint8, by file name, which is their code.
+        Taught pictures (N, N), uint8, by file name, which is also their code.
     """
 
     plant: Plant
@@ -121,7 +122,7 @@ class Taught:
 def known_points(target: Target) -> dict[str, FloatArray]:
     """Return the named points of a target, ENU metres: marks, then markers, then corners.
 
-    Of equal names the first one counts.
+    If several points have the same name, the first counts.
     """
     points = {mark.name: mark.point for mark in target.marks}
     for name, point in target.markers.items():
@@ -175,25 +176,25 @@ def teach(
     frame
         The picture.
     given
-        Pixels by the names of `known_points`; four or more, each within `REACH`
-        of the truth.
+        Pixels by the names in `known_points`; four or more, each within `REACH` of its true
+        position.
     camera
-        Its name. The lens of a camera of the plant counts as known; otherwise it is solved
-        too, see `lens.calibrate_marks`.
+        Its name. If the plant has a camera of that name, its lens is taken as known; otherwise the
+        lens is solved too, see `pose.calibrate_marks`.
     wishes, wish
-        Marks to teach, by the name of the point, and at all others.
+        Marks to teach, by the name of the point, and the mark for all other points.
     sigma
-        Standard deviation of a coordinate of a point given by hand, px.
+        Standard deviation of a coordinate of a manually specified point, px.
     anew
-        Whether to solve the lens of a camera that the plant has.
+        Whether to solve for the lens of a camera that is already in the plant.
     prefix
-        Beginning of the file names of taught pictures.
+        Prefix of the file names of taught pictures.
 
     Raises
     ------
     InputError
-        If names are unknown, or points are too few, outside the picture, or arranged unlike
-        the target.
+        If names are unknown, or points are too few, outside the picture, or arranged unlike the
+        target.
     """
     if not (np.isfinite(sigma) and sigma > 0.0):
         raise InputError(f"sigma {sigma} px; give a standard deviation above 0")
@@ -237,9 +238,10 @@ def teach(
 
 
 def write_taught(taught: Taught, path: str | Path, folder: str | Path | None = None) -> None:
-    """Write the new pictures beside a plant file, then the file by `write_with_pictures`.
+    """Write the new pictures beside a plant file, then write the file with `write_with_pictures`.
 
-    File names depend on the pictures' contents, so that an older plant file keeps its own.
+    File names depend on the contents of the pictures, so that an older plant file keeps its own
+    pictures.
     """
     from heliotrope.imaging.files import write_image
 

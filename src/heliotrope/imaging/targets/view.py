@@ -1,4 +1,4 @@
-"""A view: the map from a plane with targets to one frame, with its covariance."""
+"""A view: the mapping from a plane with targets to one frame, with its covariance."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ class Face:
     Attributes
     ----------
     targets
-        Each within some centimetres of the plane.
+        Targets, each within some centimetres of the plane.
     origin
         ENU metres, (3,).
     axes
@@ -37,29 +37,29 @@ class Face:
     axes: FloatArray
 
     def plane(self, points: npt.ArrayLike) -> FloatArray:
-        """Return metres right of and above the origin, (..., 2), of ENU points (..., 3)."""
+        """Return metres to the right of and above the origin, (..., 2), for ENU points (..., 3)."""
         return np.asarray((np.asarray(points, dtype=np.float64) - self.origin) @ self.axes.T)
 
     def point(self, plane: npt.ArrayLike) -> FloatArray:
-        """Return ENU points (..., 3) of places in the plane (..., 2)."""
+        """Return ENU points (..., 3) of positions in the plane (..., 2)."""
         return self.origin + np.asarray(plane, dtype=np.float64) @ self.axes
 
     @property
     def span(self) -> FloatArray:
-        """Least and greatest plane coordinates of the targets' corners, (2, 2)."""
+        """Smallest and largest plane coordinates of the targets' corners, (2, 2)."""
         corners = self.plane(np.concatenate([t.corners for t in self.targets]))
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
 def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
-    """Return targets grouped by their planes.
+    """Return targets grouped by plane.
 
     Parameters
     ----------
     targets
         Targets of a plant.
     apart
-        Greatest distance of a corner from its plane, m.
+        Largest distance of a corner from its plane, m.
     """
     groups: list[list[Target]] = []
     for target in targets:
@@ -99,14 +99,14 @@ class FaceView:
     face
         The plane.
     lens
-        Focal length and distortion, known or estimated with the view.
+        Focal length and distortion, known or estimated together with the view.
     H_norm_plane
         Homography from plane metres to undistorted x/z, y/z, (3, 3).
     covariance
         Covariance of the eight free parameters of the homography and of k1, (9, 9), in the scaled
         coordinates of `fit_view`.
     residual
-        RMS of the points' residuals, pixels.
+        RMS of the point residuals, pixels.
     """
 
     face: Face
@@ -116,12 +116,12 @@ class FaceView:
     residual: float
 
     def to_pixels(self, plane: npt.ArrayLike) -> FloatArray:
-        """Return pixels (..., 2) of places in the plane (..., 2), m."""
+        """Return pixels (..., 2) for positions in the plane (..., 2), m."""
         place = np.asarray(plane, dtype=np.float64)
         return distort(self.lens, _apply(self.H_norm_plane, place))
 
     def to_plane(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Return places in the plane (..., 2), m, that pixels (..., 2) show."""
+        """Return positions in the plane (..., 2), m, for pixels (..., 2)."""
         inverse = np.asarray(np.linalg.inv(self.H_norm_plane), dtype=np.float64)
         return _apply(inverse, undistort(self.lens, pixels))
 
@@ -136,9 +136,9 @@ class FaceView:
         return np.stack(sides, axis=-1)
 
     def covariance_at(self, plane: npt.ArrayLike) -> FloatArray:
-        """Return the covariance, m², (2, 2), of the place seen at a given pixel.
+        """Return the covariance, m², (2, 2), of the position seen at a given pixel.
 
-        It contains the errors of the view alone: of the marks, their survey and the lens.
+        It contains only the errors of the view: of the marks, their survey and the lens.
         """
         place = np.asarray(plane, dtype=np.float64)
         numbers = _numbers(self.face, self.H_norm_plane, self.lens)
@@ -182,7 +182,7 @@ def fit_view(
     lens: Camera,
     lens_known: bool,
 ) -> FaceView:
-    """Return the view with the greatest posterior probability.
+    """Return the view with the highest posterior probability.
 
     Parameters
     ----------
@@ -191,15 +191,15 @@ def fit_view(
     plane, pixels
         Points in the plane, m, and their pixels, (N, 2), N ≥ 4.
     covariance
-        Covariance of the pixels, survey included: of each, (N, 2, 2), or of all together, (2N, 2N).
+        Covariance of the pixels, including survey errors: per pixel, (N, 2, 2), or jointly, (2N,
+        2N).
     lens
-        Initial lens; unless ``lens_known``, its k1 is estimated with the prior
-        `LENS_DEVIATION`.
+        Initial lens; unless ``lens_known``, its k1 is estimated with the prior `LENS_DEVIATION`.
 
     Notes
     -----
-    The covariance is scaled by the residuals, as far as they exceed the unknowns in number:
-    (ν + χ²)/(ν + dof) with ν = 4, never below 1.
+    The covariance is scaled by the residuals, as far as the number of observations exceeds that of
+    the unknowns: (ν + χ²)/(ν + dof) with ν = 4, never below 1.
     """
     white = np.linalg.inv(np.linalg.cholesky(covariance))
     # A tiny deviation of the prior fixes a known lens without a second code path.

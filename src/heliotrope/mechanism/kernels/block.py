@@ -1,4 +1,4 @@
-"""Compiled: tracking of many rows, with stops, counts and the choice of the branch."""
+"""Compiled: tracking of many rows, with stops, counts and branch selection."""
 
 import math
 

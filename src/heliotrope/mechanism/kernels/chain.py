@@ -1,10 +1,10 @@
-"""Compiled: the chain of joints forward, and the screw Jacobian.
+"""Compiled: forward kinematics of the joint chain, and the screw Jacobian.
 
-One chain is (position (3,), orientation (3, 3), axes (J, 3), origins (J, 3),
-angles (J,), drives (D, S), driven (D,), vertex (3,), normal (3,)). Moving joint j by
-a small angle turns all beyond it about the line through o_j along w_j, hence for
-every angle dn = w × n and dm = w × (m − o); for every offset dm is its direction
-turned into place; a parameter of a drive enters through dθ/dp.
+One chain is (position (3,), orientation (3, 3), axes (J, 3), origins (J, 3), angles (J,), drives
+(D, S), driven (D,), vertex (3,), normal (3,)). Rotating joint j by a small angle rotates everything
+beyond the joint about the line through o_j along w_j. Hence for an angle parameter dn = w × n and
+dm = w × (m − o); for an offset parameter dm is the offset direction rotated into the current pose;
+a drive parameter enters through dθ/dp.
 """
 
 import math

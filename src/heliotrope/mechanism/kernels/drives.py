@@ -1,4 +1,4 @@
-"""Compiled: counts to joint angle, its derivatives, and back."""
+"""Compiled: motor counts to a joint angle, its derivatives, and the inverse."""
 
 import math
 

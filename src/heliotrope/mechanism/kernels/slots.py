@@ -1,8 +1,8 @@
-"""Places in the arrays that the compiled kernels read.
+"""Positions in the arrays that the compiled kernels read.
 
-A drive is a row of ``DRIVE_SLOTS`` numbers, so that a field of any size is one
-array. Outside the kernels a drive is a `Drive` and a parameter has a name; the integers below are
-not part of the interface.
+A drive is a row of ``DRIVE_SLOTS`` numbers, so a field of any size is one array. Outside the
+kernels a drive is a `Drive` and a parameter has a name; the integers below are not part of the
+public interface.
 """
 
 KIND = 0  # ROTARY or LINEAR

@@ -1,14 +1,15 @@
-"""Compiled: joint angles at which an armature sends light from a source to an aim point.
+"""Compiled: joint angles at which an armature reflects light from a source to an aim point.
 
-Directions are solved in closed form (second Paden-Kahan subproblem): R(a, θ₁) R(b, θ₂) u = v
-is met where z = R(b, θ₂) u = R(−a, θ₁) v has the components z·a = v·a and z·b = u·b; of
-the two such z one is branch 0 (− a × b) and the other branch 1 (+ a × b). The vertex moves
-with the angles, so v depends on them: fixed point first, and Newton with the screw
-derivative, safeguarded by Levenberg's damping, where that converges slowly.
+Directions are solved in closed form (second Paden-Kahan subproblem): R(a, θ₁) R(b, θ₂) u = v is
+satisfied where z = R(b, θ₂) u = R(−a, θ₁) v has the components z·a = v·a and z·b = u·b. Of the two
+solutions for z, one is branch 0 (− a × b) and the other is branch 1 (+ a × b). The vertex moves
+with the angles, so v depends on the angles. The kernel therefore iterates: first a fixed-point
+iteration, then, where that converges slowly, Newton's method with the screw derivative, safeguarded
+by Levenberg damping.
 
-Everything is a tuple of floats: an armature ``g`` of 18, a vector of 3, and a turn
-``t`` = (sin θ₁, cos θ₁, sin θ₂, cos θ₂). Array slices would cost a shared reference
-count at every call and keep the threads waiting for each other.
+Everything is a tuple of floats: an armature ``g`` of 18, a vector of 3, and a rotation ``t`` = (sin
+θ₁, cos θ₁, sin θ₂, cos θ₂). Array slices would update a shared reference count at every call and
+make the threads wait for each other.
 """
 
 import math

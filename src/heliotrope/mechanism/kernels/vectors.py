@@ -1,4 +1,4 @@
-"""Compiled: three-vectors as tuples of floats, which live in registers."""
+"""Compiled: three-vectors as tuples of floats, which stay in registers."""
 
 import math
 

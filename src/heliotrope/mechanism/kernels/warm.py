@@ -1,9 +1,9 @@
 """Compiled: the first fixed-point steps of many heliostats at once, in vector registers.
 
-One step is a chain of four square roots and as many divisions that wait for each other;
-one heliostat at a time leaves the processor idle. Here the lanes of a small table hold
-several heliostats, and the same step runs over them side by side. The result is only a
-vertex to start from: `track.solve_aim` goes on from there and decides.
+One step is a chain of four square roots and four divisions, each of which waits for the one before,
+so solving one heliostat at a time leaves the processor idle. Here the lanes of a small table hold
+several heliostats, and the same step runs on all lanes in parallel. The result is only a starting
+vertex; `track.solve_aim` continues from it and makes all decisions.
 """
 
 import math

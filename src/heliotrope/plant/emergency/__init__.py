@@ -1,8 +1,8 @@
-"""Emergencies: the plant's rows of the safety table, the order that they demand, and its proof.
+"""Emergencies: the plant's safety-table rows, the orders that they require, and their proof.
 
-`Sentinel` obeys the table and repeats and proves orders; its file holds all that begins or ends
-an emergency. `TableWatch` evaluates the rows, and `EmergencyOrder` is one order to the whole
-field with its proof.
+`Sentinel` acts on the table and repeats and confirms orders; everything that starts or ends an
+emergency is in its file. `TableWatch` evaluates the rows, and `EmergencyOrder` is one field-wide
+order with its proof.
 """
 
 from heliotrope.plant.emergency.order import EmergencyOrder, at_stow, carried_out

@@ -1,11 +1,11 @@
-"""The emergency orders of persons: one for each, until it is withdrawn.
+"""Emergency orders of people: one per person, until it is withdrawn.
 
-An order that a person gives again merges with the one that stands: nothing is recorded or sent for
-it, so a program that gives it hundreds of times a second fills neither the store nor the list of
-events. A person whose order is withdrawn while they (or a program with their token) repeat it, or
-five times by others within ten minutes, pauses before the next one is taken; nobody else does. The
-first order of a person is never refused, nor is the first one after another person has withdrawn
-theirs.
+An order that a person repeats merges with the active one and is neither recorded nor sent again, so
+that a program that repeats it hundreds of times a second fills neither the store nor the event
+list. If a person's order is withdrawn while they (or a program with their token) keep repeating it,
+or by others five times within ten minutes, there is a pause before that person's next order is
+accepted; nobody else is affected. The first order of a person is never refused, nor is the first
+one after another person has withdrawn theirs.
 """
 
 import math

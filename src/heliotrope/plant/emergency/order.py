@@ -1,11 +1,11 @@
-"""An emergency order to the whole field, and the proof that it was carried out.
+"""A field-wide emergency order, and the proof that it was carried out.
 
-A heliostat has acknowledged the order when its local controller says so, or when a state heard
-after the order shows it. A heliostat is done by its state *and* by its axes: its beam is off the
-receiver when the axes are within `NEAR` of the goals of the defocus, whatever the state is called,
-and the beam, by step counts and believed mechanism, is on no receiver: a mirror at standby may turn
-its beam onto one. A heliostat with unknown step counts is never done: the report says where its
-beam was last.
+A heliostat has acknowledged the order when its local controller says so, or when a state reported
+after the order shows it. A heliostat counts as done by its state *and* by its axes. Its beam is off
+the receiver when the axes are within `NEAR` of the defocus goals, whatever the state is called, and
+when the beam, computed from step counts and the believed mechanism, is on no receiver, because a
+heliostat at standby may turn its beam onto one. A heliostat with unknown step counts is never done;
+the report says where its beam was last.
 """
 
 from collections.abc import Mapping
@@ -32,20 +32,21 @@ Mask = npt.NDArray[np.bool_]
 
 
 class EmergencyOrder:
-    """One DEFOCUS or STOW of the whole field.
+    """One field-wide DEFOCUS or STOW.
 
     Attributes
     ----------
     act
         `Act.DEFOCUS` or `Act.STOW`.
     who, reason
-        The person or part of the plant that gave it, and why.
+        The person or part of the plant that gave the order, and why.
     at
         Monotonic s.
     ticket
         Ticket with the stage of each heliostat.
     unknown
-        Where each heliostat with unknown step counts was last, by name: none of them is done.
+        Last known beam position of each heliostat with unknown step counts, by name; none of these
+        heliostats counts as done.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class EmergencyOrder:
         return self._proof
 
     def take_flux(self, share: float, at: float) -> None:
-        """Take a flux reading, as a share of the nominal."""
+        """Take a flux reading, as a fraction of the nominal flux."""
         self._proof = self.proof.with_flux(share, at)
 
     def is_acknowledged(self, heliostat: str) -> bool:
@@ -92,9 +93,9 @@ class EmergencyOrder:
     def take_back(
         self, names: tuple[str, ...], rows: npt.NDArray[Any], heard: npt.NDArray[np.float64]
     ) -> tuple[str, ...]:
-        """Return those of K heliostats that carried out the order and have come back since.
+        """Return which of K heliostats carried out the order but have moved back since.
 
-        They are no longer done. A row (`NODE`) from before that says nothing.
+        They no longer count as done. A row (`NODE`) from before the order is ignored.
         """
         done = self.proof.done
         out = np.isin(rows["state"], states.BEAM_OUT)
@@ -113,7 +114,7 @@ class EmergencyOrder:
         return report.with_evidence(self.proof.done, shown)
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
-        """Return those of some heliostats that have not acknowledged the order."""
+        """Return which of some heliostats have not acknowledged the order."""
         return tuple(name for name in heliostats if not self.is_acknowledged(name))
 
     def take_stage(self, heliostats: tuple[str, ...], stage: Stage, now: float) -> None:
@@ -136,13 +137,14 @@ class EmergencyOrder:
         mismatched: Mask,
         shining: Mask,
     ) -> None:
-        """Take the state of heliostats (K,): rows of `NODE`, when they were true, and drives.
+        """Take the state of heliostats (K,): rows of `NODE`, the time they apply to, and drives.
 
-        Step counts (``counted``) from before the order prove nothing: they do not show the beam.
+        Step counts (``counted``) from before the order prove nothing, because they do not show
+        where the beam is now.
 
-        ``mismatched`` ones are not what their address says: their counts may be another mirror's,
-        so nothing that they report proves anything. Where a beam is still on a receiver
-        (``shining``), nothing is done.
+        ``mismatched`` heliostats do not match their address: their counts may belong to another
+        heliostat, so nothing that they report counts as proof. As long as a beam is still on a
+        receiver (``shining``), the heliostat is not done.
         """
         settled = heard >= self.at + LEAVING
         stowed = carried_out(Act.STOW, rows, drives, settled)
@@ -161,9 +163,10 @@ def switched_off(flags: npt.NDArray[Any]) -> Mask:
 
 
 def at_stow(rows: npt.NDArray[Any]) -> Mask:
-    """Return a mask of the rows (K,) of `NODE` whose heliostat rests at stow.
+    """Return a mask of the rows (K,) of `NODE` whose heliostat is at rest at stow.
 
-    One that is locked there, or has a fault, does; one that is IDLE there may go on to track.
+    A heliostat that is locked there or has a fault counts; a heliostat that is IDLE there does not,
+    because it may go on to track.
     """
     resting = (rows["state"] == states.STOWED) | (rows["flags"] & meanings.AT_STOW != 0)
     return np.asarray(resting & ~np.isin(rows["state"], states.BEAM_OUT))
@@ -181,7 +184,7 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     drives
         Of these heliostats, (K, 2).
     settled
-        Whether a heliostat on its way to stow has had the time to leave the receiver, (K,).
+        Whether a heliostat on its way to stow has had enough time to leave the receiver, (K,).
     """
     off = ~np.isin(rows["state"], states.BEAM_OUT)
     known = (rows["flags"] & meanings.COUNTS_UNKNOWN == 0) & ~switched_off(rows["flags"])

@@ -1,8 +1,8 @@
-"""The plant's own safety actions: watch the table, order, repeat, prove.
+"""The plant's own safety actions: evaluate the table, order, repeat, confirm.
 
-An emergency of the whole field begins when the table demands DEFOCUS or STOW of the field, or when
-a person orders it. It ends when nothing demands it any more: the causes have gone and are
-acknowledged, and a person's order is withdrawn.
+A field-wide emergency begins when the table requires DEFOCUS or STOW of the field, or when a person
+orders it. It ends when nothing requires it any longer, that is, when the causes have gone and are
+acknowledged, and all orders are withdrawn.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ from heliotrope.store.records import StoreError
 OFF_SHOWS = 10.0
 #: Longest pause between two orders to one heliostat that does not show them, s.
 LONGEST_PAUSE = 60.0
-#: Row of heliostats that an emergency left unproven.
+#: Row for heliostats that an emergency left unconfirmed.
 UNPROVEN = "unproven_after_emergency"
 #: A heliostat that was proven after its emergency is shown to the table for this long, s.
 _PROVEN_SHOWS = 5.0
@@ -53,32 +53,33 @@ _NIGHT = ("the sun is down", "plant")
 
 
 class Sentinel(Part):
-    """Obedience to the safety table, and every emergency up to its proof.
+    """Acts on the safety table, and follows every emergency until its proof is complete.
 
     Parameters
     ----------
     table
         The plant's rows of the safety table.
     orders, joining, watch
-        Of the plant.
+        Those of the plant.
     repeat
-        Pause between two repetitions of an order, s.
+        Pause between repetitions of an order, s.
     identities
-        Heliostats that are not what their address says: they must leave, and are never proven.
+        Heliostats that do not match their address: they must leave, and are never confirmed.
     drive_checks
-        Heliostats whose drives stall are never proven; what mirrors were seen to follow is named.
+        Heliostats whose drives stall, which are never confirmed; it also supplies today's evidence
+        that mirrors follow their drives.
     record
-        Store of the emergency that stands: the plant begins in one that held when its last program
-        ended. None: it ends with the program.
+        Store of the active emergency: if an emergency was active when the last program ended, the
+        plant starts in it. None: it is lost when the program ends.
 
     Attributes
     ----------
     table
         As given.
     order
-        The last order to the whole field, None before the first.
+        The last field-wide order, None before the first.
     on
-        Whether an emergency of the whole field holds.
+        Whether a field-wide emergency is active.
     night
         Why the field rests at stow although nothing is wrong, "" by day.
     """
@@ -123,7 +124,7 @@ class Sentinel(Part):
     # -- the table -------------------------------------------------------------------------
 
     def on_beat(self, now: float) -> None:
-        """Evaluate the table, do what it demands, and report its alarms."""
+        """Evaluate the table, take the required actions, and report the alarms."""
         self._unproven = {n: at for n, at in self._unproven.items() if now - at < _PROVEN_SHOWS}
         news, self._news = self._news + self._evaluate(now), []
         self._obey_field(now)
@@ -236,13 +237,13 @@ class Sentinel(Part):
 
     @property
     def calls(self) -> tuple[Call, ...]:
-        """The orders of persons that have not been withdrawn, one for each person."""
+        """The orders that have not been withdrawn, one per person."""
         return self._callers.calls
 
     def causes(self) -> dict[str, str]:
-        """Return the reasons for the emergency, by person with a standing order and safety table.
+        """Return the reasons for the emergency, by person with an active order and safety table.
 
-        It is empty where none holds.
+        It is empty if no emergency is active.
         """
         causes = {call.who: call.reason for call in self.calls}
         withdrawn = "" if causes else self.table.withdrawn()
@@ -252,14 +253,14 @@ class Sentinel(Part):
         return causes
 
     def ends_by(self, condition: str) -> bool:
-        """Return whether nothing but one row of the table, whose cause has gone, demands it."""
+        """Return whether only one row of the table, whose cause has gone, still requires it."""
         return self.on and not self.calls and not self.table.caused(but=condition)
 
     def call(self, who: str, act: Act, reason: str, at: float) -> EmergencyOrder:
-        """Order an emergency for a person; it holds until it is withdrawn.
+        """Order an emergency for a person; it stays active until it is withdrawn.
 
-        A person has one order: another one keeps the stronger act, and adds a new reason; an equal
-        one merges with it.
+        A person has one order. A further order keeps the stronger action and adds a new reason; an
+        identical order merges with the active one.
 
         Raises
         ------
@@ -280,15 +281,15 @@ class Sentinel(Part):
         return order
 
     def pause(self, who: str) -> float:
-        """Return the time until an order of a person is taken, s; 0 if it is taken now."""
+        """Return the time until a person's next order is accepted, s; 0 if it is accepted now."""
         return self._callers.pause(who, self._clock.monotonic())
 
     def withdraw(self, who: str, by: str) -> str:
-        """Withdraw one person's order; rows that it tripped still wait to be acknowledged.
+        """Withdraw one person's order; the rows that it tripped still need acknowledgement.
 
         Returns
         -------
-        What people should know of it, see `Callers.withdraw`.
+        What the operator should know about it, see `Callers.withdraw`.
         """
         now = self._clock.monotonic()
         told = self._callers.withdraw(who, by, now)
@@ -315,7 +316,7 @@ class Sentinel(Part):
     def acknowledge(
         self, condition: str, who: str, role: AcknowledgeRole, subject: str
     ) -> str | None:
-        """Acknowledge a row of the table; return the reason of a refusal, None if accepted."""
+        """Acknowledge a row of the table; return why it is refused, None if accepted."""
         refusal = self.table.acknowledge(condition, who, role, subject)
         if not refusal and condition == UNPROVEN:
             self._unproven.pop(subject, None)
@@ -342,7 +343,8 @@ class Sentinel(Part):
     ) -> Ticket:
         """Send DEFOCUS or STOW to some heliostats; ``giver`` is a name and a role.
 
-        An ordinary STOW of many goes ``in_turn``, but at once while an emergency holds.
+        An ordinary STOW of a large number goes ``in_turn``, but at once while an emergency is
+        active.
         """
         # Short of an emergency, the table sends off those that something is wrong with.
         ticket = self._orders.accept(
@@ -355,7 +357,7 @@ class Sentinel(Part):
         return ticket
 
     def on_connected(self, cluster: str, now: float) -> None:
-        """Send a cluster that has connected the order that it missed."""
+        """Send a cluster that has reconnected the order that it missed."""
         del now
         self._acts.pop(cluster, None)
         self._repeat_order([cluster])
@@ -375,7 +377,7 @@ class Sentinel(Part):
     # -- proof -----------------------------------------------------------------------------
 
     def put(self, name: str, value: float, at: float, subject: str = "") -> None:
-        """Take a reading of a sensor for the table, or for the proof; see `TableWatch.put`."""
+        """Take a sensor reading for the table, or for the proof; see `TableWatch.put`."""
         self.table.put(name, value, at, subject)
         if name == FLUX_READING and self.order is not None:
             self.order.take_flux(value, at)
@@ -383,10 +385,11 @@ class Sentinel(Part):
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Take a cluster's report on a ticket, if it is the order's ticket.
+        """Take a cluster's report on a ticket, if the ticket belongs to the order.
 
-        Where a plant has receivers, a cluster's word that the order is done only acknowledges it:
-        the beam is off by the step counts of the next status, which show where it went.
+        If the plant has receivers, a cluster's report that the order is done counts only as an
+        acknowledgement; whether the beam is off follows from the step counts in the next status,
+        which show where it went.
         """
         order = self.order
         if order is None or ticket is not order.ticket:
@@ -475,7 +478,7 @@ class Sentinel(Part):
         return text + f"{now - field.posed_at[row]:.0f} s ago it was {states.STATES[state]}{beam}"
 
     def refusal(self, clusters: Iterable[str]) -> str | None:
-        """Return the reason why no new motion may begin in some clusters, None if it may."""
+        """Return why no new motion may begin in some clusters, None if it may."""
         if self.on and self.order is not None:
             return f"an emergency holds ({self.order.act.name}; {_said(self.causes())})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))

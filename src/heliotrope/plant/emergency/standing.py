@@ -1,4 +1,4 @@
-"""The emergency that stands, as the store keeps it across a restart of the plant's program."""
+"""The active emergency, as the store preserves it across a restart of the plant program."""
 
 import json
 from collections.abc import Sequence
@@ -13,31 +13,31 @@ _UNREADABLE = "the record of the last emergency cannot be read"
 
 
 class EmergencyRecord(Protocol):
-    """A store of one document about the emergency that stands."""
+    """A store for one document about the active emergency."""
 
     def emergency(self) -> str:
-        """Return the document, empty without one."""
+        """Return the document; empty if there is none."""
         ...
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document; an empty one says that no emergency stands.
+        """Replace the document; an empty one means that no emergency is active.
 
         Raises
         ------
         StoreError
-            If it cannot be kept.
+            If it cannot be stored.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Call:
-    """One person's emergency order, which stands until that person withdraws it.
+    """One person's emergency order, which stays active until that person withdraws it.
 
     Attributes
     ----------
     who, reason
-        The person or program that gave it, and why.
+        The person or program that gave the order, and why.
     act
         "DEFOCUS" or "STOW".
     at
@@ -51,7 +51,7 @@ class Call:
 
     @property
     def text(self) -> str:
-        """One line: person, act, time, reason."""
+        """One line: person, action, time, reason."""
         since = f"{datetime.fromtimestamp(self.at, UTC):%H:%M} UTC"
         return f"{self.who} ({self.act}, {since}: {self.reason})"
 
@@ -63,18 +63,18 @@ class Standing:
     Attributes
     ----------
     act
-        Name of the order to the whole field, "DEFOCUS" or "STOW"; "" where no emergency holds.
+        Name of the field-wide order, "DEFOCUS" or "STOW"; "" if no emergency is active.
     who, reason
-        The person or part of the plant that gave it, and why.
+        The person or part of the plant that gave the order, and why.
     calls
-        The orders of persons that have not been withdrawn, one for each person.
+        The orders that have not been withdrawn, one per person.
     rows
-        Rows of the safety table that hold beams off or wait to be acknowledged, each with its
+        Rows of the safety table that keep beams off or wait for acknowledgement, each with its
         cluster or heliostat, "" for the field.
     unproven
-        Heliostats that the proof did not show to be done.
+        Heliostats whose completion was not confirmed.
     left_by
-        Name of the order of which ``unproven`` heliostats are left, where no emergency holds.
+        Name of the order that left ``unproven`` heliostats, if no emergency is active.
     """
 
     act: str = ""
@@ -87,12 +87,12 @@ class Standing:
 
     @property
     def document(self) -> str:
-        """The document that the store keeps, empty if nothing stands."""
+        """The document that the store keeps, empty if there is nothing to keep."""
         return "" if self == Standing() else json.dumps(asdict(self))
 
     @property
     def giver(self) -> str:
-        """The persons whose orders stand; where none does, whoever gave the order to the field."""
+        """The people whose orders are active; without any, whoever gave the field-wide order."""
         return ", ".join(call.who for call in self.calls) or self.who
 
     @property
@@ -107,7 +107,7 @@ class Standing:
 
 
 def read_standing(document: str) -> Standing:
-    """Return the contents of a document; a person's DEFOCUS, the safe side, if it is unreadable."""
+    """Return the contents of a document; if unreadable, a personal DEFOCUS, the safe choice."""
     if not document:
         return Standing()
     try:

@@ -1,4 +1,4 @@
-"""The plant's part of the safety table: readings in, demands and alarms out."""
+"""The plant's part of the safety table: readings in, required actions and alarms out."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ from heliotrope.safety import (
     watched_by,
 )
 
-#: Readings that the plant makes itself; all others must come from sensors.
+#: Readings that the plant produces itself; all others must come from sensors.
 OWN_READINGS = frozenset(
     {
         "emergency_order",
@@ -52,7 +52,7 @@ OWN_READINGS = frozenset(
         "pointing_errors",
     }
 )
-#: Row of the orders of persons.
+#: Row for emergency orders by people.
 ORDERED = "operator_emergency"
 #: Row of the night: the field rests at stow, and that is no emergency.
 NIGHT = "sun_below_horizon"
@@ -60,7 +60,7 @@ NIGHT = "sun_below_horizon"
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
 #: Readings that the plant makes of a sensor's, and the sensor.
 DERIVED = {"flux_after_emergency": FLUX_READING}
-#: Direct normal irradiance, W/m²: for the schedule and for persons.
+#: Direct normal irradiance, W/m², for the schedule and for operators.
 DNI_READING = "dni"
 #: Readings of sensors that are in no row.
 _IN_NO_ROW = frozenset({DNI_READING, *DERIVED.values()})
@@ -71,14 +71,14 @@ SUN_PERIOD = 5.0
 
 
 class PlantReadings:
-    """The readings that the plant makes itself.
+    """The readings that the plant produces itself.
 
     Parameters
     ----------
     field, authority, orders, watch, agreement
-        Of the plant.
+        Those of the plant.
     sun
-        Returns the unit vector to the sun now, (3,).
+        Function that returns the unit vector to the sun now, (3,).
 
     Attributes
     ----------
@@ -111,10 +111,10 @@ class PlantReadings:
         proof
             Proof of the emergency order in force; None if there is none.
         unproven
-            Time since which each heliostat that an emergency left unproven is proven, monotonic s;
-            infinite if it is not.
+            Time since which each heliostat that an emergency left unconfirmed has been confirmed,
+            monotonic s; infinite if it has not.
         called
-            Whether a person has ordered an emergency and not withdrawn it.
+            Whether a person has ordered an emergency that is not withdrawn.
         now
             Monotonic s.
         """
@@ -140,18 +140,18 @@ class PlantReadings:
 
 
 class TableWatch:
-    """Evaluation of the rows of the safety table that the plant watches.
+    """Evaluation of the safety-table rows for which the plant is responsible.
 
     Parameters
     ----------
     rows
         The table of `safety.conditions`, with the plant's adjustments.
     readings
-        Readings that the plant makes itself.
+        Readings that the plant produces itself.
     clusters
         Names of the clusters.
     sensors
-        Names of the readings that come from sensors, by `put`.
+        Names of the readings that come from sensors, through `put`.
     now
         Monotonic s.
 
@@ -160,15 +160,14 @@ class TableWatch:
     rows
         Names of the rows that are evaluated.
     unwatched
-        Names of the rows without a reading: they are not evaluated, and the operator must know
-        them.
+        Names of the rows without a reading, which are not evaluated; the operator must be told.
     actions
         Actions of the last evaluation, the strongest first.
 
     Raises
     ------
     InputError
-        A sensor whose reading is in no row of the plant.
+        If a sensor's reading is used in no row of the plant.
     """
 
     def __init__(
@@ -204,16 +203,16 @@ class TableWatch:
 
     @property
     def flux_measured(self) -> bool:
-        """Whether a sensor feeds the flux on the receiver, for the proof of an emergency."""
+        """Whether a sensor supplies the flux on the receiver, for the proof of an emergency."""
         return FLUX_READING in self._sensors
 
     def put(self, name: str, value: float, at: float, subject: str = "") -> None:
-        """Take a reading of a sensor, made at ``at`` (monotonic s).
+        """Take a sensor reading, measured at ``at`` (monotonic s).
 
         Raises
         ------
         UnknownNameError
-            If there is no such sensor.
+            If the sensor does not exist.
         """
         if name not in self._sensors:
             raise UnknownNameError("sensor of the plant", name, self._sensors)
@@ -223,9 +222,9 @@ class TableWatch:
             self._put[name, subject] = Reading(value, at)
 
     def shown(self, now: float) -> dict[str, float]:
-        """Return the newest readings of sensors, by name, in the units of the rows.
+        """Return the newest sensor readings, by name, in the units of the rows.
 
-        NaN: there is none, or an old one.
+        NaN: there is no reading, or it is too old.
         """
         return {
             name: reading.value
@@ -242,7 +241,7 @@ class TableWatch:
         called: bool,
         now: float,
     ) -> list[Alarm]:
-        """Evaluate all rows; return the alarms raised and ended since the last time.
+        """Evaluate all rows; return the alarms raised and cleared since the last evaluation.
 
         For ``proof``, ``unproven`` and ``called`` see `PlantReadings.take`.
         """
@@ -269,13 +268,13 @@ class TableWatch:
         return news
 
     def recall(self, rows: Iterable[tuple[str, str]]) -> None:
-        """Take rows, each with its subject, as tripped: they were before a restart."""
+        """Restore rows as tripped before a restart, each with its subject."""
         self._state = recalled(self._state, rows)
 
     def standing(self) -> tuple[tuple[str, str], ...]:
-        """Return the rows that outlive a restart, each with its subject.
+        """Return the rows that persist across a restart, each with its subject.
 
-        They hold the beams of the whole field off, or wait to be acknowledged.
+        These keep the beams of the whole field off, or wait for acknowledgement.
         """
         latched = {row.name for row in self._state.table if row.latched}
         off = {
@@ -288,7 +287,7 @@ class TableWatch:
     def acknowledge(
         self, condition: str, who: str, role: AcknowledgeRole, subject: str
     ) -> str | None:
-        """Acknowledge a row; return the reason of a refusal, None if accepted."""
+        """Acknowledge a row; return why it is refused, None if accepted."""
         self._state, refusal = acknowledge(self._state, condition, who, role, subject)
         if not refusal:
             key = (condition, subject)
@@ -296,7 +295,7 @@ class TableWatch:
         return refusal
 
     def demanded(self, cluster: str = "") -> Act | None:
-        """Return the strongest act demanded of the field, or of one cluster alone."""
+        """Return the strongest action required of the field, or of one cluster alone."""
         return max((a.act for a in self._demands(cluster)), default=None)
 
     def _demands(self, cluster: str = "") -> Iterator[Action]:
@@ -309,11 +308,11 @@ class TableWatch:
         )
 
     def night(self) -> str | None:
-        """Return the reason why the field rests at stow though nothing is wrong, None by day."""
+        """Return why the field rests at stow although nothing is wrong, None by day."""
         return next((a.text for a in self.actions if a.condition == NIGHT), None)
 
     def off(self) -> dict[str, tuple[Act, str]]:
-        """Return the heliostats that must leave, by name, each with its act and the reason."""
+        """Return the heliostats that must leave, by name, each with its action and the reason."""
         return {
             a.subject: (a.act, a.text)
             for a in reversed(self.actions)
@@ -321,7 +320,7 @@ class TableWatch:
         }
 
     def blocked(self, condition: str = "") -> dict[str, str]:
-        """Return the heliostats that one row, or any, keeps from their aims, and the reasons."""
+        """Return the heliostats that one row, or any, keeps from their aims, with the reasons."""
         return {
             a.subject: a.text
             for a in self.actions
@@ -330,9 +329,9 @@ class TableWatch:
         }
 
     def caused(self, but: str = "") -> bool:
-        """Return whether a row demands an emergency of the field.
+        """Return whether a row requires a field-wide emergency.
 
-        Its own consequences do not, nor does the row whose name is ``but``.
+        Rows that are consequences of the emergency do not count, nor does the row named ``but``.
         """
         return any(
             a.act >= Act.DEFOCUS and a.condition not in (*CONSEQUENCES, but)
@@ -340,7 +339,7 @@ class TableWatch:
         )
 
     def reasons(self, least: Act, cluster: str = "", but: str = "") -> str:
-        """Return, in words, which rows demand at least an act of the field or a cluster.
+        """Return, in words, which rows require at least a given action of the field or a cluster.
 
         ``but`` is the name of a row that is left out.
         """
@@ -348,9 +347,9 @@ class TableWatch:
         return "; ".join([a.text for a in demands if a.act >= least and a.condition != but][:3])
 
     def withdrawn(self) -> str:
-        """Return how an emergency ordered by persons ends, empty if there is none.
+        """Return how an emergency ordered by people ends, empty if there is none.
 
-        It is for an emergency of which every person has withdrawn their order.
+        For an emergency whose orders have all been withdrawn.
         """
         row = next((row for row in self._state.table if row.name == ORDERED), None)
         if row is None or row.role is None or all(a.condition != ORDERED for a in self._demands()):

@@ -1,16 +1,16 @@
 """The plant's own view of time, site and pointing, compared with the reports.
 
-A cluster with a wrong clock or site sends its local controllers a wrong sun, and each of them then
-follows it, in good order, beside its aim or its standby point. So the plant compares the time and
-the site in each status with its own; and from the step counts of each heliostat, the sun and the
-parameters that it knows, it computes where the beam goes, and compares that with the point where
-the beam was sent.
+A cluster with a wrong clock or site sends its local controllers a wrong sun vector, and each
+heliostat then tracks without any fault indication, but beside its aim or standby point. The plant
+therefore compares the time and the site in each status with its own. From the step counts of each
+heliostat, the sun vector and the parameters that it knows, it also computes where the beam goes,
+and compares that with the point to which the beam was sent.
 
-A beam is sent to a point in three states: TRACKING, SEARCHING (within the radius that the plant
-ordered), and IDLE, unless the heliostat holds still there: it does so after UNLOCK and CLEAR_FAULT,
-where a person moved it, and until it has come to standby by the way from stow. In every other state
-it is turned away, on its way, locked, or at stow by the counts that it stores itself, and no point
-is to be compared.
+A beam is directed to a point in three states: TRACKING, SEARCHING (within the radius that the plant
+ordered), and IDLE, unless the heliostat holds still there. It holds still after UNLOCK and
+CLEAR_FAULT, where an operator moved it, and until it has reached standby along the path from stow.
+In every other state it is defocused, moving, locked, or at stow by the counts that it stores
+itself, and there is no point to compare.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Aim points for heliostats, and the proof that a beam may go to its point."""
+"""Aim points for heliostats, and the check that a beam may go to its point."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -33,10 +33,10 @@ _MIDDLE = MirrorOptics.of(1e-3, 1e-3, error=0.0)
 
 
 def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
-    """Return an aim point for each heliostat, (N, 3), with each point used equally often.
+    """Assign an aim point to each heliostat, (N, 3), with each point used equally often.
 
-    Neighbours in azimuth about the points get different points, so that a cloud or the loss of a
-    cluster darkens all of them alike.
+    Heliostats that are adjacent in azimuth about the points get different points, so that a cloud
+    or the loss of a cluster affects all points equally.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
     Raises
     ------
     InputError
-        No points, or coordinates that are not finite.
+        If there are no points, or coordinates are not finite.
     """
     places = np.atleast_2d(as_vectors(vertices, "vertices"))
     targets = np.atleast_2d(as_vectors(points, "aim points"))
@@ -64,14 +64,14 @@ def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
 def default_aims(
     design: Plant, names: Sequence[str], vertices: FloatArray, points: npt.ArrayLike | None
 ) -> dict[str, FloatArray]:
-    """Return an aim for each heliostat: given points spread over them, or the design's aims.
+    """Return an aim per heliostat: given points spread over them, or the design's aims.
 
     Parameters
     ----------
     design
-        The plant; a heliostat without an aim of its own gets the centre of the first receiver.
+        The plant; a heliostat without its own aim gets the centre of the first receiver.
     names, vertices
-        Heliostats and their places, ENU, m, (N, 3).
+        Heliostats and their positions, ENU, m, (N, 3).
     points
         Aim points, (P, 3); None: those of the design.
 
@@ -94,7 +94,7 @@ def default_aims(
 
 
 class BeamCheck:
-    """Check of beams, by their mirrors, against keep-out volumes and eyes.
+    """Checks beams, computed from the mirrors, against keep-out volumes and people's eyes.
 
     Parameters
     ----------
@@ -105,21 +105,21 @@ class BeamCheck:
     volumes
         Keep-out volumes; None: those of the design.
     eyes
-        Places from which people may look into resting beams, ENU, m, (P, 3); None: the design's.
+        Points from which people may see resting beams, ENU, m, (P, 3); None: those of the design.
 
     Attributes
     ----------
     position
-        Places of the heliostats, ENU, m, (N, 3).
+        Positions of the heliostats, ENU, m, (N, 3).
     solids
-        The receivers with some room, which no approach leads a beam across.
+        The receivers with a margin, which the beam must not cross on an approach.
     machines
-        Limits and resting places of heliostats, by name, as far as the design knows them.
+        Limits and rest positions of heliostats, by name, as far as the design specifies them.
 
     Raises
     ------
     InputError
-        Eyes that are not finite points.
+        If eye positions are not finite points.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class BeamCheck:
         self.mirrors = MirrorOptics.of(*sizes)
 
     def replace(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
-        """Take the new calibration of a heliostat: rows (18,) and (2, 19)."""
+        """Take a heliostat's new calibration: arrays (18,) and (2, 19)."""
         self.armature.table[row] = armature
         self.drives.table[row] = drives
         self._stop(row)
@@ -181,7 +181,7 @@ class BeamCheck:
     ) -> Tracking:
         """Return the poses for aims (K, 3) of heliostats (K,), those nearest to counts (K, 2).
 
-        The sun is (3,) or (K, 3).
+        The sun vector is (3,) or (K, 3).
         """
         # At night nothing moves; the pose for an overhead sun shows the beam's way just as well.
         source = np.where(sun[..., 2:] > 0.0, sun, np.array([0.0, 0.0, 1.0]))
@@ -194,9 +194,9 @@ class BeamCheck:
         )
 
     def stop(self, row: int, aim: FloatArray, sun: FloatArray, counts: FloatArray) -> str:
-        """Return which stop keeps a heliostat from an aim (3,), and what would help.
+        """Return which stop keeps a heliostat from an aim (3,), and the remedy.
 
-        The sun is (3,), and the pose the one nearest to counts (2,).
+        The sun vector is (3,), and the pose is the one nearest to counts (2,).
         """
         table = self.drives.table[row]
         free = table.copy()
@@ -226,22 +226,22 @@ class BeamCheck:
         start: FloatArray,
         stopped: bool,
     ) -> dict[str, str]:
-        """Return the heliostats that may not aim at points, and the reasons.
+        """Return the heliostats that may not aim at given points, and the reasons.
 
         Parameters
         ----------
         rows
-            Rows of the heliostats, (K,).
+            Indices of the heliostats, (K,).
         aims
             ENU, m, (K, 3).
         sun
-            Unit vector, (3,).
+            Sun vector, (3,).
         start
-            Points at which their beams are now, ENU, m, (K, 3), NaN without one. The sweep from
-            there is checked as well.
+            Points at which their beams are now, ENU, m, (K, 3), NaN if there is none. The sweep
+            from there is checked as well.
         stopped
             Whether a surface at the aim (receiver, target) stops the beam. A beam at a standby
-            point goes on beyond it.
+            point continues beyond it.
         """
         reasons: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
@@ -269,20 +269,21 @@ class BeamCheck:
         possible: Sequence[tuple[npt.NDArray[np.intp], FloatArray]],
         sun: FloatArray,
     ) -> dict[str, str]:
-        """Return the heliostats whose resting beams would dazzle an eye, and the reasons.
+        """Return the heliostats whose resting beams would dazzle a person, and the reasons.
 
-        All resting beams together must stay below `MOST_SUNS` there; a heliostat is named if it
-        shines into an eye where they do not.
+        All resting beams together must stay below `MOST_SUNS` there; if they do not, every
+        heliostat that shines into the eye is named.
 
         Parameters
         ----------
         rows, points
             Heliostats (K,) and their new standby points, ENU, m, (K, 3).
         possible
-            Standby points that local controllers may have now, and whose; see `Points.possible`.
-            A heliostat counts at the one from which an eye sees the most of it.
+            Standby points that local controllers may have now, and the heliostats concerned; see
+            `Points.possible`. A heliostat counts with the standby point from which an eye receives
+            most.
         sun
-            Unit vector, (3,).
+            Sun vector, (3,).
         """
         if not len(self.eyes) or not len(rows):
             return {}
@@ -320,13 +321,14 @@ class BeamCheck:
         Parameters
         ----------
         rows
-            Rows of the heliostats, (K,).
+            Indices of the heliostats, (K,).
         counts
             Step counts of their axes, (K, 2).
         aims, sun
             As in `problems`.
         motion
-            Returns the angles that the axes pass between counts; see `Paths.motion`.
+            Function that returns the angles that the axes pass through between counts; see
+            `Paths.motion`.
         """
         reasons: dict[str, str] = {}
         solved = self.poses(rows, aims, sun, counts)
@@ -351,7 +353,7 @@ class BeamCheck:
         rows, aims, sun
             As in `problems`.
         radius
-            Largest angle between beams and their aims, rad. Nothing stops the beams there.
+            Largest angle between beams and their aims, rad. The beams are not stopped there.
         """
         reasons: dict[str, str] = {}
         if not (self.volumes and sun[2] > 0.0):
@@ -387,13 +389,13 @@ class BeamCheck:
         Parameters
         ----------
         rows
-            Rows of the heliostats, (K,).
+            Indices of the heliostats, (K,).
         path
-            Angles that the axes pass, rad, (K, W, 2).
+            Angles that the axes pass through, rad, (K, W, 2).
         sun
-            Unit vectors, (3,) or (K, 3).
+            Sun vectors, (3,) or (K, 3).
         when
-            Where that is, in words.
+            Description of the location, in words.
         """
         reasons: dict[str, str] = {}
         if len(rows) and self.volumes and sun[..., 2].max() > 0.0:
@@ -405,7 +407,7 @@ class BeamCheck:
     ) -> dict[str, str]:
         """Return the heliostats whose beams would cross a receiver on a path, and why.
 
-        For the arguments see `moving`. It is the middle of a beam that counts; see `_MIDDLE`.
+        For the arguments see `moving`. The check uses the middle of a beam; see `_MIDDLE`.
         """
         entered = self._on_receivers(rows, path, sun)
         return {
@@ -419,7 +421,7 @@ class BeamCheck:
     ) -> npt.NDArray[np.bool_]:
         """Return a mask of the beams on a receiver, (K,), with the axes at angles (K, 2).
 
-        For ``sun`` see `problems`; it is the middle of a beam that counts.
+        For ``sun`` see `problems`; the check uses the middle of a beam.
         """
         still = np.repeat(angles[:, None], 2, axis=1)
         return np.asarray(self._on_receivers(rows, still, sun).any(axis=-1))
@@ -439,17 +441,17 @@ class BeamCheck:
         counts: FloatArray,
         tables: tuple[FloatArray, FloatArray] | None = None,
     ) -> dict[str, str]:
-        """Return the heliostats whose beams come too near to something in a year, and why.
+        """Return the heliostats whose resting beams come too near something in a year, and why.
 
-        That is a receiver, a target or a keep-out volume, with the mirrors standing still at counts
-        (K, 2) and the sun wherever it is in a year. See also `Machine.stow_lights`.
+        That is a receiver, a target or a keep-out volume, with the heliostats at rest at counts (K,
+        2) and the sun at any position of the year. See also `Machine.stow_lights`.
 
         Parameters
         ----------
         rows, counts
-            Rows of the heliostats, (K,), and steps, (K, 2).
+            Indices of the heliostats, (K,), and steps, (K, 2).
         tables
-            Armatures and drives, (K, 18) and (K, 2, 19); None: those of the check.
+            Armatures and drives, (K, 18) and (K, 2, 19); None: those of this check.
         """
         armature, drives = tables or (self.armature.table[rows], self.drives.table[rows])
         normal, vertex = Armature(armature).pose(Drive(drives).angles(counts))
@@ -469,7 +471,7 @@ class BeamCheck:
     def at_stow(self) -> dict[str, str]:
         """Return the heliostats that may not rest at their stow positions, and why.
 
-        Those whose machine is not known are left out; see `standing`.
+        Heliostats whose machine is unknown are left out; see `standing`.
         """
         known = [row for row, name in enumerate(self.names) if name in self.machines]
         stow = [self.machines[self.names[row]].stow for row in known]
@@ -478,8 +480,7 @@ class BeamCheck:
     def together(self, angles: FloatArray, sun: FloatArray) -> Beams:
         """Return the beams of the whole field with the axes at angles (N, 2).
 
-        Each mirror is taken to be focused on the first receiver, which is where its beam is
-        strongest.
+        Each mirror is assumed to be focused on the first receiver, where its beam is strongest.
         """
         normal, vertex = self.armature.pose(angles)
         mirrors = self.mirrors
@@ -489,7 +490,7 @@ class BeamCheck:
         return standing_beams(vertex, normal, sun, mirrors, FAR)
 
     def inside(self, row: int, poses: FloatArray, sun: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return in which poses, angles of the axes (K, 2), the beam of a heliostat is in a volume.
+        """Return in which poses, axis angles (K, 2), the beam of a heliostat is in a volume.
 
         For ``sun`` see `problems`.
         """

@@ -1,17 +1,17 @@
-"""Aims and standby points of heliostats, assigned by people and kept across restarts of the plant.
+"""Assigned aims and standby points of heliostats, preserved across restarts of the plant.
 
-A plant that has forgotten where its beams are cannot prove where they may go. So points are on the
-disk before the commands that assign them are sent. They are assigned when they are sent: one that
-waits for its turn, and may be given up there, is not assigned yet.
+A plant that does not know where its beams are cannot prove where they may go. Points are therefore
+stored on disk before the commands that assign them are sent. They count as assigned when they are
+sent; a point whose command is still queued, and may be dropped from the queue, is not yet assigned.
 
-`Assigned` is the protocol of their store. `AssignedFile` is one small file, written under another
-name and renamed, so that the old or the new file is always there.
+`Assigned` is the protocol of the store. `AssignedFile` is one small file, written under a temporary
+name and renamed, so that either the old or the new file always exists.
 
-A local controller may refuse a point, or never get it. So the points before are kept too until it
-has acknowledged the new one: a program that starts anew then knows where a beam may still be.
+A local controller may refuse a point, or never receive it. The previous points are therefore kept
+until the new point is acknowledged, so that a restarted program knows where a beam may still be.
 
-What visits hold (`HELD`) is kept beside the points, and is on the disk before it is taken too: a
-program that starts anew gives it back (`giving_back`).
+What visits hold (`HELD`) is stored with the points, also on disk before it is taken; a restarted
+program releases it (`giving_back`).
 """
 
 import json
@@ -64,7 +64,7 @@ class Assigned(Protocol):
         ...
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Replace the stored points; the new ones are on the disk when this returns."""
+        """Replace the stored points; the new points are on disk when this returns."""
         ...
 
 
@@ -86,7 +86,7 @@ class AssignedFile:
         Raises
         ------
         FormatError
-            A file that holds something else.
+            If the file contains something else.
         """
         try:
             document = json.loads(self.path.read_bytes())
@@ -123,7 +123,7 @@ class AssignedFile:
         Raises
         ------
         AssignedError
-            If they could not be written and synced; the earlier points stay stored.
+            If they could not be written and synced; the earlier points remain stored.
         """
         data = json.dumps({"version": VERSION, **points}, allow_nan=False).encode()
         beside = self.path.with_name(self.path.name + ".new")
@@ -366,7 +366,7 @@ def _followed(
 
 
 def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> None:
-    """Give a standby point, ENU, m, to all heliostats without one: their machines store it."""
+    """Set a standby point, ENU, m, for all heliostats without one; their machines store it."""
     if point is not None:
         standbys[~np.isfinite(standbys).all(axis=-1)] = point
 

@@ -1,8 +1,8 @@
-"""The plant's beliefs about its mirrors: the one owner of calibrations and their sightings.
+"""The plant's beliefs about its heliostats: the single owner of calibrations and their sightings.
 
-A new `HeliostatCalibration` is taken here once and passed to all subscribers: the controller (beam
-checks and wanted parameters), automatic control, the schedule, the store and the pages. A
-calibration recalled from the store comes the same way.
+A new `HeliostatCalibration` is accepted here once and passed to all subscribers: the controller
+(beam checks and wanted parameters), automatic control, the schedule, the store and the pages. A
+calibration loaded from the store takes the same route.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""The alarms that clusters have reported, compared with those that they list in their statuses."""
+"""The alarms that clusters have reported, compared with the alarms listed in their statuses."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Settings that all clusters should share, compared by the checksum in each status."""
+"""Settings that all clusters should share, compared through the checksum in each status."""
 
 from collections import Counter
 from collections.abc import Callable

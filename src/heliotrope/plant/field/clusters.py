@@ -1,4 +1,4 @@
-"""The plant's ends of the links to its clusters: messages posted, leases, questions and answers."""
+"""The plant's ends of the cluster links: messages sent, leases, queries and replies."""
 
 import asyncio
 import math

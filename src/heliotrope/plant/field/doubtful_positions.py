@@ -1,12 +1,13 @@
-"""Heliostats whose step counts or parameters are in doubt, and what confirms that they are right.
+"""Heliostats with doubtful step counts or parameters, and what confirms them.
 
-A power cut in motion may leave the step counts of a local controller wrong by up to 1,000 steps,
-which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then be off its place without any other
-sign. Such a heliostat is named, and kept off the receiver until a photograph on a target or a
-person has confirmed its place. A confirmation holds for one boot: it says nothing of the next cut.
-One that stores new parameters which a calibration has yet to verify stays off in the same way, one
-whose parameters a flight of a drone contradicts, one whose drives stall, and all while no witness
-confirms the sun.
+A power failure during motion may leave the step counts of a local controller wrong by up to 1,000
+steps, which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then be off position without any
+other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target or
+an operator has confirmed its position. A confirmation is valid for one boot, because it says
+nothing about the next power failure. Four other groups are kept off in the same way: heliostats
+with new parameters that a calibration has not yet verified, heliostats whose parameters a drone
+flight contradicts, heliostats whose drives stall, and all heliostats while no witness confirms the
+sun.
 """
 
 import contextlib

@@ -1,9 +1,10 @@
-"""Whether drives turn their mirrors: today's evidence by measurements, and the drives that stall.
+"""Whether drives move their mirrors: today's measured evidence, and the drives that stall.
 
-Step counts are the steps that a board has sent to its motors. Ice, a loose coupling or a driver
-without current leave the mirror where it is, and the counts go on. A diagnosis of movement with a
-tilt sensor on the mirror shows it, and so does a photograph of the beam on a target. A heliostat
-whose drives stall is named, joins no receiver, and nothing that it reports proves an emergency.
+Step counts are the steps that a board has sent to its motors. With ice, a loose coupling or an
+unpowered driver the mirror stays where it is while the counts continue. A motion diagnosis with a
+tilt sensor on the mirror reveals this, and so does a photograph of the beam on a target. A
+heliostat whose drives stall is named, joins no receiver, and none of its reports counts as proof of
+an emergency.
 """
 
 from collections.abc import Callable, Iterable, Mapping

@@ -1,6 +1,6 @@
-"""Firmware versions of the local controllers, compared with the one that the plant expects.
+"""Firmware versions of the local controllers, compared with the version that the plant expects.
 
-No status carries them: each cluster is asked to search its bus when it has connected.
+A status does not contain them, so each cluster is asked to search its bus when it has connected.
 """
 
 from collections.abc import Callable

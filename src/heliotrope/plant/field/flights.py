@@ -1,7 +1,8 @@
-"""Flights of a drone that the plant has taken, and what its mirrors reveal of their shared errors.
+"""Drone flights imported into the plant, and what its mirrors reveal about shared errors.
 
-A heliostat's fit needs what all others say of the errors that it shares with them, but not its own
-word a second time. So the sum is kept in parts, one for each heliostat (`CommonFit.information`).
+The fit of a heliostat needs the information from all other heliostats about the errors that they
+share, but must not count its own information twice. The sum is therefore stored in parts, one per
+heliostat (`CommonFit.information`).
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence

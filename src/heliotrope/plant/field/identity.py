@@ -1,8 +1,8 @@
-"""Which board answers at an address: two exchanged addresses, or a board moved to another mirror.
+"""Which board responds at an address: swapped addresses, or a board moved to another heliostat.
 
-Every local controller reports the checksum of the armature that it stores. The armature holds the
-place of the mirror, so no two are equal, and the checksum of another heliostat's armature shows
-that other heliostat's board: a command to H1 would move H2. A checksum that the plant has never
+Every local controller reports the checksum of the armature that it stores. The armature contains
+the position of the mirror, so no two are equal, and the checksum of another heliostat's armature
+reveals that heliostat's board: a command to H1 would move H2. A checksum that the plant has never
 known says nothing about whose board it is.
 """
 

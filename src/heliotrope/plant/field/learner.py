@@ -1,4 +1,4 @@
-"""The learning of groups of mirrors, in a process beside the plant."""
+"""Learning for heliostat groups, in a process beside the plant."""
 
 import asyncio
 import os

@@ -1,12 +1,12 @@
 """The ledger: which orders each heliostat was sent and has acknowledged, by kind of order.
 
-A report says nothing of an order that the board had not taken yet when it made the report. A path
-is proven from where a heliostat was last reported: if another order has been sent since, it may
-have left that place, and be somewhere on a path without a proof. Whether a report counts, or
-which of two orders came later, is answered here.
+A report says nothing about an order that the board had not received when it made the report. A path
+is proven from the last reported position of a heliostat. If another order has been sent since, the
+heliostat may have left that position, and be on a path that was not proven. The ledger decides
+whether a report counts, and which of two orders came later.
 
-A heliostat that leaves the receiver was lost, unless somebody ordered it off, which `losses`
-looks up here too.
+A heliostat that leaves the receiver counts as lost unless it was ordered off; `losses` checks this
+here too.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,9 @@
-"""Locks of persons: heliostats out of service, and targets, receivers and towers under work.
+"""Personal locks: heliostats out of service, and targets, receivers and towers under work.
 
-Each person has a lock of their own, as lockout-tagout requires: a locked place is back in service
-when the last lock is returned. A heliostat that is locked stays in stow: nobody moves it, neither a
-person nor automatic control nor a command to a group. To a locked target or receiver no beam is
-sent; under a locked tower no heliostat leaves stow. EMERGENCY, DEFOCUS and STOW pass.
+Each person applies their own lock, as lockout-tagout requires; a locked object returns to service
+when the last lock is removed. A locked heliostat stays at stow: neither an operator nor automatic
+control nor a group command moves it. No beam is sent to a locked target or receiver, and while the
+tower is locked no heliostat leaves stow. EMERGENCY, DEFOCUS and STOW override locks.
 """
 
 import math

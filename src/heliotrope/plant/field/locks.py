@@ -1,14 +1,14 @@
-"""Locks of visits: heliostats that a visit has locked to write their parameters.
+"""Visit locks: heliostats that a visit has locked to write their parameters.
 
-A visit unlocks them itself. Where it cannot, because an emergency holds, a person's order has taken
-the heliostat out of the visit or the visit was cancelled, the plant unlocks them as soon as it may
-(`giving_back`). A local controller stays LOCKED through DEFOCUS and STOW, and UNLOCK stops it; so
-one that was ordered off is unlocked at stow.
+A visit unlocks its heliostats itself. If it cannot, because an emergency is active, an operator's
+order has taken the heliostat out of the visit or the visit was cancelled, the plant unlocks them as
+soon as it may (`giving_back`). A local controller stays LOCKED through DEFOCUS and STOW, and UNLOCK
+stops it; a heliostat that was ordered off is therefore unlocked at stow.
 
-A lock is on the disk before it is taken (`assigned.HELD`). A program that finds one there does not
-know what was ordered since the last program ended, so it sends the heliostat to stow and unlocks it
-there. After a longer time a person may have locked it, by a program whose store was lost: then only
-a person unlocks it.
+A lock is stored on disk before it is applied (`assigned.HELD`). A program that finds such a lock
+does not know what was ordered after the previous program ended, so it sends the heliostat to stow
+and unlocks it there. After a longer time an operator may have locked it, through a program whose
+store was lost; in that case only an operator unlocks it.
 """
 
 from collections.abc import Callable, Iterable

@@ -1,4 +1,4 @@
-"""Hooks through which the parts of a plant learn of events, in the order of their list."""
+"""Hooks that notify the parts of a plant of events, in the order of their list."""
 
 from collections.abc import Sequence
 

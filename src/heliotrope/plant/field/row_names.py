@@ -1,4 +1,4 @@
-"""The names of the rows of a cluster's status, asked for where the message with them was lost."""
+"""Heliostat names of the rows in a cluster's status, requested again if the message was lost."""
 
 import math
 

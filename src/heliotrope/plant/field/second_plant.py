@@ -1,4 +1,4 @@
-"""Another plant with the same keys: clusters report in each status to which run they belong."""
+"""Detects another plant with the same keys: clusters report which run they belong to."""
 
 from collections.abc import Callable, Iterable
 

@@ -1,8 +1,9 @@
-"""The state of the whole field in one table, each row with its age.
+"""The state of the whole field in one table, with the age of each row.
 
 Rows come from the clusters' `ClusterStatus` messages. The age of a row is the age that the cluster
-gave to the local controller's answer plus the time since. A row older than the limit is stale, and
-its values are masked: an unknown value is never shown as if it were known (invariant 11).
+stated for the local controller's reply, plus the time since. A row older than the limit is stale,
+and its values are masked, so that an unknown value is never shown as if it were known (invariant
+11).
 """
 
 import math
@@ -39,13 +40,14 @@ class HeliostatState:
     name, cluster
         Names.
     age
-        Age of the values below, s; infinite if never heard.
+        Age of the values below, s; infinite if nothing was ever received.
     live
-        Whether the age is below the limit. If not, ``state`` is "" and the rest means nothing.
+        Whether the age is below the limit. If not, ``state`` is "" and the other values are
+        meaningless.
     state, fault, flags
         In words.
     counts, goals
-        Steps of the two axes, and their goals, (2,).
+        Step counts of the two axes, and their goals, (2,).
     """
 
     name: str
@@ -79,40 +81,41 @@ class FieldState:
     Parameters
     ----------
     clusters
-        Names of the heliostats by name of the cluster.
+        Names of the heliostats by cluster name.
     limit
-        Age from which a row is stale, s.
+        Age above which a row is stale, s.
 
     Attributes
     ----------
     names, index
-        Names, N, and their rows.
+        The N names, and the index of each.
     clusters, members
         Names of the clusters, and of their heliostats.
     cluster
-        Row of each heliostat's cluster, (N,).
+        Index of each heliostat's cluster, (N,).
     rows
         Last known rows of dtype `NODE`, (N,); use `values`, which masks stale rows.
     heard
-        Time at which each row was true, monotonic s, (N,); minus infinity if never heard.
+        Time to which each row applies, monotonic s, (N,); minus infinity if nothing was received.
     counted_at
-        The same of its step counts and goals.
+        The same for its step counts and goals.
     posed, posed_state, posed_at
-        Step counts when they were last known, (N, 2), the state then, and that time, (N,): a local
-        controller that has lost its counts goes on reporting numbers, which mean nothing.
+        Step counts when they were last known, (N, 2), the state at that time, and the time, (N,). A
+        local controller that has lost its counts continues to report numbers, which are
+        meaningless.
     unlisted
         Heliostats for which their clusters report no row.
     restarted
-        Heliostats whose boards had started anew, or stored another armature, by the last status:
-        other boards may be there.
+        Heliostats whose boards had restarted, or stored another armature, at the last status; the
+        boards may have been replaced.
     turned
-        Whether one that is locked or in FAULT has moved since: it has turned away, and turns no
-        further, (N,). One that was locked anew would, which no status shows.
+        Whether a heliostat that is locked or in FAULT has moved since; it has turned away, and
+        turns no further, (N,). If it were locked again it would turn, which no status shows.
 
     Raises
     ------
     InputError
-        No heliostats, or one in two clusters.
+        If there are no heliostats, or one is in two clusters.
     """
 
     def __init__(self, clusters: Mapping[str, Sequence[str]], limit: float = STALE) -> None:
@@ -217,7 +220,7 @@ class FieldState:
         return cluster in self._places
 
     def place(self, name: str) -> int:
-        """Return the row of a heliostat.
+        """Return the index of a heliostat.
 
         Raises
         ------
@@ -230,7 +233,7 @@ class FieldState:
         return row
 
     def age(self, now: float) -> FloatArray:
-        """Return the age of each row, s, (N,); infinite if never heard."""
+        """Return the age of each row, s, (N,); infinite if nothing was received."""
         return as_float(now - self.heard)
 
     def live(self, now: float) -> Mask:
@@ -250,27 +253,27 @@ class FieldState:
         return np.ma.MaskedArray(self.rows[field].copy(), mask=~self.live(now))
 
     def counts(self, rows: npt.NDArray[np.intp]) -> FloatArray:
-        """Return the step counts of heliostats (K,) as last heard, (K, 2)."""
+        """Return the last reported step counts of heliostats (K,), (K, 2)."""
         return self._pairs(rows, "primary", "secondary")
 
     def goals(self, rows: npt.NDArray[np.intp]) -> FloatArray:
-        """Return the goals of the step counts of heliostats (K,) as last heard, (K, 2)."""
+        """Return the last reported step-count goals of heliostats (K,), (K, 2)."""
         return self._pairs(rows, "primary_goal", "secondary_goal")
 
     def _pairs(self, rows: npt.NDArray[np.intp], *names: str) -> FloatArray:
         return np.stack([self.rows[name][rows] for name in names], axis=-1).astype(np.float64)
 
     def sure(self, now: float) -> Mask:
-        """Return a mask of the heliostats that are live and know their step counts, (N,)."""
+        """Return a mask of the heliostats that are live and have known step counts, (N,)."""
         known = (self.rows["flags"] & meanings.COUNTS_UNKNOWN == 0) & np.isfinite(self.counted_at)
         return np.asarray(self.live(now) & known)
 
     def among(self, numbers: Sequence[int], now: float) -> Mask:
-        """Return a mask of the heliostats that are live and in one of some states, (N,)."""
+        """Return a mask of the heliostats that are live and in one of the given states, (N,)."""
         return np.asarray(self.live(now) & np.isin(self.rows["state"], list(numbers)))
 
     def counted(self, now: float) -> dict[str, int]:
-        """Return the number of heliostats in each state; those not live count as "stale"."""
+        """Return the number of heliostats in each state; stale heliostats count as "stale"."""
         live = self.live(now)
         totals = np.bincount(self.rows["state"][live], minlength=len(states.STATES))
         counts = {name: int(n) for name, n in zip(states.STATES, totals, strict=True) if n}
@@ -278,7 +281,7 @@ class FieldState:
         return {**counts, "stale": stale} if stale else counts
 
     def failed_share(self, now: float, span: float = 600.0) -> float:
-        """Return the share of heliostats that failed within a span, s."""
+        """Return the fraction of heliostats that failed within a time span, s."""
         return float(np.mean(now - self.failed_at < span))
 
     def of(self, name: str, now: float) -> HeliostatState:

@@ -1,10 +1,11 @@
-"""Independent witnesses of the sun: what sees a time or a site that is wrong in plant and clusters.
+"""Independent witnesses of the sun, which reveal a wrong time or site in plant and clusters.
 
-Where plant and clusters share a wrong time or site, all of their suns agree, and every mirror
-follows them in good order, beside its aim. So before the first heliostat of a day joins a
-receiver, a witness must have seen the sun where the plant computes it: a satellite receiver (its
-time and its place), a sun sensor, or photographs of beams on targets. Beams may go to targets
-meanwhile. While one contradicts, nothing leaves stow: the path is free for the computed sun.
+If plant and clusters share a wrong time or site, all their sun vectors agree, and every heliostat
+tracks without any fault indication, but beside its aim. Before the first heliostat of a day joins a
+receiver, a witness must therefore have seen the sun where the plant computes it: a satellite
+receiver (its time and its position), a sun sensor, or photographs of beams on targets. Until then
+beams may go to targets. While a witness contradicts, nothing leaves stow, because the paths were
+proven for the computed sun.
 """
 
 import asyncio

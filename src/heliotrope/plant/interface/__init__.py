@@ -1,9 +1,9 @@
-"""The plant's local interface: what consoles, `heliotrope ctl` and gateways may ask, and who may.
+"""The plant's local interface: what consoles, `heliotrope ctl` and gateways may call, and who may.
 
 `PlantInterface` serves two sockets in the plant's data folder: one for all calls, and one for
-EMERGENCY, DEFOCUS and STOW alone. Connections, keys, reading and writing have a thread of their
-own; only the call itself runs in the plant's loop. `calls` is the table of the calls.
-`ConsoleProcess` runs a part of the console beside the plant and starts it again.
+EMERGENCY, DEFOCUS and STOW alone. Connections, keys, reading and writing are handled in a separate
+thread; only the call itself runs in the plant's event loop. `calls` is the table of the calls.
+`ConsoleProcess` runs a part of the console beside the plant and restarts it.
 """
 
 from heliotrope.plant.interface.admission import BusyError

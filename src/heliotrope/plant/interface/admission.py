@@ -1,6 +1,7 @@
-"""How many ordinary orders are admitted: of one person, and of all.
+"""Limits on how many ordinary orders are admitted: per person, and in total.
 
-EMERGENCY, DEFOCUS and STOW never ask here, nor do renewing and giving back the command authority.
+EMERGENCY, DEFOCUS and STOW are not subject to these limits, nor are renewal and release of the
+command authority.
 """
 
 import math
@@ -16,7 +17,7 @@ OWN, ALL = (10.0, 100.0), (30.0, 200.0)
 
 
 class BusyError(HeliotropeError):
-    """Too many orders: nothing was sent."""
+    """Too many orders; nothing was sent."""
 
 
 class Admission:

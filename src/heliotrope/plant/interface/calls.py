@@ -1,9 +1,9 @@
-"""The table of calls: request of the API, least role, arguments, answer, and work of each.
+"""The table of calls: API request, minimum role, arguments, reply and implementation of each.
 
-A function with its row is the one definition of an operation: the console makes the routes of the
-HTTP API from it, `heliotrope ctl` at the plant asks by the same requests, and the reference of the
-API lists it. The model of its ``order``, the type of its answer and its docstring are taken as they
-stand.
+A function together with its table entry is the only definition of an operation: the console derives
+the routes of the HTTP API from it, `heliotrope ctl` at the plant makes the same requests, and the
+API reference lists it. The model of its ``order``, the type of its reply and its docstring are used
+unchanged.
 """
 
 import asyncio
@@ -53,7 +53,7 @@ _LINK = re.compile(r"\[([^\]]+)\]\([^)]+\)")
 
 @dataclass(frozen=True)
 class WithBlob:
-    """A value, and the bytes that go with it: for the API those of a JPEG."""
+    """A value, and the bytes that accompany it: for the API those of a JPEG."""
 
     value: Any
     blob: bytes
@@ -61,7 +61,7 @@ class WithBlob:
 
 @dataclass(frozen=True)
 class Later(Generic[T]):
-    """An answer that has to be waited for in the plant's loop, once it has done the work."""
+    """A reply that must be awaited in the plant's event loop, after the work itself."""
 
     wait: Callable[[], Coroutine[Any, Any, T]]
 
@@ -76,33 +76,33 @@ class Call:
     Attributes
     ----------
     function
-        Does it in the plant's loop; it names which of ``desk``, ``who``, ``order`` and ``blob`` it
-        needs.
+        Function that does the work in the plant's event loop; its arguments are those of ``desk``,
+        ``who``, ``order`` and ``blob`` that it needs.
     request
-        Method and path of the HTTP API, with arguments in braces; "": only the local interface has
-        it.
+        Method and path in the HTTP API, with arguments in braces; "": available only on the local
+        interface.
     group
-        Heading under which the API describes it.
+        Section heading in the API reference.
     role
-        Least role of the person on whose behalf it is made.
+        Minimum role of the person on whose behalf the call is made.
     arguments
         Model of the arguments.
     answer
-        Type of the value; None: there is none.
+        Type of the value; None: there is no value.
     body
-        Model of a request's body where that is not all the arguments.
+        Model of the request body, if it does not contain all arguments.
     pack
-        Makes arguments and blob of a body; None: it takes no blob.
+        Function that derives arguments and blob from a body; None: the call takes no blob.
     bare
-        Whether a request may come without a body.
+        Whether a request may have no body.
     fresh
-        Time for which all callers share an answer, s; 0: none.
+        Time for which all callers share a reply, s; 0: replies are not shared.
     urgent
         Whether it belongs to the socket for EMERGENCY, DEFOCUS and STOW.
     console
         Whether only a console may make it.
     unlimited
-        Whether it is not counted as an order; see `counted`.
+        Whether it does not count as an order; see `counted`.
     """
 
     function: Callable[..., Any]
@@ -121,7 +121,7 @@ class Call:
 
     @property
     def counted(self) -> bool:
-        """Whether it is an order, of which only so many are admitted."""
+        """Whether it is an order, whose rate is limited."""
         return self.role >= Role.OPERATOR and not (self.urgent or self.unlimited)
 
     @property
@@ -131,18 +131,18 @@ class Call:
 
     @property
     def plain_text(self) -> str:
-        """The same without links."""
+        """The same text without links."""
         return _LINK.sub(r"\1", self.text)
 
     def work(self, desk: Desk, who: Person, order: Any, blob: bytes) -> Any:
-        """Do it; the value is made plain elsewhere, and that of a `Later` has to be waited for."""
+        """Do the work; the value is converted elsewhere, and a `Later` must be awaited."""
         given = {"desk": desk, "who": who, "order": order, "blob": blob}
         named = inspect.signature(self.function).parameters
         ready = functools.partial(self.function, **{name: given[name] for name in named})
         return Later(ready) if inspect.iscoroutinefunction(self.function) else ready()
 
 
-#: All calls that are done in the plant's loop, by name.
+#: All calls that run in the plant's event loop, by name.
 CALLS: dict[str, Call] = {}
 
 
@@ -184,9 +184,9 @@ def sun(desk: Desk) -> views.SunView:
 
 
 @_call("GET receivers/{name}/flux", "plant", fresh=FRESH)
-def flux(desk: Desk, order: orders.Named) -> FluxView:
+async def flux(desk: Desk, order: orders.Named) -> FluxView:
     """Return the predicted flux on a receiver."""
-    return desk.operations.receiver_flux(order.name)
+    return await desk.operations.receiver_flux(order.name)
 
 
 @_call("GET field", "field", fresh=ALWAYS)
@@ -212,9 +212,10 @@ def heliostat(desk: Desk, order: orders.Named) -> views.HeliostatView:
 
 @_call("GET heliostats/{name}/why", "field")
 def why(desk: Desk, order: orders.Named) -> views.Explanation:
-    """Return why a heliostat tracks or does not, what happens next, and what a person can do.
+    """Explain why a heliostat tracks or not, what happens next, and what an operator can do.
 
-    `order`: the last command to it, by whom and when; `button`: the command that `remedy` means.
+    `order`: the last command to it, by whom and when; `button`: the command that `remedy` refers
+    to.
     """
     return desk.operations.why(order.name)
 
@@ -227,7 +228,7 @@ def clusters(desk: Desk) -> tuple[views.ClusterRow, ...]:
 
 @_call(console=True)
 def live(desk: Desk) -> WithBlob:
-    """Return the field and the plant at one moment."""
+    """Return the state of the field and the plant at one moment."""
     head, blob = frame_parts(desk.operations.viewer.frame())
     return WithBlob({"frame": head, "overview": overview(desk.operations)}, blob)
 
@@ -243,7 +244,7 @@ def emergency(desk: Desk) -> views.EmergencyView:
 
 @_call("POST emergency", "safety", bare=True, urgent=True)
 def order_emergency(desk: Desk, who: Person, order: orders.EmergencyCall) -> views.EmergencyView:
-    """Order DEFOCUS (or STOW) of the whole field, with proof; open to everybody signed in."""
+    """Order a field-wide DEFOCUS (or STOW), with proof; open to everyone signed in."""
     return desk.order_emergency(who, order)
 
 
@@ -251,7 +252,7 @@ def order_emergency(desk: Desk, who: Person, order: orders.EmergencyCall) -> vie
 def withdraw_emergency(desk: Desk, who: Person, order: orders.Withdrawal) -> views.EmergencyView:
     """Withdraw your emergency order, or as an engineer that of an `owner`; nothing moves.
 
-    The emergency goes on while another person's order stands (`calls`).
+    The emergency continues while another person's order is active (`calls`).
     """
     desk.operations.withdraw(who, order.owner)
     return desk.operations.viewer.emergency()
@@ -259,9 +260,9 @@ def withdraw_emergency(desk: Desk, who: Person, order: orders.Withdrawal) -> vie
 
 @_call("PUT readings/{name}", "safety", ENGINEER, body=orders.Reading)
 def give_reading(desk: Desk, who: Person, order: orders.NamedReading) -> None:
-    """Give a reading of the safety table: its `value`, and `at`, when it was made.
+    """Submit a reading for the safety table: its `value`, and `at`, the time of measurement.
 
-    Only where the links file says [`"api"`](../how-to/integrate.md#sensors).
+    Accepted only if the links file says [`"api"`](../how-to/integrate.md#sensors).
     """
     desk.readings.take(who, order.name, order.value, order.at)
 
@@ -280,9 +281,9 @@ def acknowledge(desk: Desk, who: Person, order: orders.Acknowledged) -> None:
 
 @_call("GET events", "logs", fresh=FRESH)
 def events(desk: Desk, order: orders.Some) -> tuple[views.EventRow, ...]:
-    """Return the last events, newest first.
+    """Return the latest events, newest first.
 
-    `heliostats`: how many it is about, where `text` does not name them all.
+    `heliostats`: the number of heliostats concerned, if `text` does not name them all.
     """
     return desk.operations.logbook.events(order.limit)
 
@@ -304,10 +305,10 @@ async def journal(desk: Desk, order: orders.Journal) -> tuple[JournalEntry, ...]
 
 @_call("GET report", "logs")
 async def report(desk: Desk, order: orders.Period) -> ShiftReport:
-    """Return the report of a time: production, availability, calibrations, alarms, work, notes.
+    """Return the report for a time span: production, availability, calibrations, alarms, notes.
 
-    `since` and `until` are POSIX seconds, at most 31 days apart; 0 or left out: the last eight
-    hours. Energy and power are predicted.
+    `since` and `until` are POSIX seconds, at most 31 days apart; 0 or omitted: the last eight
+    hours. Energy and power are predictions.
     """
     return await desk.operations.report(order.since, order.until)
 
@@ -320,9 +321,10 @@ async def trends(desk: Desk) -> tuple[Quantity, ...]:
 
 @_call("GET trend", "logs")
 async def trend(desk: Desk, order: orders.TrendOrder) -> Trend:
-    """Return a quantity over time: least, mean and largest value in intervals.
+    """Return a quantity over time: minimum, mean and maximum per interval.
 
-    `?quantity=power.receiver&since=…&until=…` in POSIX seconds; with `heliostat`, one of its own.
+    `?quantity=power.receiver&since=…&until=…` in POSIX seconds; with `heliostat`, a quantity of
+    that heliostat.
     """
     return await desk.operations.trend(
         order.quantity, order.heliostat, order.since, order.until, order.points
@@ -331,19 +333,19 @@ async def trend(desk: Desk, order: orders.TrendOrder) -> Trend:
 
 @_call("POST notes", "logs", OPERATOR)
 def note_for_people(desk: Desk, who: Person, order: orders.NoteOrder) -> None:
-    """Keep a note for the next shift; the journal and the report show it."""
+    """Store a note for the next shift, which the journal and the report show."""
     desk.operations.note(who, order.text)
 
 
 @_call("GET packets", "logs", fresh=FRESH)
 def packets(desk: Desk, order: orders.SomePackets) -> tuple[views.PacketRow, ...]:
-    """Return the last messages between plant and clusters, newest first."""
+    """Return the latest messages between plant and clusters, newest first."""
     return desk.operations.logbook.packets(order.limit, order.cluster)
 
 
 @_call("POST clusters/{name}/frames", "logs", ENGINEER)
 async def bus_frames(desk: Desk, who: Person, order: orders.Named) -> tuple[views.BusFrame, ...]:
-    """Record the frames of a cluster's bus for five seconds, decoded; nothing moves."""
+    """Record the frames on a cluster's bus for five seconds, decoded; nothing moves."""
     found = await bus.record(desk.operations.plant, order.name)
     text = f"{order.name}: recorded {len(found)} frames of its bus"
     desk.operations.logbook.event("command", who.name, text)
@@ -359,7 +361,7 @@ def note(desk: Desk, order: orders.Note) -> None:
 
 @_call()
 def note_use(desk: Desk, who: Person, order: orders.Use) -> None:
-    """Record what a person on this machine did with the records; see `cli._noted`."""
+    """Record what a user of this computer did with the records; see `cli._noted`."""
     kind = SecurityEvent[order.kind]
     desk.operations.security.note(kind, who.name, detail=order.detail)
 
@@ -375,21 +377,21 @@ def authority(desk: Desk, who: Person) -> AuthorityState:
 
 @_call("POST authority", "authority", OPERATOR)
 def take_authority(desk: Desk, who: Person) -> Later[AuthorityState]:
-    """Take the command authority, or renew it; automatic control gives way."""
+    """Take the command authority, or renew it; automatic control yields."""
     new = desk.take(who)
     return Later(lambda: desk.told(who, new))
 
 
 @_call("POST authority/seize", "authority", OPERATOR)
 def seize_authority(desk: Desk, who: Person, order: orders.GivenReason) -> Later[AuthorityState]:
-    """Break another person's command authority and take it."""
+    """Take the command authority away from another person."""
     desk.operations.seize_authority(who, order.reason)
     return Later(lambda: desk.told(who, True))
 
 
 @_call("PUT authority", "authority", OPERATOR, unlimited=True)
 def keep_authority(desk: Desk, who: Person) -> AuthorityState:
-    """Renew the command authority: every few seconds, while somebody is present."""
+    """Renew the command authority, every few seconds while its holder is present."""
     return desk.keep(who)
 
 
@@ -404,19 +406,19 @@ def release_authority(desk: Desk, who: Person) -> AuthorityState:
 
 @_call("POST stow", "commands", OPERATOR, urgent=True)
 def stow(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
-    """Send heliostats to stow; needs no authority."""
+    """Send heliostats to stow; needs no command authority."""
     return desk.tickets.put(desk.operations.stow(who, order.heliostats))
 
 
 @_call("POST defocus", "commands", OPERATOR, urgent=True)
 def defocus(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
-    """Take beams off the receiver; needs no authority."""
+    """Move beams off the receiver; needs no command authority."""
     return desk.tickets.put(desk.operations.defocus(who, order.heliostats))
 
 
 @_call("POST commands", "commands", OPERATOR)
 def command(desk: Desk, who: Person, order: orders.CommandOrder) -> Later[TicketState]:
-    """Give a command of the wire.
+    """Give a bus command.
 
     APPROACH, TRACK, IDLE, REFOCUS, LOCK, UNLOCK, SEARCH, JOG, ZERO and more.
     """
@@ -437,7 +439,7 @@ def command(desk: Desk, who: Person, order: orders.CommandOrder) -> Later[Ticket
 
 @_call("GET commands", "commands")
 def commands(desk: Desk) -> tuple[TicketState, ...]:
-    """Return the last commands given through the console, newest first."""
+    """Return the latest commands given through the console, newest first."""
     return desk.tickets.last()
 
 
@@ -451,7 +453,7 @@ def one_command(desk: Desk, order: orders.OneCommand) -> TicketState:
 def aim(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> Later[TicketState]:
     """Aim heliostats at a receiver or a target by name, or at points.
 
-    `right` and `up`: a point of the unrolled receiver, m from its middle as seen from outside.
+    `right` and `up`: a point on the unrolled receiver, m from its middle as seen from outside.
     """
     if bool(order.where) == bool(order.points):
         raise InputError("aim: give either where (a receiver or target) or points")
@@ -477,23 +479,24 @@ def standby(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> 
 def automatic(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
     """Give heliostats to automatic control, which raises and calibrates them.
 
-    Answers with a ticket, done where a heliostat follows, and with the reason where it does not.
+    Returns a ticket, which is done for a heliostat once it follows, and otherwise states the
+    reason.
     """
     return desk.tickets.put(desk.operations.give_back(who, order.heliostats))
 
 
 @_call("POST automatic/resume", "commands", OPERATOR)
 async def resume(desk: Desk, who: Person) -> None:
-    """Let automatic control go on with its heliostats, after a loss of many or an emergency.
+    """Let automatic control resume with its heliostats, after a large loss or an emergency.
 
-    It acknowledges an emergency whose orders are all withdrawn.
+    This also acknowledges an emergency whose orders are all withdrawn.
     """
     await desk.resume(who)
 
 
 @_call("GET holds", "calibration")
 def holds(desk: Desk) -> tuple[Lockout, ...]:
-    """Return the locks of persons on heliostats, targets, receivers and the tower.
+    """Return the personal locks on heliostats, targets, receivers and the tower.
 
     A locked heliostat is out of service.
     """
@@ -502,20 +505,20 @@ def holds(desk: Desk) -> tuple[Lockout, ...]:
 
 @_call("POST holds", "commands", OPERATOR)
 def hold(desk: Desk, who: Person, order: orders.HoldOrder) -> TicketState:
-    """Put your lock on `heliostats`, `targets`, `receivers` or the `tower`.
+    """Apply your lock to `heliostats`, `targets`, `receivers` or the `tower`.
 
-    Heliostats concerned go to stow, and nobody moves them. Answers with a ticket, done where a
-    heliostat is parked in stow. Each person has a lock of their own.
+    The heliostats concerned go to stow, and nobody moves them. Returns a ticket, which is done for
+    a heliostat once it is parked at stow. Each person applies their own lock.
     """
     return desk.tickets.put(desk.operations.hold(who, **order.model_dump(exclude_none=True)))
 
 
 @_call("POST holds/release", "commands", OPERATOR)
 def unhold(desk: Desk, who: Person, order: orders.GivenBack) -> tuple[Lockout, ...]:
-    """Return your locks; nothing moves.
+    """Remove your locks; nothing moves.
 
-    As an engineer with `owner` and `reason`: remove that person's. What is locked is in service
-    again when nobody's lock is left.
+    As an engineer with `owner` and `reason`: remove that person's locks. A locked object is in
+    service again when nobody's lock is left.
     """
     desk.operations.unhold(who, **order.model_dump())
     return desk.operations.automatic.service.out
@@ -528,9 +531,9 @@ def unhold(desk: Desk, who: Person, order: orders.GivenBack) -> tuple[Lockout, .
 def calibration(desk: Desk) -> views.CalibrationView:
     """Return the progress of calibration.
 
-    `outlooks`: the first and the last [prediction](../how-to/planning.md#in-the-running-plant) of
-    the field's errors for this day; `field`: what has come true; `choice`: why automatic control
-    chose the last visit, or begins none.
+    `outlooks`: the first and the latest [prediction](../how-to/planning.md#in-the-running-plant) of
+    the field errors for this day; `field`: the actual errors so far; `choice`: why automatic
+    control chose the last visit, or starts none.
     """
     return desk.operations.automatic.view()
 
@@ -546,19 +549,18 @@ def switch_calibration(desk: Desk, who: Person, order: orders.Switch) -> views.C
 def calibrate(desk: Desk, who: Person, order: orders.OneCalibration) -> TicketState:
     """Calibrate a heliostat as soon as a target is free, before all others.
 
-    Answers with a ticket that ends with the result. With `search` only its beam is searched;
-    `together` names others that go to the target with it, in one
-    [joint visit](../explanation/plant.md#many-mirrors-on-one-target), as soon as all are ready;
-    with `receiver` all stay in production and are
-    [measured on the receiver](../explanation/plant.md#mirrors-in-production), as soon as all track
-    it.
+    Returns a ticket that ends with the result. With `search` only its beam is searched for;
+    `together` names other heliostats that go to the target with it, in one [joint
+    visit](../explanation/plant.md#many-mirrors-on-one-target), as soon as all are ready; with
+    `receiver` all stay in production and are [measured on the
+    receiver](../explanation/plant.md#mirrors-in-production), as soon as all track it.
     """
     return desk.tickets.put(desk.operations.calibrate(who, **order.model_dump()))
 
 
 @_call("GET schedule", "calibration", fresh=FRESH)
 def schedule(desk: Desk, order: orders.SomeVisits) -> tuple[PlannedVisit, ...]:
-    """Return the planned next measurements."""
+    """Return the planned visits."""
     return desk.operations.automatic.plan(order.limit)
 
 
@@ -566,7 +568,7 @@ def schedule(desk: Desk, order: orders.SomeVisits) -> tuple[PlannedVisit, ...]:
 def timetable(desk: Desk) -> tuple[views.TimetableRow, ...]:
     """Return the [timetable](../explanation/schedule.md#the-timetable) of calibrations.
 
-    Each entry comes with its next and last time, and what came of that.
+    Each entry is returned with its next and last time, and the result of the last one.
     """
     return desk.operations.automatic.timetable.rows()
 
@@ -575,7 +577,7 @@ def timetable(desk: Desk) -> tuple[views.TimetableRow, ...]:
 def put_timetable(
     desk: Desk, who: Person, order: orders.TimetableOrder
 ) -> tuple[views.TimetableRow, ...]:
-    """Put a timetable in force: all its `entries`; `null`: that of the plant file.
+    """Activate a timetable: all its `entries`; `null`: the timetable of the plant file.
 
     An entry has the keys of the [plant file](plant-format.md#timetable).
     """
@@ -587,10 +589,10 @@ def put_timetable(
 
 @_call("GET retries", "calibration")
 def retries(desk: Desk) -> tuple[Retry, ...]:
-    """Return what automatic control tries again or has given up.
+    """Return what automatic control is retrying or has given up.
 
-    Each row gives the work, of what, failures, the last reason, seconds until the next try (null:
-    none by itself), and what follows.
+    Each record states the work, its subject, the number of failures, the last reason, seconds until
+    the next attempt (null: no automatic attempt), and what follows.
     """
     return desk.operations.automatic.retries()
 
@@ -599,29 +601,30 @@ def retries(desk: Desk) -> tuple[Retry, ...]:
 async def parameters(desk: Desk, who: Person, order: orders.Named) -> ParametersView:
     """Return the error parameters of a heliostat.
 
-    It gives those of the plant file, those in use with σ, whether its local controller stores them
-    (asked now for an operator, else as last compared), and earlier versions.
+    Returns the parameters from the plant file, the parameters in use with σ, whether the local
+    controller stores them (queried now for an operator, otherwise as last compared), and earlier
+    versions.
     """
     return await desk.operations.parameters.view(order.name, who)
 
 
 @_call("GET heliostats/{name}/versions", "calibration")
 async def versions(desk: Desk, order: orders.TwoVersions) -> ParameterComparison:
-    """Return two versions of a heliostat's parameters side by side, with σ.
+    """Return two versions of a heliostat's parameters for comparison, with σ.
 
     `?first=3&second=5`; 0 is the plant file. `beam_rms` and `beam_most`: change of the beam at its
-    aim over the suns of this day, m.
+    aim over the sun positions of this day, m.
     """
     return await desk.operations.parameters.compare(order.name, order.first, order.second)
 
 
 @_call("POST parameters", "calibration", ENGINEER)
 async def set_parameters(desk: Desk, who: Person, order: orders.ParameterOrder) -> TicketState:
-    """Set error parameters of a heliostat at rest by `values`, or bring back an earlier `version`.
+    """Set error parameters of a heliostat at rest by `values`, or restore an earlier `version`.
 
-    The `reason` is kept. Where the plant file asks for a
+    The `reason` is recorded. If the plant file requires a
     [second approval](plant-format.md#second-approval), nothing is written and no command authority
-    is needed: the change waits, and the ticket ends with what becomes of it.
+    is needed: the change waits, and the ticket ends with the outcome.
     """
     typed, approvals = desk.operations.parameters, desk.operations.approvals
     if bool(order.values) == bool(order.version):
@@ -668,13 +671,13 @@ def withdraw_change(desk: Desk, who: Person, order: orders.OneChange) -> None:
 
 @_call("GET targets/{name}", "calibration")
 def target(desk: Desk, order: orders.Named) -> CameraReading:
-    """Return the findings of the software in the last photograph of a target."""
+    """Return what the software found in the latest photograph of a target."""
     return CameraReading.of(desk.operations.camera(order.name))
 
 
 @_call("GET targets/{name}/photograph", "calibration")
 def photograph(desk: Desk, order: orders.Picture) -> WithBlob:
-    """Return the last photograph of a target, annotated with the findings of the software."""
+    """Return the latest photograph of a target, annotated with what the software found."""
     view = desk.operations.camera(order.name)
     return WithBlob({"version": view.version}, b"" if view.version == order.known else view.jpeg)
 
@@ -687,41 +690,42 @@ async def take_photograph(desk: Desk, who: Person, order: orders.Named) -> Camer
 
 @_call("GET photographs", "calibration")
 async def kept_photographs(desk: Desk, order: orders.KeptOf) -> tuple[views.PictureRow, ...]:
-    """Return the newest kept photographs of a heliostat (`?heliostat=`).
+    """Return the newest stored photographs of a heliostat (`?heliostat=`).
 
-    Each comes with the result of its visit; without a heliostat, those that persons asked for.
+    Each is returned with the result of its visit; without a heliostat, photographs requested by
+    operators.
     """
     return tuple(await desk.kept(order.heliostat, order.limit))
 
 
 @_call("GET photographs/{identity}", "calibration")
 async def kept_photograph(desk: Desk, order: orders.KeptOne) -> WithBlob:
-    """Return a kept photograph, annotated with the findings of the software."""
+    """Return a stored photograph, annotated with what the software found."""
     return WithBlob({"identity": order.identity}, await desk.kept_picture(order.identity))
 
 
 @_call("POST targets/{name}/marks/picture", "calibration", ENGINEER)
 def begin_marks(desk: Desk, who: Person, order: orders.Named) -> PictureToMark:
-    """Hold the newest picture of a target's camera, so that its corners can be marked.
+    """Hold the newest picture from a target's camera, so that its corners can be marked.
 
-    The answer gives its `number`, size, the points with the pixels where they are expected, and
-    where marks are kept.
+    Returns its `number`, size, the points with the pixels where they are expected, and where marks
+    are stored.
     """
     return desk.marking.begin(who, order.name)
 
 
 @_call("GET pictures-to-mark/{identity}", "calibration", ENGINEER)
 async def picture_to_mark(desk: Desk, order: orders.KeptOne) -> WithBlob:
-    """Return a held picture as JPEG, as the camera took it; the last four are held."""
+    """Return a held picture as JPEG, as taken by the camera; the last four are held."""
     return WithBlob({"number": order.identity}, await desk.marking.picture(order.identity))
 
 
 @_call("POST targets/{name}/marks", "calibration", ENGINEER, body=orders.Clicks)
 async def mark_corners(desk: Desk, who: Person, order: orders.Marks) -> MarksView:
-    """Try points clicked in a held picture (`number`, `points` as pixels by name).
+    """Test points clicked in a held picture (`number`, `points` as pixels by name).
 
-    The answer gives residuals, notes and the target from the front; with `save` (needs the command
-    authority) the camera works by them from now on.
+    Returns residuals, notes and the target seen from the front; with `save` (needs the command
+    authority) the camera uses them from now on.
     """
     token = desk.token_of(who) if order.save else None
     points = {name: (x, y) for name, (x, y) in order.points.items()}
@@ -737,19 +741,19 @@ def _flight_text(document: FlightDocument) -> tuple[dict[str, Any], bytes]:
 
 @_call("GET flights", "calibration", fresh=FRESH)
 def flights(desk: Desk) -> tuple[views.FlightView, ...]:
-    """Return the flights of a drone that the plant has taken, the last first.
+    """Return the drone flights imported into the plant, the latest first.
 
-    Each gives what became of its heliostats, and the errors that its rows share.
+    Each record states what was done with its heliostats, and the errors that its records share.
     """
     return desk.operations.automatic.flights.views()
 
 
 @_call("POST flights", "calibration", ENGINEER, body=FlightDocument, pack=_flight_text)
 async def take_flight(desk: Desk, who: Person, blob: bytes) -> views.FlightView:
-    """Take a flight of a drone; nothing moves, and the answer comes once all mirrors are fitted.
+    """Import a drone flight; nothing moves, and the reply comes once all heliostats are fitted.
 
-    The body is the [`flight.json`](formats.md#flightjson) of `heliotrope drone evaluate`, at most
-    8 MiB and 20,000 rows.
+    The body is the [`flight.json`](formats.md#flightjson) from `heliotrope drone evaluate`, at most
+    8 MiB and 20,000 records.
     """
     document = await asyncio.to_thread(parse_flight, blob)
     return await desk.operations.automatic.flights.take(who, document, blob.decode())
@@ -757,15 +761,15 @@ async def take_flight(desk: Desk, who: Person, blob: bytes) -> views.FlightView:
 
 @_call("GET learning", "calibration", fresh=FRESH)
 def learning(desk: Desk) -> tuple[views.LearningView, ...]:
-    """Return what was learnt of each group of mirrors, when and from what, and what is in force."""
+    """Return what was learnt about each heliostat group, when and from what, and what is in use."""
     return desk.operations.automatic.learning.views()
 
 
 @_call("POST learning", "calibration", ENGINEER)
 def learn(desk: Desk, who: Person, order: orders.OneGroup) -> tuple[views.LearningView, ...]:
-    """Learn drift, noise and installation of a `group` ("": all) now, as every night.
+    """Learn drift, noise and installation errors of a `group` ("": all) now, as every night.
 
-    Nothing moves; it runs beside the plant, and `GET learning` says how it ended.
+    No heliostat moves; learning runs beside the plant, and `GET learning` reports the result.
     """
     desk.operations.learn(who, order.group)
     return desk.operations.automatic.learning.views()
@@ -779,12 +783,12 @@ _REQUESTS = [
 
 
 def asked(request: str) -> tuple[str, dict[str, Any]]:
-    """Return the call of a request (method, path and query), and the arguments in it.
+    """Return the call for a request (method, path and query), and the arguments in it.
 
     Raises
     ------
     InputError
-        If no call has this request: some are answered by the console alone.
+        If no call has this request; some requests are answered by the console alone.
     """
     place, _, query = request.partition("?")
     for pattern, name in _REQUESTS:

@@ -1,7 +1,7 @@
-"""The processes of a console: started beside the plant, watched, and started again.
+"""The console processes: started beside the plant, monitored, and restarted.
 
-Nothing that happens to them reaches the plant: a process that ends, or gives no sign of life, is
-killed and started again after a pause that grows from one failure to the next.
+A failure in these processes does not affect the plant: a process that ends, or sends no sign of
+life, is killed and restarted after a pause that increases with each failure.
 """
 
 import asyncio
@@ -46,7 +46,7 @@ class Part:
     alarm: AlarmKind
 
 
-#: Page and API; and the way for EMERGENCY alone.
+#: Page and API; and the path for EMERGENCY alone.
 CONSOLE = Part("console", "heliotrope.console", alarms.CONSOLE)
 EMERGENCY_WAY = Part("emergency", "heliotrope.console.urgent_process", alarms.EMERGENCY_WAY)
 
@@ -75,29 +75,29 @@ class Patience:
 
 
 class ConsoleProcess:
-    """A part of a plant's console in a process of its own.
+    """A part of a plant's console in its own process.
 
     Parameters
     ----------
     interface
-        The plant's interface, through which it gives its signs of life.
+        The plant's interface, through which the process sends its signs of life.
     part
         The part.
     listen
-        Returns its listening socket, the same each time, and the settings of the console as JSON
-        values; called in threads, raises `InputError` if the address is not available.
+        Function that returns its listening socket, the same each time, and the console settings as
+        JSON values; called in threads, raises `InputError` if the address is not available.
     on_alarm
-        Takes the alarm in the plant's loop.
+        Function that takes an alarm in the plant's event loop.
     on_address
-        Called once, in the interface's thread, with the address at which it listens, when the plant
-        works.
+        Function called once, in the interface's thread, with the address at which it listens, when
+        the plant is running.
     patience
         See `Patience`.
 
     Attributes
     ----------
     pid
-        Of the process; 0 while there is none.
+        Process identifier; 0 if there is no process.
     starts
         Number of starts.
     """

@@ -1,4 +1,4 @@
-"""Errors on their way over the local interface: a kind and a text, and the same class again."""
+"""Errors passed over the local interface: a kind and a text, converted back to the same class."""
 
 from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.local import CallError

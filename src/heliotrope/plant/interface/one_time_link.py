@@ -1,4 +1,4 @@
-"""The one-time link: a person signs in to a simulated plant on this machine without a password."""
+"""The one-time link: signs a local user in to a simulated plant without a password."""
 
 import hashlib
 import hmac

@@ -1,6 +1,6 @@
-"""Arguments of the calls, checked where they arrive: by the console, and again by the plant.
+"""Arguments of the calls, validated on arrival: by the console, and again by the plant.
 
-Lists of points travel as names in the arguments and coordinates in the blob; see `points_of`.
+Lists of points are sent as names in the arguments and coordinates in the blob; see `points_of`.
 """
 
 from typing import Annotated, Any, Literal, Self

@@ -1,4 +1,4 @@
-"""The plant at one moment, as the live stream shows it beside the rows of the field."""
+"""The plant at one moment, as the live stream shows it along with the field's rows."""
 
 from typing import Any
 

@@ -1,8 +1,8 @@
-"""The plant's local interface at work: two sockets, each with a thread of its own.
+"""The plant's local interface at run time: two sockets, each with its own thread.
 
-The plant's loop does nothing but the calls, one at a time for each socket, and those of the
-ordinary socket for a limited share of its time. Taking connections, checking keys and tokens,
-reading, writing and making views plain are done in the threads, whose time is the machine's.
+The plant's event loop runs only the calls, one at a time per socket, and those of the ordinary
+socket for a limited fraction of its time. Accepting connections, checking keys and tokens, reading,
+writing and converting views are done in the threads, which use real time.
 """
 
 import asyncio
@@ -77,22 +77,22 @@ class PlantInterface:
     Parameters
     ----------
     operations
-        The plant at work.
+        The running plant.
     people
         Accounts, sessions and tokens.
     data
-        Folder of the plant, in which the folder of the sockets stands.
+        Folder of the plant, which contains the folder of the sockets.
 
     Attributes
     ----------
     folder
         Folder of the sockets.
     key
-        Proves a console; made at each start.
+        Secret that authenticates a console; created at each start.
     admission
-        How many ordinary orders are admitted.
+        Limits on ordinary orders.
     heard
-        When each part of a console last gave a sign of life, monotonic time of the machine, s.
+        When each part of a console last sent a sign of life, monotonic time of the computer, s.
     addresses
         Addresses at which they listen.
     """
@@ -113,12 +113,12 @@ class PlantInterface:
     async def running(
         self, *beside: Callable[[], Coroutine[Any, Any, None]]
     ) -> AsyncIterator["PlantInterface"]:
-        """Serve during a block, in the plant's loop; ``beside`` runs in the ordinary thread.
+        """Serve during a block, in the plant's event loop; ``beside`` runs in the ordinary thread.
 
         Raises
         ------
         InputError
-            If the sockets cannot be made.
+            If the sockets cannot be created.
         """
         self._plant = asyncio.get_running_loop()
         make_folder(self.folder)
@@ -140,18 +140,18 @@ class PlantInterface:
 
     @property
     def begun(self) -> bool:
-        """Whether the plant works: it leads a field that is ready."""
+        """Whether the plant is running: it controls a field that is ready."""
         return self._desk.operations.begun.is_set()
 
     def one_time_link(self, name: str, address: str) -> str:
-        """Return a link that signs an account in, once and soon, without its password.
+        """Return a link that signs an account in once, for a short time, without its password.
 
         Parameters
         ----------
         name
             The account.
         address
-            Of the console.
+            Address of the console.
 
         Raises
         ------
@@ -163,7 +163,7 @@ class PlantInterface:
         return f"{address}enter?once={self._link.make(name)}"
 
     def in_plant(self, work: Callable[[], T]) -> "Future[T]":
-        """Do work in the plant's loop, from any thread."""
+        """Run work in the plant's event loop, from any thread."""
         assert self._plant is not None
         done: Future[T] = Future()
 

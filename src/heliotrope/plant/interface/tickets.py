@@ -1,4 +1,4 @@
-"""The last commands given through the interface."""
+"""The most recent commands given through the interface."""
 
 from collections import OrderedDict
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""The last photographs of a plant's targets, for display."""
+"""The latest photographs of a plant's targets, for display."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,12 +1,12 @@
-"""Cameras of a real plant: the newest frame of each source, read like every photograph.
+"""Cameras of a real plant: the newest frame of each source, evaluated like every photograph.
 
-A thread for each camera keeps the newest frame of its source (`imaging.sources`): a watched
-folder, a stream, a device, or the address of one image. A photograph of a beam is the first frame
-exposed after it was asked for. Where none comes within some seconds an alarm is raised, and the
-camera's targets are left alone until a frame comes.
+A thread per camera keeps the newest frame of its source (`imaging.sources`): a watched folder, a
+stream, a device, or the address of a single image. A photograph of a beam is the first frame
+exposed after the request. If no frame arrives within some seconds an alarm is raised, and the
+camera's targets are not used until a frame arrives.
 
-The picture of the empty target is learnt from every frame (`imaging.memory`), so that light which
-changes over the day is not taken for a beam.
+The picture of the empty target is updated from every frame (`imaging.memory`), so that light that
+changes over the day is not mistaken for a beam.
 """
 
 import asyncio

@@ -1,9 +1,10 @@
-"""The clock of a simulated field, which the plant that leads it follows.
+"""The clock of a simulated field, which the plant in control of the field follows.
 
-A simulated field may begin at another time, run faster, and slow down where its machine is too
-slow. The plant asks for the state of its clock five times in a second of it (`ClockReader`), and
-its event loop has that time (`FollowedLoop`). Both are made from the address in a links file with
-``twin``, which no other link may stand beside, so a plant with real links has no such clock.
+A simulated field may begin at a different time, run faster, and slow down if its computer is too
+slow. The plant polls the state of the field's clock five times per simulated second
+(`ClockReader`), and its event loop runs on that time (`FollowedLoop`). Both are created from the
+address in a links file with ``twin``, which excludes all other links, so a plant with real links
+has no such clock.
 """
 
 import asyncio

@@ -1,8 +1,8 @@
-"""The links file: how a plant reaches its clusters, and the links that follow from it.
+"""The links file: how a plant reaches its clusters, and the resulting links.
 
-A cluster is reached in one of three ways: it connects to this plant over TCP, it meets the plant
-at an MQTT broker, or its bus is at this machine and its cluster file is given. In the last case
-the program that builds the plant also runs the cluster's program in this process
+A cluster is reached in one of three ways: it connects to this plant over TCP, it meets the plant at
+an MQTT broker, or its bus is attached to this computer and its cluster file is specified. In the
+last case the program that builds the plant also runs the cluster program in this process
 (`cluster.program`) and adds its link. Keys are in a separate file that nobody else may read.
 """
 
@@ -38,50 +38,56 @@ from heliotrope.safety import FLUX_READING
 class TcpTable(Table):
     """``[tcp]``: where clusters connect to this plant."""
 
-    listen: str = Field(min_length=3, description="`address:port` of this machine.")
-    certificate: str | None = Field(None, description="PEM file, with its key: TLS.")
+    listen: str = Field(
+        min_length=3, description="`address:port` on this computer at which clusters connect."
+    )
+    certificate: str | None = Field(
+        None, description="PEM file of the certificate; together with `key`, switches TLS on."
+    )
     key: str | None = Field(None, description="PEM file of the certificate's key.")
     authority: str | None = Field(
         None,
         description="PEM file of the authority that signs clusters' certificates; "
-        "default: they need none.",
+        "default: clusters need no certificate.",
     )
     unencrypted: bool = Field(
-        False, description="Accept connections from other machines without TLS."
+        False, description="Accept connections from other computers without TLS."
     )
 
 
 class MqttTable(Table):
-    """``[mqtt]``: the broker at which clusters are met."""
+    """``[mqtt]``: the broker through which clusters are reached."""
 
     url: str = Field(min_length=1, description="`mqtt://host:port/prefix`, or `mqtts://…` (TLS).")
     username: str | None = Field(
-        None, description="For the broker; the password is in the key file."
+        None, description="User name at the broker; the password is in the key file."
     )
     authority: str | None = Field(
         None,
         description="PEM file of the authority that signs the broker's certificate; "
         "default: the system's.",
     )
-    unencrypted: bool = Field(False, description="Accept a broker elsewhere without TLS.")
+    unencrypted: bool = Field(False, description="Accept a broker on another computer without TLS.")
 
 
 class WitnessTable(Table):
     """``[witness]``: what sees the sun independently of the clocks and sites of the plant."""
 
     gpsd: str = Field(
-        "", description="`host` or `host:port` of gpsd, whose satellite receiver is at the plant."
+        "",
+        description="`host` or `host:port` of the gpsd whose satellite receiver is at the plant.",
     )
     sun_sensor: str = Field(
         "",
-        description="File beside this one with azimuth and elevation of the sun, degrees, replaced "
-        "with each reading.",
+        description="File beside this one that contains azimuth and elevation of the sun in "
+        "degrees; the sensor's program replaces it for each reading.",
     )
     photographs: bool = Field(
         False, description="Whether photographs of beams on targets count as a witness."
     )
     none: bool = Field(
-        False, description="Accept that there is no witness; else the plant says so once a day."
+        False,
+        description="Accept that there is no witness; otherwise the plant reports this once a day.",
     )
 
 
@@ -92,13 +98,13 @@ class ExpectedPolling(Table):
         CommonSettings.steps_every,
         ge=1,
         le=60,
-        description="Interval between requests for step counts.",
+        description="Interval between polls for step counts, s.",
     )
     silence_s: float = Field(
         CommonSettings.silence,
         ge=2.0,
         le=3600.0,
-        description="A heliostat silent for longer is reported.",
+        description="A heliostat that is silent for longer (s) is reported.",
     )
 
 
@@ -107,39 +113,40 @@ class LinksDocument(Table):
 
     format: Literal["heliotrope-links"]
     version: Literal[1]
-    keys: str = Field("", description="File of the keys, beside this one.")
+    keys: str = Field("", description="Key file, beside this one.")
     tcp: TcpTable | None = None
     mqtt: MqttTable | None = None
     polling: ExpectedPolling = Field(
         default_factory=ExpectedPolling,  # type: ignore[arg-type]
-        description="What every cluster file of this plant has in its table of that name.",
+        description="Values that every cluster file of this plant should have in its table "
+        "of that name.",
     )
     firmware: int | None = Field(
         None,
         ge=0,
         le=0xFFFF,
-        description="Version of the firmware that every board should have; default: not compared.",
+        description="Firmware version that every board should have; default: not compared.",
     )
     witness: WitnessTable = Field(
         default_factory=WitnessTable,  # type: ignore[arg-type]
-        description="What sees the sun independently of the clocks and sites of the plant.",
+        description="Witnesses that see the sun independently of the plant's clocks and site.",
     )
     sensors: dict[str, str] = Field(
         default_factory=dict,
-        description='File with one number, or `"api"`, by reading of the safety table, or `dni` '
-        "(W/m²); "
-        '`receiver_flux_nominal` may be `"camera"`.',
+        description="Source of each reading of the safety table, and of `dni` (W/m²): a file with "
+        'one number, or `"api"`; for `receiver_flux_nominal` also `"camera"`.',
     )
     receiver_light: str = Field(
-        "", description='Reference of the receiver\'s camera, beside this file: for `"camera"`.'
+        "", description='Reference file of the receiver camera, beside this file; for `"camera"`.'
     )
     twin: str = Field(
         "",
-        description="Address of a simulated field: the plant follows its clock. Every cluster is "
-        "then `tcp`, and there is no witness.",
+        description="Address of a simulated field, whose clock the plant follows. Every cluster "
+        "must then be `tcp`, and no witness is allowed.",
     )
     clusters: dict[str, str] = Field(
-        min_length=1, description='`"tcp"`, `"mqtt"`, or the cluster file of a local bus, by name.'
+        min_length=1,
+        description='For each cluster: `"tcp"`, `"mqtt"`, or the cluster file of a local bus.',
     )
 
 

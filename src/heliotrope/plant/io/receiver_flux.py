@@ -1,9 +1,9 @@
-"""The flux on the receiver by its camera: the port `plant.ports.Sensors` for `FLUX_READING`.
+"""The flux on the receiver from its camera: the port `plant.ports.Sensors` for `FLUX_READING`.
 
-Once a second the newest frame of the receiver's camera is measured against a reference
+Once per second the newest frame from the receiver camera is compared with a reference
 (`imaging.receiver_light`). A reading counts from the earliest moment at which its frame may have
-been exposed. No reading comes of a frame that may hide light, of one that repeats the last one, or
-that is old: the last reading goes stale, and the proof of an emergency counts light.
+been exposed. A frame that may hide light, repeats the previous frame, or is old yields no reading;
+the last reading then becomes stale, and the proof of an emergency assumes that there is light.
 """
 
 import asyncio

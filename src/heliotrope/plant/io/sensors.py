@@ -1,10 +1,10 @@
-"""Sensors: readings from outside for the safety table and the schedule.
+"""Sensors: external readings for the safety table and the schedule.
 
 Other programs write them to files, for example.
 
-A file holds one number in the unit of its row, and is replaced with each reading (written under
-another name, then renamed). A file that is not replaced gives no new reading: after some seconds
-its row counts the worst case, as if the sensor were gone. See `safety.conditions`.
+A file contains one number in the unit of its row, and is replaced with each reading (written under
+a temporary name, then renamed). A file that is not replaced yields no new reading; after some
+seconds its row counts the worst case, as if the sensor had failed. See `safety.conditions`.
 """
 
 import asyncio

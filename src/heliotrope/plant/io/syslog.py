@@ -1,10 +1,11 @@
-"""Security events and alarms sent on to a receiver of syslog, as RFC 5424.
+"""Forwards security events and alarms to a syslog receiver, following RFC 5424.
 
-The transports are UDP (RFC 5426), TCP with octet counting (RFC 6587, section 3.4.1) and TLS
-(RFC 5425). Messages wait in a bounded queue for a thread of its own, so a receiver that is slow or
-away holds nothing up; those that find the queue full are counted, and the count is told to the
-receiver and to the plant. A message that TCP had taken when a connection broke may be lost without
-a count: the numbers in ``meta sequenceId`` (RFC 5424, section 7.3.1) show that to the receiver.
+The transports are UDP (RFC 5426), TCP with octet counting (RFC 6587, section 3.4.1) and TLS (RFC
+5425). Messages wait in a bounded queue for a dedicated thread, so a receiver that is slow or
+unreachable delays nothing else. Messages that find the queue full are counted, and the count is
+reported to the receiver and to the plant. A message that TCP had accepted when a connection broke
+may be lost uncounted; the numbers in ``meta sequenceId`` (RFC 5424, section 7.3.1) reveal this to
+the receiver.
 """
 
 import contextlib
@@ -43,7 +44,7 @@ _LAST_NUMBER = 2_147_483_647
 
 @dataclass(frozen=True)
 class Receiver:
-    """Where messages go: ``udp``, ``tcp`` or ``tls``, host, port, and the authority for TLS."""
+    """Destination of messages: ``udp``, ``tcp`` or ``tls``, host, port, and authority for TLS."""
 
     scheme: str
     host: str
@@ -56,12 +57,12 @@ class Receiver:
 
     @classmethod
     def read(cls, url: str, authority: Path | None = None) -> "Receiver":
-        """Return the receiver of a URL; its certificate is checked against the authority.
+        """Return the receiver from a URL; its certificate is checked against the authority.
 
         Raises
         ------
         InputError
-            If it is not the URL of a receiver, or the authority cannot be used.
+            If it is not a receiver URL, or the authority cannot be used.
         """
         try:
             parts = urlsplit(url)

@@ -1,4 +1,5 @@
-"""Motion: paths of mirrors past keep-out volumes, their proofs, and the watch over beams.
+"""Motion: heliostat paths around keep-out volumes, their proofs, and the monitoring of beams.
 
-`PathProofs` proves a path before it is ordered, and `BeamWatch` watches where beams are afterwards.
+`PathProofs` proves a path before it is ordered, and `BeamWatch` monitors afterwards where the beams
+are.
 """

@@ -1,7 +1,7 @@
-"""Where DEFOCUS and STOW lead a beam, and which of the two takes it out of a keep-out volume.
+"""Where DEFOCUS and STOW lead a beam, and which of them moves it out of a keep-out volume.
 
-Both orders are open to anybody, and a local controller accepts them in every state, so no command
-authority is needed. The paths are those of a mirror that has no sun: by the angles of the defocus,
+Anyone may give both orders, and a local controller accepts them in every state, so no command
+authority is needed. The paths are those of a heliostat without a sun vector: by the defocus angles,
 or straight to stow, azimuth last.
 """
 

@@ -1,8 +1,8 @@
-"""The path of a beam between two positions of the axes, and from stow to standby.
+"""The path of a beam between two axis positions, and from stow to standby.
 
-It is the path of `lcu.motion`: its points, its order of the axes, and its speeds. One axis after
-the other turns when stow is left, and when it is reached; in every other motion both start at once,
-each at its own rate, so that the one with less to do arrives first.
+It is the path of `lcu.motion`, with the same points, axis order and speeds. When leaving or
+reaching stow, the axes move one after the other; in every other motion both start at once, each at
+its own rate, so that the axis with less to do arrives first.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""Proof, before a command is sent, that it brings no beam into a keep-out volume.
+"""Proof, before a command is sent, that the command brings no beam into a keep-out volume.
 
-Where beams are afterwards is watched by `BeamWatch`.
+`BeamWatch` monitors afterwards where the beams are.
 """
 
 import struct
@@ -48,12 +48,12 @@ _TO_STANDBY = (
 
 
 class BeamError(RefusedError):
-    """The refusal of a command that would bring beams where none may be.
+    """The refusal of a command that would send beams where they are not allowed.
 
     Attributes
     ----------
     refusals
-        Reasons, by name of the heliostat.
+        Reasons, by heliostat name.
     """
 
     def __init__(self, command: str, refusals: dict[str, str]) -> None:

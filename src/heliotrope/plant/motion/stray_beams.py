@@ -1,9 +1,9 @@
-"""Stray beams on a receiver, sent there by no order: a mirror locked, jogged or defocused onto it.
+"""Stray beams on a receiver, sent there by no order: from a locked, jogged or defocused heliostat.
 
-Every heliostat is checked that is not tracking or searching, by its step counts and the mechanism
-that the plant believes: a beam is on the receiver by where it is, whatever the state is called. A
-mirror that comes nearer to its goal still moves. One at stow is checked as all others are: the
-stow position may be false.
+Every heliostat that is neither tracking nor searching is checked, from its step counts and the
+mechanism that the plant believes: what counts is where the beam is, whatever the state is called. A
+heliostat that approaches its goal still counts as moving. A heliostat at stow is checked like all
+others, because the stow position may be wrong.
 """
 
 from collections.abc import Callable

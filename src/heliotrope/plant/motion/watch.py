@@ -1,4 +1,4 @@
-"""Watch over beams: in a keep-out volume or heading for one, or stray on a receiver."""
+"""Monitors beams: in a keep-out volume or heading for one, or stray on a receiver."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,8 +1,8 @@
-"""A plant at work, as consoles, APIs and the command line use it.
+"""A running plant, as used by consoles, APIs and the command line.
 
-Begin with `Operations`: the one object that they talk to. Behind it stand automatic control
-(`automatic`, with `raising` and `calibrating`), the book of calibrations, the logbook of alarms,
-events and packets, and `views`, the plain values that people see.
+Begin with `Operations`, the single object that they talk to. Behind it are automatic control
+(`automatic`, with `raising` and `calibrating`), the calibration book, the logbook of alarms, events
+and packets, and `views`, the plain values that are displayed.
 """
 
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings

@@ -1,10 +1,10 @@
-"""Automatic control: the field raised, calibrated target by target, and stowed before the night.
+"""Automatic control: the field is raised, calibrated target by target, and stowed before night.
 
-It commands under a name of its own. It takes the command authority while nobody else has it, and
-gives way at once: it begins nothing new, and visits under way go on to their end. It moves only
-*wanted* heliostats. A heliostat that a person stows, defocuses or
-locks is not wanted until a person gives it back; after an emergency, none is. After a loss of many
-heliostats it waits for a person (`losses`).
+It commands under its own name. It takes the command authority while nobody else holds it, and
+yields at once: it starts nothing new, and visits in progress are completed. It moves only *wanted*
+heliostats. A heliostat that an operator stows, defocuses or locks is not wanted until an operator
+gives it back; after an emergency, none is. After the loss of a large number of heliostats it waits
+for an operator (`losses`).
 """
 
 import asyncio
@@ -88,28 +88,30 @@ class AutomaticSettings:
     Attributes
     ----------
     wanted
-        Whether all heliostats are wanted from the start; else those that `give_back` names.
+        Whether all heliostats are wanted from the start; otherwise only those that `give_back`
+        names.
     calibrate
         Whether calibration is on at the start.
     rate
-        Heliostats that leave stow, and that go to the receiver, in a second.
+        Number of heliostats that leave stow, and that go to the receiver, per second.
     beat
         Time between checks of the field, s.
     lowest
         Elevation of the sun below which the field is stowed, rad.
     patience
-        Time before the same command is given again, s.
+        Minimum time before the same command is repeated, s.
     margin
-        Standard deviations by which an uncalibrated beam must miss the targets.
+        Number of standard deviations by which an uncalibrated beam must clear the targets.
     losses
-        Heliostats that may be lost within 30 s; after more, it waits for a person's Resume.
+        Number of heliostats that may be lost within 30 s; after more, it waits for an operator's
+        Resume.
     losses_share
-        Share of the field that may be lost within 30 s, where that is fewer: 3 are all of a small
-        field.
+        Fraction of the field that may be lost within 30 s, if that is fewer, because 3 may be all
+        of a small field.
     foresee
-        Time between predictions of the field's errors for the rest of the day, s; 0: none is made.
+        Time between predictions of the field errors for the rest of the day, s; 0: no predictions.
     events
-        Age at which events, and alarms that are over and acknowledged, are removed, days.
+        Age at which events, and alarms that are cleared and acknowledged, are removed, days.
     """
 
     wanted: bool = False
@@ -154,32 +156,33 @@ class AutomaticControl:
     plant, logbook
         The controller, and the logbook of its alarms and events.
     visits
-        The visits that it can make; None: nothing is calibrated.
+        The visits that it can perform; None: nothing is calibrated.
     records
-        Store of everything that outlasts a restart; None: nothing is kept.
+        Store of everything that survives a restart; None: nothing is stored.
     truth
-        Returns the true tracking errors, known to a twin only, rad, (N,); None: they are unknown.
+        Function that returns the true tracking errors, known only to a twin, rad, (N,); None: they
+        are unknown.
     settings
         Its settings.
     learner
-        Learns groups of mirrors at night; None: nothing is learnt.
+        Learns heliostat groups at night; None: nothing is learnt.
 
     Attributes
     ----------
     book
-        Book of calibrations.
+        The calibration book.
     truth
-        True errors, known to a twin only.
+        True errors, known only to a twin.
     service
         Heliostats out of service.
     flights
-        Takes flights of a drone.
+        Imports drone flights.
     learning
-        The nightly learning about each group of mirrors.
+        The nightly learning for each heliostat group.
     timetable
         Calibrations at times of day and at intervals.
     installed
-        Tracking error that the priors allow an uncalibrated heliostat, rad.
+        Expected tracking error of an uncalibrated heliostat according to the priors, rad.
     """
 
     def __init__(
@@ -256,7 +259,7 @@ class AutomaticControl:
         self._on = on
 
     def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
-        """Give heliostats to automatic control, or take them out of it; see `Raising.want`."""
+        """Put heliostats under automatic control, or remove them; see `Raising.want`."""
         self._raising.want(heliostats, wanted=wanted, by_person=by_person)
         if not wanted:
             self._withdraw(heliostats or self._plant.field.names, "a person has taken it away")
@@ -264,13 +267,13 @@ class AutomaticControl:
     def hold(
         self, person: Person, places: Sequence[tuple[Kind, str]], reason: str, hours: float
     ) -> tuple[str, ...]:
-        """Lock places for a person; return the heliostats that stow. See `Operations.hold`."""
+        """Lock objects for a person; return the heliostats that stow. See `Operations.hold`."""
         names = self.service.take(person, places, reason, hours)
         self._withdraw(names, f"{person.name} has taken it out of service")
         return names
 
     def drop(self, heliostats: Sequence[str], why: str) -> None:
-        """Give up what persons asked for of heliostats."""
+        """Drop what operators have requested for heliostats."""
         self._withdraw(heliostats, why)
 
     def _withdraw(self, heliostats: Sequence[str], why: str) -> None:
@@ -338,7 +341,7 @@ class AutomaticControl:
 
     @property
     def follows_within(self) -> float:
-        """Time in which all heliostats that are given to it must follow, s."""
+        """Time within which all heliostats under automatic control must follow, s."""
         return _FOLLOWS + len(self._plant.field) / self._settings.rate
 
     def following(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
@@ -347,7 +350,7 @@ class AutomaticControl:
         Parameters
         ----------
         since
-            When they were given to it, monotonic s.
+            When they were put under automatic control, monotonic s.
         heliostats
             Names.
         """
@@ -394,15 +397,15 @@ class AutomaticControl:
         return Step(f"it waits: {waits}" if waits else f"it waits for its turn: {shown.condition}")
 
     def calibrating(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
-        """Return the progress of calibrations that persons requested at a time, POSIX s."""
+        """Return the progress of calibrations that operators requested at a given time, POSIX s."""
         return {name: self._calibration_step(name, since) for name in heliostats}
 
     def wants(self, heliostat: str) -> bool:
-        """Return whether a heliostat is given to automatic control."""
+        """Return whether a heliostat is under automatic control."""
         return bool(self._raising.wanted[self._plant.field.place(heliostat)])
 
     def visit_of(self, heliostat: str) -> Running | None:
-        """Return the visit of a heliostat that is under way, None if there is none."""
+        """Return the visit of a heliostat that is in progress, None if there is none."""
         running = () if self._calibrating is None else self._calibrating.running.values()
         return next((one for one in running if heliostat in one.heliostats), None)
 
@@ -434,7 +437,7 @@ class AutomaticControl:
         return f"its turn comes after {', '.join(busy)}" if busy else "its turn comes next"
 
     def retries(self) -> tuple[Retry, ...]:
-        """Return the tasks that are tried again or were given up, with the reasons."""
+        """Return the tasks that are being retried or were given up, with the reasons."""
         now, visits = self._plant.now(), self._calibrating
         return (
             *(() if visits is None else visits.retries()),
@@ -446,22 +449,22 @@ class AutomaticControl:
 
     @property
     def waits(self) -> str:
-        """Why it waits for a person's Resume, empty if it does not."""
+        """Why it waits for an operator's Resume, empty if it does not."""
         return self._losses.reason
 
     @property
     def to_resume(self) -> str:
-        """What a person's Resume would do, empty if nothing waits for it."""
+        """What an operator's Resume would do, empty if nothing waits for it."""
         left = 0 if self._plant.sentinel.on else int(self._raising.left.sum())
         after = f"The emergency is over: {left:,} heliostats wait for a person's Resume."
         return self.waits or (after if left else "")
 
     def left_by_emergency(self, heliostat: str) -> bool:
-        """Return whether an emergency has taken a heliostat out, and nobody has resumed since."""
+        """Return whether an emergency has removed a heliostat, without a Resume since."""
         return bool(self._raising.left[self._plant.field.place(heliostat)])
 
     def resume(self) -> int:
-        """Go on after a loss of many heliostats or an emergency; return how many come back."""
+        """Continue after a large loss of heliostats or an emergency; return how many come back."""
         self._losses.resume()
         if not self._plant.sentinel.on:
             return self._raising.resume()
@@ -469,18 +472,18 @@ class AutomaticControl:
         return int((self._raising.left | self._raising.wanted).sum())
 
     def give_up(self, why: str) -> None:
-        """Take all heliostats out of automatic control, until a person resumes."""
+        """Remove all heliostats from automatic control, until an operator resumes."""
         self._raising.give_up()
         self._resumed_at = -math.inf
         self._withdraw(self._plant.field.names, why)
 
     def stop(self) -> None:
-        """Begin nothing more; to be called before `run` is cancelled."""
+        """Start nothing more; to be called before `run` is cancelled."""
         self._stopped = True
         self._end_visits("automatic control has been stopped")
 
     async def halt(self, limit: float = 5.0) -> None:
-        """Give up all work, and wait for visits under way to end, ``limit`` s at most."""
+        """Stop all work, and wait for visits in progress to end, at most ``limit`` s."""
         self._on = False
         self._raising.give_up()
         self.give_way()
@@ -490,7 +493,7 @@ class AutomaticControl:
             await self._sleep(0.5)
 
     def give_way(self) -> None:
-        """Give the command authority to a person; visits under way go on to their end."""
+        """Yield the command authority to an operator; visits in progress are completed."""
         self._gave_way_at = self._plant.now()
         if self._has_authority():
             self._plant.release_authority(AUTOMATIC, self._token)
@@ -526,13 +529,13 @@ class AutomaticControl:
         )
 
     def plan(self, limit: int) -> tuple[PlannedVisit, ...]:
-        """Return the coming visits."""
+        """Return the planned visits."""
         return () if self._calibrating is None else self._calibrating.plan(self._ready(), limit)
 
     # -- running ---------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Work until cancelled."""
+        """Run until cancelled."""
         async with asyncio.TaskGroup() as group:
             for part in (self._govern, self._raise, self._diagnose, self._look, self._learn):
                 name = part.__name__.strip("_")

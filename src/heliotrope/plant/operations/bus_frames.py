@@ -1,4 +1,4 @@
-"""Frames of a cluster's bus, recorded for a person and decoded."""
+"""Frames from a cluster's bus, recorded and decoded for an operator."""
 
 import asyncio
 import math

@@ -1,4 +1,4 @@
-"""Calibrating the field: one visit after another to each target, as the schedule says."""
+"""Field calibration: successive visits to each target, as scheduled."""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -52,12 +52,12 @@ _TRUTH_EVERY = 5.0
 
 
 class Scheduling(Foreseeing, Protocol):
-    """The choice of the heliostat that is calibrated next.
+    """The choice of the next heliostat to calibrate.
 
     Attributes
     ----------
     attempts
-        Visits that failed, by heliostat; in POSIX s.
+        Failed visits, by heliostat; in POSIX s.
     """
 
     attempts: Attempts
@@ -77,7 +77,7 @@ class Scheduling(Foreseeing, Protocol):
         ...
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[PlannedVisit]:
-        """Return the coming visits."""
+        """Return the planned visits."""
         ...
 
     def done(self, entry: CalibrationEntry) -> None:
@@ -85,7 +85,7 @@ class Scheduling(Foreseeing, Protocol):
         ...
 
     def shone(self, mirrors: int, lit: int, seconds: float) -> None:
-        """Take the time of a receiver visit, in which some of the mirrors lit there took part."""
+        """Record the time of a receiver visit, in which some of the heliostats on it took part."""
         ...
 
 

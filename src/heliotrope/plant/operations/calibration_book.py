@@ -1,4 +1,4 @@
-"""The calibration of every heliostat, for people: predicted and measured errors over time."""
+"""Calibration records for display: predicted and measured errors of every heliostat over time."""
 
 from collections import deque
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Coded visits of automatic calibration: which heliostats are measured at once, and where."""
+"""Coded visits in automatic calibration: which heliostats are measured together, and where."""
 
 import asyncio
 from collections.abc import Callable, Collection, Sequence

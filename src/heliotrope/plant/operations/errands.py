@@ -1,7 +1,7 @@
-"""Errands: operations whose end is not that of one command, followed to their result.
+"""Errands: operations that involve several commands, followed to their result.
 
-A person asks for a calibration, takes a heliostat out of service, or gives it to automatic
-control. Each of these is a `Ticket` too: it names what each heliostat does or waits for, and it
+An operator requests a calibration, takes a heliostat out of service, or gives it to automatic
+control. Each of these is a `Ticket` too: it states what each heliostat is doing or waiting for, and
 ends with the result, or with the reason why there is none.
 """
 

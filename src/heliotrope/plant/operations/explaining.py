@@ -1,4 +1,4 @@
-"""Why one heliostat tracks or does not, what happens next, and what a person can do about it."""
+"""Explains why a heliostat tracks or not, what happens next, and what an operator can do."""
 
 from datetime import UTC, datetime
 

@@ -1,9 +1,10 @@
-"""Flights of a drone taken into the plant: all mirrors fitted together, new parameters in safety.
+"""Import of drone flights: all heliostats fitted together, new parameters applied safely.
 
-A flight never moves a beam. A small change is taken while the heliostat is at stow or locked, where
-its local controller may be written. A large change, and a first calibration, wait for a visit to a
-target, which fits the flight's rows with its photographs and verifies the result by one more; until
-then a heliostat that the flight sees far from where it should be stays off the receiver.
+A flight never moves a beam. A small change is applied while the heliostat is at stow or locked,
+where its local controller may be written. A large change, and a first calibration, wait for a visit
+to a target, which fits the records of the flight together with its photographs and verifies the
+result by one more photograph. Until then a heliostat that the flight found far from its expected
+pose stays off the receiver.
 """
 
 import asyncio

@@ -1,8 +1,8 @@
-"""Predictions of the field's errors for the rest of the day, and what comes true of them.
+"""Predictions of the field errors for the rest of the day, compared with the outcome.
 
-A prediction takes seconds for a large field, so it is made beside the loop, from a copy of what the
-schedule knows. The first prediction of a day is kept for comparison; the last one is about the time
-to come.
+A prediction takes seconds for a large field, so it is computed outside the event loop, from a copy
+of the schedule's knowledge. The first prediction of a day is kept for comparison; the latest one
+covers the remaining time.
 """
 
 from collections import deque

@@ -1,8 +1,8 @@
-"""Readings of the safety table that programs give, for sensors that the plant does not read itself.
+"""Safety-table readings supplied by programs, for sensors that the plant does not read itself.
 
-A reading counts from the moment when it was made, and goes stale from then, as one from a file
-does. Only the readings that the links file names as given are taken: an account alone cannot
-replace a sensor that the plant reads.
+A reading counts from the time of its measurement and becomes stale from then on, like a reading
+from a file. Only readings that the links file declares as supplied by programs are accepted, so
+that an account alone cannot replace a sensor that the plant reads.
 """
 
 import math

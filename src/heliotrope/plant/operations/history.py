@@ -1,11 +1,11 @@
-"""Figures of the whole plant over time: taken every minute, kept in the store.
+"""Plant-wide time series: sampled every minute, kept in the store.
 
-The report of a shift and the trends are made of them. A figure has the name of its kind, and after
-a full stop what it is of: ``power.RECEIVER`` (W), ``state.TRACKING`` and ``state.stale`` (number of
+Shift reports and trends are built from them. The name of a series consists of its kind, a full
+stop, and its subject: ``power.RECEIVER`` (W), ``state.TRACKING`` and ``state.stale`` (number of
 heliostats), ``reading.dni`` (in the unit of the safety table).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 
 import numpy as np
 
@@ -87,19 +87,19 @@ class History:
         self,
         plant: PlantController,
         records: Records | None,
-        now: Callable[[], Mapping[str, float]],
+        now: Callable[[], Awaitable[Mapping[str, float]]],
     ) -> None:
         self._plant, self._records, self._now = plant, records, now
 
     async def run(self) -> None:
         """Work until cancelled."""
         while self._records is not None:
-            self.take(self._records)
+            await self.take(self._records)
             await sleep_until(self._plant.clock, self._plant.now() + EVERY)
 
-    def take(self, records: Records) -> None:
+    async def take(self, records: Records) -> None:
         """Take one row; the minute is missing where the store takes no more, which is alarmed."""
         try:
-            records.record(PlantFigures(self._plant.clock.utc().timestamp(), self._now()))
+            records.record(PlantFigures(self._plant.clock.utc().timestamp(), await self._now()))
         except StoreError:
             return

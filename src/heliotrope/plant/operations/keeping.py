@@ -1,4 +1,4 @@
-"""Records that outlast a restart: sightings, calibrations, visits, heliostats out of service."""
+"""Records that survive a restart: sightings, calibrations, visits, heliostats out of service."""
 
 import functools
 from collections.abc import Sequence

@@ -1,8 +1,9 @@
 """Nightly learning: the hyperparameters of each group, in the background.
 
-They say how far the mirrors of a group differ from the plant file, how their drives drift, and how
-noisy their photographs are. Visits follow the drift by them, and the predicted errors, the schedule
-and the ellipses grow as they say. A person may order it at any time; nothing moves.
+They describe how far the heliostats of a group differ from the plant file, how their drives drift,
+and how noisy their photographs are. Visits use them to follow the drift, and they determine how
+predicted errors, the schedule and the ellipses grow. An operator may start it at any time; no
+heliostat moves.
 """
 
 import json

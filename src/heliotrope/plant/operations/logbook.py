@@ -1,4 +1,4 @@
-"""Alarms, events and packets of a plant at work, for people."""
+"""Alarms, events and packets of a running plant, for display."""
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -40,16 +40,16 @@ class Logbook:
     clock
         Clock of the plant.
     records
-        Store that keeps alarms and events as well; None: none does.
+        Store that also keeps alarms and events; None: no store.
     events, packets
-        Numbers of events and packets held here.
+        Number of events and packets kept in memory.
 
     Attributes
     ----------
     refused
-        Number of unreadable messages of each cluster.
+        Number of unreadable messages from each cluster.
     forward
-        Takes each alarm that begins or ends; None: nobody.
+        Function that takes each alarm raised or cleared; None: no function.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Logbook:
     # -- taking ----------------------------------------------------------------------------
 
     def tapped(self, links: Mapping[str, Link]) -> dict[str, Link]:
-        """Return the links for the plant, which note every message in this book."""
+        """Return the links for the plant, wrapped so that every message is noted in this book."""
         self._links.update(links)
         return {
             name: TappedLink(link, self._clock, _Listener(name, self))
@@ -89,7 +89,7 @@ class Logbook:
         }
 
     def packet(self, cluster: str, way: str, data: bytes) -> None:
-        """Take a message at a link; ``way`` is "to" or "from"."""
+        """Note a message on a link; ``way`` is "to" or "from"."""
         kind = _kind(data)
         if kind in _STEADY:
             self._steady[cluster, way, kind] = self._now(), data
@@ -97,7 +97,7 @@ class Logbook:
             self._packets.append((self._now(), cluster, way, data))
 
     def take_alarm(self, alarm: Alarm) -> None:
-        """Take an alarm of the plant or of a cluster; one that ends by itself becomes an event."""
+        """Take an alarm from the plant or a cluster; one that ends by itself becomes an event."""
         if alarm.condition in _PASSING:
             self.event("plant", alarm.subject, alarm.text)
             return
@@ -124,7 +124,7 @@ class Logbook:
         severity: Severity = Severity.INFO,
         heliostats: Sequence[str] = (),
     ) -> None:
-        """Take an event; see `EventRow`. ``heliostats``: all those that it is about."""
+        """Record an event; see `EventRow`. ``heliostats``: all heliostats that it concerns."""
         number, names = next(self._numbers), tuple(heliostats)
         if len(names) > MOST_NAMED or not all(name in text for name in names):
             self._named[number] = names
@@ -151,7 +151,7 @@ class Logbook:
         self.take_alarm(alarms.RECORD_REFUSED.raised(problem=problem))
 
     def check_records(self, lost: str) -> None:
-        """Raise and end the alarms about the store; ``lost``: why another record was not kept."""
+        """Raise and clear the alarms about the store; ``lost``: why another record was not kept."""
         if self._records is None:
             return
         problem, kind = lost or self._records.problem, alarms.RECORDS
@@ -173,7 +173,7 @@ class Logbook:
         return known is not None and known.active
 
     def acknowledge(self, who: str, condition: str, subject: str) -> None:
-        """Note that a person acknowledged an alarm."""
+        """Note that an operator acknowledged an alarm."""
         known = self._alarms.get((condition, subject))
         if known is not None:
             self._alarms[condition, subject] = replace(known, acknowledged_by=who)
@@ -184,7 +184,7 @@ class Logbook:
 
     @staticmethod
     def is_plain(condition: str) -> bool:
-        """Whether the acknowledgement of an alarm means nothing to the plant."""
+        """Whether acknowledging an alarm has no effect on the plant."""
         return condition in alarms.KINDS and condition not in _UNACKNOWLEDGED + _CONFIRMED
 
     @property
@@ -198,7 +198,7 @@ class Logbook:
         return tuple(rows[:500])
 
     def events(self, limit: int = 200) -> tuple[EventRow, ...]:
-        """Return the last events, newest first."""
+        """Return the latest events, newest first."""
         return tuple(list(self._events)[: -limit - 1 : -1])
 
     def named(self, number: int) -> tuple[str, ...]:
@@ -214,7 +214,7 @@ class Logbook:
         return self._named[number]
 
     def packets(self, limit: int, cluster: str = "") -> tuple[PacketRow, ...]:
-        """Return the last messages, newest first."""
+        """Return the latest messages, newest first."""
         found = [
             (at, name, way, data)
             for (name, way, _), (at, data) in self._steady.items()

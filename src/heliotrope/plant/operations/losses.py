@@ -1,9 +1,10 @@
-"""Losses: heliostats that left the receiver or its standby point without an order of the plant.
+"""Losses: heliostats that left the receiver or their standby point without an order of the plant.
 
-Whether one was ordered off, by a person, a visit, the safety table or automatic control, is asked
-of what the plant has sent (`plant.field.ledger`). A heliostat that lost its cluster, its sun or its
-supply turns away by itself. Automatic control may raise a few such heliostats again. After a loss
-of many it waits for a person: nobody knows what has happened in the field.
+Whether a heliostat was ordered off, by an operator, a visit, the safety table or automatic control,
+follows from the orders that the plant has sent (`plant.field.ledger`). A heliostat that lost its
+cluster, its sun vector or its supply turns away by itself. Automatic control may raise a few such
+heliostats again. After the loss of a large number it waits for an operator, because the cause is
+unknown.
 """
 
 import math

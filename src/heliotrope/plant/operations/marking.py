@@ -1,9 +1,10 @@
-"""Corner markers that a person clicks in a camera's picture, for the perspective of its target.
+"""Corner markers that a user clicks in a camera picture, for the perspective of its target.
 
-`heliotrope camera teach` does the same beside a plant (`imaging.targets.teaching`). Here the camera
-at work takes the new view for its next photograph, and a plant file in the data folder keeps it in
-the form that teaching writes, with dated copies of older ones. The plant's own file stays: the
-program must not be able to change it, and in a simulation its cameras are the true ones.
+`heliotrope camera teach` does the same without a running plant (`imaging.targets.teaching`). Here
+the running camera uses the new view for its next photograph, and a plant file in the data folder
+stores it in the form that teaching writes, with dated copies of older versions. The plant's own
+file is not changed: the program must not be able to change it, and in a simulation its cameras are
+the true ones.
 """
 
 import asyncio

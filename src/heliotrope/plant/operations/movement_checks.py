@@ -1,8 +1,8 @@
-"""The diagnosis of movement on each day, before a heliostat is first raised.
+"""The daily motion diagnosis, before a heliostat is first raised.
 
 A heliostat with a tilt sensor is released at stow (IDLE, where it holds), moves each axis a little
-and back (DIAGNOSE), and is stowed again: a drive that ice holds is found before its step counts
-leave stow. `plant.field.drive_checks` takes the results.
+and back (DIAGNOSE), and is stowed again. A drive blocked by ice is thus found before its step
+counts leave stow. `plant.field.drive_checks` takes the results.
 """
 
 from collections.abc import Callable

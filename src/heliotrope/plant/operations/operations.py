@@ -1,20 +1,19 @@
-"""The plant at work: the one object that a console, an API and the command line talk to.
+"""The running plant: the single object that a console, an API and the command line talk to.
 
-It gives people's commands, and runs automatic control, which raises the field and calibrates it
-with every target's camera. A failure of one part of automatic control becomes an event or an alarm,
-and the rest goes on. Its parts are asked by their names: `viewer` for the field and a heliostat as
-plain values, `logbook` for alarms, events and packets, `automatic` for calibration, plan and
-timetable.
+It executes operator commands, and runs automatic control, which raises the field and calibrates it
+with the camera of every target. A failure in one part of automatic control becomes an event or an
+alarm, and the rest continues. Its parts are accessed by name: `viewer` for the field and a
+heliostat as plain values, `logbook` for alarms, events and packets, `automatic` for calibration,
+plan and timetable.
 
-People's commands go through here so that automatic control knows what they want: a heliostat that a
-person has stowed, defocused or locked stays so until a person gives it back, and one that a person
-has raised and that was lost is left to people.
+Operator commands pass through here so that automatic control knows what operators want: a heliostat
+that an operator has stowed, defocused or locked stays so until an operator gives it back, and a
+heliostat that an operator has raised and that was lost is left to the operators.
 """
 
 import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -26,7 +25,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
-from heliotrope.optics import FluxView, predict_flux
+from heliotrope.optics import FluxView
 from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import ORDERED, EmergencyOrder
@@ -39,6 +38,7 @@ from heliotrope.plant.operations.history import History, figures
 from heliotrope.plant.operations.logbook import MOST_NAMED, Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.operations.predicted_flux import PredictedFlux
 from heliotrope.plant.operations.report import ShiftReport, period, report
 from heliotrope.plant.operations.security import SecurityLog
 from heliotrope.plant.operations.trends import Quantity, Trend, quantities, trend
@@ -53,6 +53,7 @@ from heliotrope.plant.operations.views import (
 from heliotrope.plant.orders.authority import Grant, Person, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Act
 from heliotrope.store.records import NOTE, JournalEntry, JournalQuery, Kind, Records
 
@@ -63,8 +64,6 @@ _TAKES_FROM_AUTOMATIC = messages.having("manual")
 _GIVES_TO_AUTOMATIC = messages.having("automatic")
 
 _DAY = 86_400.0
-#: Time between predictions of the flux, s.
-_FLUX_EVERY = 5.0
 #: Time between looks after the security events, s.
 _LOOKED = 5.0
 #: Time between looks at operations under way, s.
@@ -76,10 +75,10 @@ REFUSED_LINK = "refused link"
 
 
 class Photographer(Protocol):
-    """A source of photographs of targets for people."""
+    """A source of target photographs for display."""
 
     def view(self, target: str) -> CameraView:
-        """Return the last photograph."""
+        """Return the latest photograph."""
         ...
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
@@ -87,43 +86,39 @@ class Photographer(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class _Cached:
-    at: float
-    value: FluxView
-
-
 class Operations:
-    """A plant at work.
+    """A running plant.
 
     Parameters
     ----------
     plant
         The controller; its ``on_alarm`` is ``logbook.take_alarm`` and its links are
-        ``logbook.tapped(links)``. It is run by the owner.
+        ``logbook.tapped(links)``. The owner runs it.
     logbook
         Alarms, events and packets.
     automatic
         Automatic control of the plant.
     cameras
-        Photographs of the targets for people, by name of the target.
+        Photographs of the targets for display, by target name.
     records
-        Store of everything that outlasts a restart; None: nothing is kept.
+        Store of everything that survives a restart; None: nothing is stored.
     extra
-        Returns further rows of the summary, such as the speed of a twin.
+        Function that returns additional rows for the summary, such as the speed of a twin.
     pictures
-        Keeps photographs with their results; None: they are not kept.
+        Stores photographs with their results; None: they are not stored.
     marking
-        Takes views that persons mark; None: there is no camera.
+        Takes views that users mark; None: there is no camera.
+    worker
+        Where computations run; see `Worker`.
 
     Attributes
     ----------
     plant, logbook, automatic, viewer, security, pictures, parameters, approvals, marking
-        See their classes: whoever reads the plant asks them.
+        See their classes; readers access them directly.
     telemetry
-        Folder of the telemetry; None: none is archived.
+        Folder of the telemetry; None: no telemetry is archived.
     begun
-        Set once it works.
+        Event that is set once the plant is running.
     """
 
     def __init__(
@@ -137,6 +132,7 @@ class Operations:
         extra: Callable[[], Mapping[str, Any]] | None = None,
         pictures: Pictures | None = None,
         marking: Marking | None = None,
+        worker: Worker = at_once,
     ) -> None:
         self.plant, self.logbook, self.pictures, self.marking = plant, logbook, pictures, marking
         self.automatic, self._cameras, self._extra = automatic, dict(cameras or {}), extra
@@ -148,13 +144,13 @@ class Operations:
         self.telemetry: Path | None = None
         self._history = History(plant, records, self._figures)
         self._records = records
-        self._flux: dict[str, _Cached] = {}
+        self._flux = PredictedFlux(plant, self.viewer, automatic.installed, worker)
         self._closing, self.begun = asyncio.Event(), asyncio.Event()
 
     # -- running ---------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Work until closed; the plant itself is run by the owner."""
+        """Run until closed; the owner runs the plant controller itself."""
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
         self.approvals.recall()
         self.begun.set()
@@ -186,7 +182,7 @@ class Operations:
             await sleep_until(self.plant.clock, self.plant.now() + _FOLLOWED)
 
     async def close(self) -> None:
-        """End automatic control; beams stay where they are, so stow the field first."""
+        """Stop automatic control; beams stay where they are, so stow the field first."""
         self._closing.set()
 
     # -- the field -------------------------------------------------------------------------
@@ -236,7 +232,7 @@ class Operations:
         )
 
     def why(self, heliostat: str) -> Explanation:
-        """Explain why a heliostat tracks or does not; see `Explanation`.
+        """Explain why a heliostat tracks or not; see `Explanation`.
 
         Raises
         ------
@@ -257,12 +253,12 @@ class Operations:
         return await self._read("journal", lambda records: records.journal(query))
 
     async def report(self, since: float, until: float) -> ShiftReport:
-        """Return the report of a time; see `report.period`.
+        """Return the report for a time span; see `report.period`.
 
         Raises
         ------
         InputError
-            If the plant keeps no records, or the time is not one.
+            If the plant keeps no records, or the time span is invalid.
         """
         name, now = self.plant.design.name, self.plant.clock.utc().timestamp()
         first, last = period(since, until, now)
@@ -287,7 +283,7 @@ class Operations:
     ) -> Trend:
         """Return a quantity of the plant or of a heliostat over time; see `trends.trend`.
 
-        Without an end: until now; without a beginning: the day before it.
+        Without an end: until now; without a start: one day before the end.
         """
         if heliostat:
             self.plant.field.place(heliostat)
@@ -301,14 +297,14 @@ class Operations:
         )
 
     def note(self, person: Person, text: str) -> None:
-        """Keep a person's note, such as one for the next shift, in the journal.
+        """Store an operator's note, such as one for the next shift, in the journal.
 
         Raises
         ------
         RefusedError
             If the person is a viewer.
         InputError
-            If it is empty.
+            If the note is empty.
         """
         _operator(person, "note")
         if not text.strip():
@@ -322,8 +318,8 @@ class Operations:
         await self._records.confirm()
         return await asyncio.to_thread(read, self._records)
 
-    def _figures(self) -> dict[str, float]:
-        power = {name: self.receiver_flux(name).power for name in self.receivers}
+    async def _figures(self) -> dict[str, float]:
+        power = {name: view.power for name, view in (await self._flux.everywhere()).items()}
         return figures(self.viewer.frame(), self.summary(), self.sun(), power)
 
     # -- light -----------------------------------------------------------------------------
@@ -334,8 +330,8 @@ class Operations:
         found = sun.position(at, self.plant.design.site)
         return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
 
-    def receiver_flux(self, name: str = "") -> FluxView:
-        """Return the predicted flux on a receiver ("": the first), made every five seconds.
+    async def receiver_flux(self, name: str = "") -> FluxView:
+        """Return the predicted flux on a receiver ("": the first); see `PredictedFlux`.
 
         Raises
         ------
@@ -345,13 +341,7 @@ class Operations:
         if not name and not self.receivers:
             raise UnknownNameError("receiver", name, self.receivers)
         receiver = self.plant.design.receiver(name or self.receivers[0])
-        now, known = self.plant.now(), self._flux.get(receiver.name)
-        if known is None or now - known.at >= _FLUX_EVERY:
-            view = predict_flux(
-                receiver, *self.viewer.beams(receiver.name), sun=self.plant.sun_vector()
-            )
-            known = self._flux[receiver.name] = _Cached(now, view)
-        return known.value
+        return (await self._flux.everywhere())[receiver.name]
 
     # -- calibration -----------------------------------------------------------------------
 
@@ -377,11 +367,11 @@ class Operations:
         together: Sequence[str] = (),
         receiver: bool = False,
     ) -> Ticket:
-        """Calibrate a heliostat, or only search its beam, on the next free target, before others.
+        """Calibrate a heliostat, or only search for its beam, on the next free target, first.
 
-        With others (``together``) it is calibrated in one joint visit, as soon as all are ready.
-        With ``receiver`` it is measured where it shines, as soon as all track the receiver. The
-        ticket ends with the result of the visit.
+        With other heliostats (``together``) it is calibrated in one joint visit, as soon as all are
+        ready. With ``receiver`` it is measured while it tracks the receiver, as soon as all of them
+        do. The ticket ends with the result of the visit.
 
         Raises
         ------
@@ -416,9 +406,9 @@ class Operations:
         RefusedError
             If the person is a viewer.
         UnknownNameError
-            If no camera looks at it.
+            If no camera covers the target.
         FetchError
-            If its camera gives no frame.
+            If its camera delivers no frame.
         """
         _operator(person, "photograph")
         before = self.camera(target).version
@@ -430,17 +420,17 @@ class Operations:
         return view
 
     def learn(self, person: Person, group: str = "") -> None:
-        """Learn a group of mirrors ("": all) now; see `Learning.order`."""
+        """Learn a heliostat group ("": all) now; see `Learning.order`."""
         self.automatic.learning.order(person, group)
         self._tell(person, f"asked to learn {group or 'all groups'}")
 
     def camera(self, target: str) -> CameraView:
-        """Return the last photograph of a target.
+        """Return the latest photograph of a target.
 
         Raises
         ------
         UnknownNameError
-            If no camera looks at it.
+            If no camera covers the target.
         """
         if target not in self._cameras:
             raise UnknownNameError("target with a camera", target, self._cameras)
@@ -457,11 +447,12 @@ class Operations:
         receivers: Sequence[str] = (),
         tower: bool = False,
     ) -> Ticket:
-        """Lock heliostats, targets, receivers or the tower for a person, with a lock of their own.
+        """Lock heliostats, targets, receivers or the tower with a person's own lock.
 
-        Locked heliostats go to stow, and nobody moves them; so do those whose beams are aimed at a
-        locked target or receiver, and all under a locked tower. What is locked is back in service
-        when everybody has returned their lock. The ticket is done where a heliostat is parked.
+        Locked heliostats go to stow, and nobody moves them; so do heliostats whose beams are aimed
+        at a locked target or receiver, and all heliostats under a locked tower. A locked object
+        returns to service when everyone has removed their lock. The ticket is done for a heliostat
+        once it is parked.
 
         Parameters
         ----------
@@ -472,12 +463,12 @@ class Operations:
         reason
             Why.
         hours
-            Time after which it is expected back; NaN if unknown. It stays locked after it too.
+            Expected time of return to service; NaN if unknown. The lock remains beyond that time.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer or gives no reason.
+            If the person is a viewer or states no reason.
         UnknownNameError
             If there is no such heliostat, target or receiver.
         """
@@ -501,15 +492,15 @@ class Operations:
         owner: str = "",
         reason: str = "",
     ) -> None:
-        """Return a person's own locks; nothing moves.
+        """Remove a person's own locks; no heliostat moves.
 
-        An engineer may remove those of an ``owner`` who cannot, by name and with a reason.
+        An engineer may remove the locks of an ``owner`` who cannot, by name and with a reason.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, has no lock there while others have, or removes another's
-            without being an engineer or without a reason.
+            If the person is a viewer, has no lock where others have one, or removes another
+            person's lock without being an engineer or without a reason.
         UnknownNameError
             If there is no such heliostat, target or receiver.
         """
@@ -560,12 +551,12 @@ class Operations:
     # -- the authority ---------------------------------------------------------------------
 
     def take_authority(self, person: Person) -> Grant:
-        """Take the command authority; automatic control gives way at once.
+        """Take the command authority; automatic control yields at once.
 
         Raises
         ------
         RefusedError
-            If another person has it, or the person is a viewer.
+            If another person holds it, or the person is a viewer.
         """
         _operator(person, "authority")
         self.automatic.give_way()
@@ -574,7 +565,7 @@ class Operations:
         return grant
 
     def seize_authority(self, person: Person, reason: str) -> Grant:
-        """Break another person's command authority and take it.
+        """Take the command authority away from another person.
 
         Raises
         ------
@@ -588,12 +579,12 @@ class Operations:
         return grant
 
     def release_authority(self, person: Person, token: int) -> None:
-        """Give the command authority back; automatic control goes on.
+        """Release the command authority; automatic control continues.
 
         Raises
         ------
         RefusedError
-            If the person does not have it.
+            If the person does not hold it.
         """
         self.plant.release_authority(person, token)
         self._tell(person, "has given the command authority back", "authority")
@@ -637,9 +628,10 @@ class Operations:
         heliostats
             Names; () for all.
         where
-            Receiver or target: the first receiver as the design says, others at their centres.
+            Receiver or target: for the first receiver the aims of the design, for others the
+            centre.
         place
-            Point of the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
+            Point on the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
 
         Raises
         ------
@@ -672,21 +664,21 @@ class Operations:
         return ticket
 
     def stow(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Send heliostats (() for all) to stow; anybody may."""
+        """Send heliostats (() for all) to stow; anyone may order this."""
         ticket = self.plant.stow(person.name, heliostats)
         self._meant("STOW", ticket.heliostats)
         self._told(person, ticket)
         return ticket
 
     def defocus(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Take beams off the receiver; anybody may."""
+        """Move beams off the receiver; anyone may order this."""
         ticket = self.plant.defocus(person.name, heliostats)
         self._meant("DEFOCUS", ticket.heliostats)
         self._told(person, ticket)
         return ticket
 
     def emergency(self, person: Person, act: str = "DEFOCUS", reason: str = "") -> EmergencyOrder:
-        """Order DEFOCUS or STOW of the whole field with proof; anybody may.
+        """Order a field-wide DEFOCUS or STOW with proof; anyone may order this.
 
         Raises
         ------
@@ -703,7 +695,7 @@ class Operations:
         return order
 
     def withdraw(self, person: Person, owner: str = "") -> None:
-        """Withdraw a person's own emergency order, or an ``owner``'s as an engineer.
+        """Withdraw the person's own emergency order, or an ``owner``'s as an engineer.
 
         Raises
         ------
@@ -722,7 +714,7 @@ class Operations:
         Raises
         ------
         RefusedError
-            If the role is too low, or the cause of a latched row has not gone.
+            If the role is too low, or the cause of a latched row persists.
         """
         _operator(person, "acknowledge")
         if not self.logbook.is_plain(condition):
@@ -733,7 +725,7 @@ class Operations:
     def give_back(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
         """Give heliostats (() for all) to automatic control, which raises and calibrates them.
 
-        The ticket is done where a heliostat follows, and says why where it does not.
+        The ticket is done for a heliostat once it follows, and otherwise states why it does not.
 
         Raises
         ------
@@ -748,14 +740,14 @@ class Operations:
         return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)
 
     def resume(self, person: Person) -> None:
-        """Let automatic control go on with its heliostats, after a loss of many or an emergency.
+        """Let automatic control resume with its heliostats, after a large loss or an emergency.
 
-        An emergency whose orders are all withdrawn is acknowledged by it.
+        This also acknowledges an emergency whose orders are all withdrawn.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, an order stands, or something else demands the emergency.
+            If the person is a viewer, an order is active, or something else requires the emergency.
         """
         _operator(person, "resume")
         sentinel = self.plant.sentinel

@@ -1,9 +1,9 @@
-"""The photographs of calibrations, kept with their results: found by heliostat and time.
+"""Calibration photographs, stored with their results and found by heliostat and time.
 
-The pictures lie in a folder as JPEG, one row each in `pictures.sqlite` beside them. They are
-thinned by age, and the folder never grows beyond its limit by more than one visit: the oldest go
-first. A disk that fails costs pictures, never a calibration. The photographs of a coded visit are
-kept once, and found by each of its heliostats.
+The pictures are JPEG files in a folder, with one record each in `pictures.sqlite` beside them. They
+are thinned out by age, and the folder never exceeds its limit by more than one visit; the oldest
+are removed first. A disk failure costs pictures, never a calibration. The photographs of a coded
+visit are stored once, and found under each of its heliostats.
 """
 
 import asyncio

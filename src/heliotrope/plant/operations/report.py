@@ -1,4 +1,4 @@
-"""The report of a shift: what a plant made in a time, what it lacked, and what people did."""
+"""The shift report: what a plant produced in a time span, what was missing, and what people did."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

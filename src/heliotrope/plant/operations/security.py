@@ -1,8 +1,8 @@
-"""Security events of a plant: recorded as events, sent on, and watched for patterns.
+"""Security events of a plant: recorded as events, forwarded, and monitored for patterns.
 
-Anybody can cause any number of some kinds, so those of one kind and person are recorded at most
-`MOST` times in a `SPAN`; the rest are counted, and one event says how many there were. One person's
-events never leave out another's.
+Anyone can cause any number of some kinds of event, so events of one kind and person are recorded at
+most `MOST` times in a `SPAN`; the rest are counted, and one event states the count. The events of
+one person never displace those of another.
 """
 
 from collections import deque
@@ -30,7 +30,7 @@ _LONGEST = 100
 
 
 class SecurityEvent(Enum):
-    """Kinds of security events: words for people, and severity."""
+    """Kinds of security events: display text and severity."""
 
     SIGNED_IN = ("signed in", Severity.INFO)
     SIGN_IN_FAILED = ("failed to sign in", Severity.WARNING)
@@ -59,7 +59,7 @@ class SecurityEvent(Enum):
 
     @property
     def words(self) -> str:
-        """Text for people."""
+        """Display text."""
         return self.value[0]
 
     @property
@@ -128,19 +128,19 @@ class EventCounter:
 
 
 class SecurityLog:
-    """Records security events, and raises alarms about patterns of them; used in the plant's loop.
+    """Records security events, and raises alarms about patterns; used in the plant's event loop.
 
     Parameters
     ----------
     logbook
-        Takes events and alarms.
+        Logbook that takes events and alarms.
     clock
         Clock of the plant.
 
     Attributes
     ----------
     forward
-        Takes each note that is recorded; None: nobody.
+        Function that takes each note that is recorded; None: no function.
     """
 
     def __init__(self, logbook: Logbook, clock: Clock) -> None:
@@ -157,9 +157,9 @@ class SecurityLog:
     def note(
         self, kind: SecurityEvent, who: str = "", address: str = "", detail: str = "", more: int = 0
     ) -> None:
-        """Record an event of a kind, unless there were too many of it lately.
+        """Record an event of a kind, unless there were too many recently.
 
-        A console gives the events that it has counted in their sum, ``more``.
+        A console passes the number of further events that it has counted as ``more``.
         """
         text = _sum_of(more) if more else plain(detail)
         made = SecurityNote(kind, self._utc(), plain(who), plain(address), text)
@@ -169,7 +169,7 @@ class SecurityLog:
             self._record(made)
 
     def close(self) -> None:
-        """Record how many events were counted until now."""
+        """Record how many events were counted so far."""
         self._sum_up(all_=True)
 
     def _sum_up(self, *, all_: bool = False) -> None:
@@ -182,9 +182,9 @@ class SecurityLog:
             self.forward(made)
 
     def look(self, refused_link: str = "") -> None:
-        """End alarms whose causes have ceased; note a link that was refused since the last look.
+        """Clear alarms whose causes have gone; note links refused since the last call.
 
-        Sums of events that were not recorded singly are recorded once their minute is over.
+        Totals of events that were not recorded individually are recorded once their minute is over.
         """
         self._sum_up()
         now = self._clock.monotonic()

@@ -1,4 +1,4 @@
-"""Locks of persons: taking heliostats, targets, receivers and the tower out of service."""
+"""Personal locks: taking heliostats, targets, receivers and the tower out of service."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 

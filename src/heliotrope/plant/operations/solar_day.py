@@ -1,4 +1,4 @@
-"""Days of local mean solar time, to which a prediction of the field's errors belongs."""
+"""Days of local mean solar time, to which the predictions of field errors belong."""
 
 from heliotrope.sun import Site
 

@@ -1,8 +1,8 @@
-"""The timetable of a running plant: calibrations that people want at times of day or at intervals.
+"""The timetable of a running plant: calibrations requested at times of day or at intervals.
 
-An entry that is due asks for its heliostats as a person does, so they come before all that the
-schedule would choose. The timetable of the plant file is in force until a person puts another one
-in force, which outlasts a restart.
+An entry that is due requests its heliostats as an operator does, so they come before all that the
+schedule would choose. The timetable in the plant file is in force until an operator activates
+another one, which survives a restart.
 """
 
 import json

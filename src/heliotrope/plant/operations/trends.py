@@ -1,4 +1,4 @@
-"""Quantities over time: figures of the plant, and what is kept of one heliostat."""
+"""Quantities over time: time series of the plant, and stored data of one heliostat."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
-"""Error parameters that a person sets where a calibration cannot: shown, set, brought back.
+"""Error parameters that an operator enters where calibration is impossible: show, set, restore.
 
-They become a version of the heliostat's calibration without sightings, and are written by the way
-that calibrations take: at rest, where old and new beams are free, compared afterwards. The next fit
-replaces them. Earlier versions come from the store.
+They become a version of the heliostat's calibration without sightings, and are written by the same
+route as calibrations: at rest, where the old and the new beam are clear, and compared afterwards.
+The next fit replaces them. Earlier versions come from the store.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""Two versions of a heliostat's error parameters side by side, and what they change of its beam."""
+"""Comparison of two versions of a heliostat's error parameters and their effect on its beam."""
 
 from dataclasses import dataclass
 

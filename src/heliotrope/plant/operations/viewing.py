@@ -1,4 +1,4 @@
-"""Views of a plant at work: the field as one table, one heliostat, an emergency."""
+"""Views of a running plant: the field as one table, one heliostat, an emergency."""
 
 from typing import Any
 
@@ -105,15 +105,6 @@ class Viewer:
         for k, (center, reach) in enumerate(zip(self._centers, self._reach, strict=True), 1):
             found[on & (np.linalg.norm(aims - center, axis=-1) <= reach)] = k
         return found
-
-    def beams(self, name: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return vertices, aims, areas and errors of the beams on a receiver."""
-        frame = self.frame()
-        rows = np.flatnonzero(frame.on == self.aim_names.index(name))
-        error = np.where(np.isfinite(frame.error), frame.error, self._automatic.installed)[rows]
-        vertices = self._plant.beams.armature.origin_1[rows]
-        area = np.prod(self.sizes[rows], axis=-1)
-        return vertices, self._plant.aims[rows], area, error.astype(np.float64)
 
     def heliostat(self, name: str) -> HeliostatView:
         """Return one heliostat in detail.

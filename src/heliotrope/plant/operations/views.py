@@ -1,4 +1,4 @@
-"""The views that `Operations` gives of a plant at work: plain values that never change."""
+"""The views that `Operations` returns of a running plant: plain, immutable values."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,8 @@
-"""ZERO and LOCK POSITION: the position of one heliostat's axes, as a person declares it.
+"""ZERO and LOCK POSITION: an operator declares the axis positions of one heliostat.
 
-ZERO takes step counts. LOCK POSITION (Malan, table D.1, 0xD4) takes the aim at which the person
-sees the beam: the counts become those that the calibrated mirror would have now, its beam there.
+ZERO takes step counts. LOCK POSITION (Malan, table D.1, 0xD4) takes the aim at which the operator
+sees the beam; the counts become those that the calibrated heliostat would have now with its beam at
+that aim.
 """
 
 import functools
@@ -30,10 +31,10 @@ def zero(
     heliostats: Sequence[str],
     values: Sequence[float],
 ) -> Ticket:
-    """Declare the step counts of the two axes of one heliostat that is locked or has a fault.
+    """Declare the step counts of both axes of one heliostat that is locked or has a fault.
 
-    Nothing moves; its controller stores the counts. It needs an engineer, and the heliostat's key
-    in its cluster.
+    Nothing moves; the local controller stores the counts. This requires an engineer, and the
+    heliostat's key in its cluster.
 
     Parameters
     ----------
@@ -42,16 +43,16 @@ def zero(
     person, token
         The person commanding, and the token of the command authority.
     heliostats
-        The name of one.
+        The name of one heliostat.
     values
         Counts of the primary and the secondary axis, steps.
 
     Raises
     ------
     RefusedError
-        If it is not accepted; nothing is sent then.
+        If it is not accepted; in that case nothing is sent.
     InputError
-        Values that do not fit.
+        If values do not fit.
     UnknownNameError
         If there is no such heliostat.
     """

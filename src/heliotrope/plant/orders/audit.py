@@ -1,13 +1,13 @@
-"""The audit: exactly one record of every accepted command, with who, what, when and the result.
+"""The audit: exactly one record per accepted command, with who, what, when and the result.
 
-A record is begun before its command is sent; a command whose record cannot be begun is not
-sent. DEFOCUS and STOW never wait: they are sent first, and their records are retried until they
-are written. `Audit` is the protocol of a store, and `JsonLines` a store in one file. Both wait for
-their disk: `disk.Disk` keeps that out of the loop.
+A record is begun before its command is sent; if the record cannot be begun, the command is not
+sent. DEFOCUS and STOW never wait: they are sent first, and their records are retried until they are
+written. `Audit` is the protocol of a store, and `JsonLines` is a store in one file. Both wait for
+their disk; `disk.Disk` keeps these waits out of the event loop.
 
-The file holds two lines for each record, "accepted" and "result", both appended and synced to the
-disk. `read` puts them together. A line torn by a loss of power is skipped and counted; a record
-without a result is ended at the next start.
+The file contains two lines per record, "accepted" and "result", both appended and synced to disk.
+`read` combines them. A line left incomplete by a power failure is skipped and counted; a record
+without a result is completed at the next start.
 
 ::
 
@@ -47,9 +47,9 @@ class Record:
     identity
         Unique for all time.
     who, role
-        The person, or the part of the plant, that gave it.
+        The person, or the part of the plant, that gave the command.
     what, values
-        Name of the command and its numbers; where groups have different numbers, see ``note``.
+        Name of the command and its values; if groups have different values, see ``note``.
     heliostats
         Names; () for all.
     at
@@ -57,7 +57,7 @@ class Record:
     note
         Reason or details.
     result, finished
-        The result and its time; "" before.
+        The result and its time; "" until then.
     """
 
     identity: str
@@ -76,7 +76,7 @@ class Audit(Protocol):
     """A store of records."""
 
     def begin(self, record: Record) -> None:
-        """Write a record without a result; it is on the disk when this returns."""
+        """Write a record without a result; it is on disk when this returns."""
         ...
 
     def finish(self, identity: str, result: str, at: str) -> None:
@@ -109,17 +109,17 @@ class Forgetful:
 
 
 class JsonLines:
-    """An audit in one file that only grows, line by line.
+    """An audit in a single append-only file, line by line.
 
-    The lines are a hash chain: each has the digest of its content and of the line before; see
-    `verify`. Lines of earlier programs have none; the first digest covers them all.
+    The lines form a hash chain: each has the digest of its content and of the previous line; see
+    `verify`. Lines from earlier programs have no digest; the first digest covers all of them.
 
     Parameters
     ----------
     path
-        Created if it does not exist. Only one process at a time may hold it.
+        Path, created if it does not exist. Only one process at a time may hold it.
     started
-        UTC, written to records that are ended now because the plant had stopped.
+        UTC, written to records that are completed now because the plant had stopped.
 
     Raises
     ------
@@ -165,7 +165,7 @@ class JsonLines:
         AuditError
             If it could not be written and synced.
         InputError
-            An identity that another record has.
+            If another record has the same identity.
         """
         if record.identity in self._known:
             raise InputError(f"audit: a record {record.identity} exists; identities are unique")
@@ -183,7 +183,7 @@ class JsonLines:
         AuditError
             If it could not be written and synced.
         InputError
-            A record that was not begun, or has a result.
+            If the record was not begun, or has a result.
         """
         if identity not in self._open:
             raise InputError(f"audit: no record {identity} waits for a result")
@@ -192,7 +192,7 @@ class JsonLines:
         self._open.discard(identity)
 
     def confirm(self) -> None:
-        """Check that a record could be written now: the disk syncs and has room.
+        """Check that a record could be written now, that is, the disk syncs and has space.
 
         Raises
         ------

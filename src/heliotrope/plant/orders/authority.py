@@ -1,15 +1,16 @@
-"""Who may command: roles, and the one command authority of the plant.
+"""Who may command: roles, and the plant's single command authority.
 
-One person at a time holds the command authority. With it comes a token of 32 bits, which the plant
-sends to its clusters with every lease, and they to their local controllers: a command with another
-token moves nothing. Each change of holder makes a new token, so that no command of an earlier
-holder that is still under way takes effect. An authority that is not renewed expires; another
-person may break it.
+One person at a time holds the command authority. It comes with a 32-bit token, which the plant
+sends to its clusters with every lease, and the clusters to their local controllers; a command with
+any other token moves nothing. Each change of holder creates a new token, so that no command from an
+earlier holder that is still in transit takes effect. An authority that is not renewed expires;
+another person may also seize it.
 
-A visit works under a `Mandate`, which the holder gives at its beginning and which is valid until
-the visit ends, whoever takes command meanwhile. It is for the heliostats of the visit only, and a
-person's command to one of them takes that one out. Commands under a mandate go out with the present
-token; while nobody holds the authority and a mandate is open, the plant has a token of its own.
+A visit works under a `Mandate`, which the holder grants at its start and which is valid until the
+visit ends, whoever takes command in the meantime. It covers only the heliostats of the visit, and
+an operator's command to one of them removes that heliostat. Commands under a mandate are sent with
+the current token; while nobody holds the authority and a mandate is open, the plant has its own
+token.
 
 DEFOCUS and STOW need no authority, no role and no token.
 """
@@ -40,11 +41,11 @@ __all__ = [
 
 
 class TakenOutError(RefusedError):
-    """The end of a visit whose heliostats orders of others have taken out of it."""
+    """The end of a visit whose heliostats have been removed from it by other orders."""
 
 
 class Role(IntEnum):
-    """The role of a person; a higher role may do all that a lower one may."""
+    """The role of a person; a higher role may do everything that a lower role may."""
 
     VIEWER = 0
     OPERATOR = 1
@@ -64,7 +65,7 @@ class Role(IntEnum):
         }[self]
 
 
-#: Commands of the wire that an operator may give; all others need an engineer.
+#: Bus commands that an operator may give; all others require an engineer.
 OPERATOR_COMMANDS = messages.BY_OPERATORS
 #: Tokens of mandates are above those of the wire, which have 32 bits.
 _MANDATES = 1 << 32
@@ -77,14 +78,14 @@ class Person:
     Parameters
     ----------
     name
-        Name as the audit records it.
+        Name as recorded in the audit.
     role
         See `Role`.
 
     Raises
     ------
     InputError
-        An empty name.
+        If the name is empty.
     """
 
     name: str
@@ -95,12 +96,12 @@ class Person:
             raise InputError("person: the name is empty; the audit must record who commands")
 
     def must_be(self, needed: Role, what: str) -> None:
-        """Refuse a command to a person whose role is too low; ``what`` names the command.
+        """Refuse a command if the person's role is too low; ``what`` names the command.
 
         Raises
         ------
         RefusedError
-            If it is too low.
+            If the role is too low.
         """
         if self.role < needed:
             raise refusals.ROLE_TOO_LOW.error(
@@ -117,7 +118,7 @@ class Grant:
     holder
         The person.
     token
-        1 to 2^32 - 1.
+        Token, 1 to 2^32 - 1.
     since, kept
         When it was taken and last renewed, monotonic s.
     """
@@ -135,17 +136,18 @@ class Mandate:
     Attributes
     ----------
     person
-        The holder of the authority who gave it; commands are recorded under this name.
+        The authority holder who granted it; commands are recorded under this name.
     token
-        Stands for the mandate where a command needs a token; it never goes to a cluster.
+        Token that represents the mandate within the plant; it is never sent to a cluster.
     where
         Name of the surface that the heliostats visit.
     heliostats
-        Names of the heliostats that it is for; those that were taken out are missing.
+        Names of the heliostats that it covers, without those that were removed.
     taken
-        Why others were taken out, by name.
+        Why heliostats were removed, by name.
     blameless
-        Those of them that an order took out which they had not caused: a person's, an emergency.
+        Removed heliostats whose removal they did not cause themselves: by an operator's order or an
+        emergency.
     ended
         Why all commands under it are refused; "" while it is valid.
     """
@@ -161,9 +163,9 @@ class Mandate:
     def take_out(
         self, heliostats: Iterable[str], why: str, *, fault: bool = False
     ) -> tuple[str, ...]:
-        """Take heliostats out for a reason ``why``; return those that were in it.
+        """Remove heliostats for a reason ``why``; return those that were covered.
 
-        With ``fault`` the heliostats have caused the order themselves.
+        With ``fault`` the heliostats caused the order themselves.
         """
         names = tuple(name for name in heliostats if name in self.heliostats)
         self.heliostats.difference_update(names)
@@ -186,14 +188,14 @@ class Mandate:
 
 
 class Authority:
-    """The one command authority of a plant.
+    """The plant's single command authority.
 
     Parameters
     ----------
     clock
         Clock of the plant.
     lifetime
-        Life of the authority without renewal, s.
+        Lifetime of the authority without renewal, s.
     entropy
         Source of random bytes for the tokens.
 
@@ -202,12 +204,12 @@ class Authority:
     lifetime
         As given.
     changed_at
-        When `token` last changed, monotonic s: clusters hear of it within a second.
+        When `token` last changed, monotonic s; clusters learn of it within a second.
 
     Raises
     ------
     InputError
-        A lifetime that is not above 0.
+        If the lifetime is not above 0.
     """
 
     def __init__(
@@ -233,7 +235,7 @@ class Authority:
 
     @property
     def grant(self) -> Grant | None:
-        """The present holder's grant, None if nobody has the authority."""
+        """The present holder's grant, None if nobody holds the authority."""
         grant = self._grant
         if grant is not None and not self._clock.monotonic() - grant.kept < self.lifetime:
             self._give_up()
@@ -241,7 +243,7 @@ class Authority:
 
     @property
     def token(self) -> int:
-        """The token that clusters accept commands with; 0: they accept none.
+        """The token with which clusters accept commands; 0: they accept no commands.
 
         It is 0 while nobody holds the authority and no mandate is open.
         """
@@ -252,17 +254,17 @@ class Authority:
     def silent_for(self) -> float:
         """Time since any authority was last renewed, or since the plant began, s.
 
-        While a mandate is open the plant commands by itself, and it is 0.
+        It is 0 while a mandate is open, because the plant then commands by itself.
         """
         return 0.0 if self._mandates else self._clock.monotonic() - self._last_kept
 
     def take(self, person: Person) -> Grant:
-        """Take the authority if nobody has it; its holder renews it.
+        """Take the authority if nobody holds it; if the person already holds it, renew it.
 
         Raises
         ------
         RefusedError
-            For a viewer, or if another person has it.
+            If the person is a viewer, or another person holds it.
         """
         grant = self.grant
         person.must_be(Role.OPERATOR, "command authority")
@@ -274,12 +276,12 @@ class Authority:
         return self.keep(person, grant.token)
 
     def seize(self, person: Person, reason: str) -> Grant:
-        """Break another person's authority and take it; the audit needs a reason.
+        """Take the authority away from another person; the audit requires a reason.
 
         Raises
         ------
         RefusedError
-            For a viewer, without a reason, or if the holder has a higher role.
+            If the person is a viewer, there is no reason, or the holder has a higher role.
         """
         grant = self.grant
         person.must_be(Role.OPERATOR, "command authority")
@@ -300,7 +302,7 @@ class Authority:
         Raises
         ------
         RefusedError
-            If the person does not have it, or has lost it.
+            If the person does not hold it, or has lost it.
         """
         grant = self._checked(person, token)
         self._last_kept = self._clock.monotonic()
@@ -308,12 +310,12 @@ class Authority:
         return grant
 
     def release(self, person: Person, token: int) -> None:
-        """Give the authority back.
+        """Release the authority.
 
         Raises
         ------
         RefusedError
-            If the person does not have it.
+            If the person does not hold it.
         """
         self._checked(person, token)
         self._give_up()
@@ -324,7 +326,7 @@ class Authority:
         Raises
         ------
         RefusedError
-            If the role is too low, or the person has neither the authority nor a mandate.
+            If the role is too low, or the person holds neither the authority nor a mandate.
         """
         needed = Role.OPERATOR if command in OPERATOR_COMMANDS else Role.ENGINEER
         person.must_be(needed, command)
@@ -340,7 +342,7 @@ class Authority:
     def mandate(
         self, person: Person, token: int, heliostats: Sequence[str], where: str
     ) -> Iterator[Mandate]:
-        """Give a mandate for the time of a visit.
+        """Grant a mandate for the duration of a visit.
 
         Parameters
         ----------
@@ -352,9 +354,9 @@ class Authority:
         Raises
         ------
         RefusedError
-            If the role is too low, or the person does not have the authority.
+            If the role is too low, or the person does not hold the authority.
         TakenOutError
-            If the visit is refused and orders of others have left it no heliostat.
+            If the visit is refused because other orders have left it no heliostat.
         """
         person.must_be(Role.ENGINEER, "visit")
         self.keep(person, token)
@@ -374,7 +376,7 @@ class Authority:
                 self._own, self._last_kept = 0, self._clock.monotonic()
 
     def mandate_of(self, token: int) -> Mandate | None:
-        """Return the open mandate of a token, None if there is none."""
+        """Return the open mandate for a token, None if there is none."""
         return self._mandates.get(token)
 
     def visited(self) -> dict[str, Mandate]:
@@ -382,17 +384,17 @@ class Authority:
         return {name: each for each in self._mandates.values() for name in each.heliostats}
 
     def taken_out(self, where: str) -> frozenset[str]:
-        """Return the heliostats that orders have taken out of the visit to a surface."""
+        """Return the heliostats that orders have removed from the visit to a surface."""
         here = (each.taken for each in self._mandates.values() if each.where == where)
         return frozenset(name for taken in here for name in taken)
 
     def prevail(self, heliostats: Sequence[str], why: str, *, fault: bool = False) -> None:
-        """Take heliostats out of the visits that they are in; see `Mandate.take_out`."""
+        """Remove heliostats from their visits; see `Mandate.take_out`."""
         for each in self._mandates.values():
             each.take_out(heliostats, why, fault=fault)
 
     def end_mandates(self, person: Person, why: str) -> None:
-        """End the mandates that a person gave; their visits take the beams off."""
+        """End the mandates that a person granted; their visits move the beams off."""
         for each in self._mandates.values():
             if each.person == person:
                 each.ended = why
@@ -408,9 +410,10 @@ class Authority:
         return frozenset() if token == self.token else frozenset(heliostats)
 
     def left(self, token: int, heliostats: Iterable[str]) -> frozenset[str]:
-        """Return the heliostats that no mandate holds any more under a token.
+        """Return the heliostats that no mandate covers any longer under a token.
 
-        Those of a visit that is told to end are still its own: it takes their beams off.
+        A visit that has been told to end still keeps its heliostats, because it moves their beams
+        off.
         """
         mandate = self._mandates.get(token)
         if mandate is None:
@@ -418,9 +421,9 @@ class Authority:
         return frozenset(heliostats) - mandate.heliostats
 
     def present(self, token: int) -> int:
-        """Return the token that goes to the clusters; 0 if a mandate is over.
+        """Return the token to send to the clusters; 0 if a mandate has ended.
 
-        A mandate's commands go with the present token.
+        Commands under a mandate are sent with the current token.
         """
         if token < _MANDATES:
             return token

@@ -1,4 +1,4 @@
-"""Commands of people: permitted, proven, recorded, and sent, at once or when their turn comes."""
+"""Operator commands: authorised, proven, recorded, and sent, at once or in turn."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The sending of heliostats that wait in a queue, once their turn has come."""
+"""Sends the commands of queued heliostats when their turn comes."""
 
 from collections import deque
 from collections.abc import Callable

@@ -1,8 +1,8 @@
-"""Giving back what visits have taken: moved aims, locks and fine steps, once no visit holds them.
+"""Restores what visits have taken (moved aims, locks and fine steps) once no visit holds it.
 
-A visit gives back what it took. Whatever is left when it ends, or when a person's order takes a
-heliostat out of it, the plant gives back itself, under whatever command authority there is, as soon
-as motions are accepted.
+A visit restores what it took. Whatever is left when it ends, or when an operator's order removes a
+heliostat from it, the plant restores itself, under whatever command authority exists, as soon as
+motions are accepted.
 """
 
 from collections.abc import Callable, Mapping, Sequence

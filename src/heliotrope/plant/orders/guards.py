@@ -1,9 +1,9 @@
 """Guards: why heliostats may not be given a command, as one table.
 
-A row names the refusal, the commands that it stops, and the check that gives each heliostat's
-reason. The table is evaluated when a command is accepted, when its record is written, and when its
-turn comes; of several reasons, the first row's is given. Where the beams may go is proven after
-that: see `PathProofs`.
+Each entry names the refusal, the commands that it blocks, and the check that returns the reason per
+heliostat. The table is evaluated when a command is accepted, when its record is written, and when
+its turn comes; of several reasons, the first in the table is reported. Whether the beams may go
+there is proven after that: see `PathProofs`.
 """
 
 from collections.abc import Callable, Iterable, Sequence

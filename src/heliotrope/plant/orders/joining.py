@@ -1,7 +1,8 @@
-"""The queue of heliostats that join the receiver, at a bounded rate and after a bounded wait.
+"""The queue of heliostats that join the receiver, with a limited rate and a limited wait.
 
-An APPROACH of many waits in it too: the proof of 10,000 ways from stow takes 0.6 s, in which no
-lease could be renewed. So they go in slices, one a beat.
+An APPROACH of a large number of heliostats is queued too, because the proof of 10,000 paths from
+stow takes 0.6 s, in which no lease could be renewed. It is therefore processed in slices, one per
+beat.
 """
 
 from collections import deque

@@ -1,8 +1,8 @@
 """The audit and the assigned points in the plant's store.
 
-`KeptAudit` is an `audit.Audit`, `KeptPoints` an `assigned.Assigned`, both on a `store.Keeper`. They
-wait for the disk, so a plant uses them in the thread of its `disk.Disk`. `KeptAudit.confirm` does
-not wait: it relies on the store's last answer.
+`KeptAudit` is an `audit.Audit`, `KeptPoints` an `assigned.Assigned`, both based on a
+`store.Keeper`. They wait for the disk, so a plant uses them in the thread of its `disk.Disk`.
+`KeptAudit.confirm` does not wait; it relies on the last result from the store.
 """
 
 import math

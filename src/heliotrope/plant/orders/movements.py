@@ -1,10 +1,10 @@
-"""Aims that visits have moved, and the aims to which the beams go back.
+"""Aims that visits have moved, and the aims to which the beams return.
 
-A receiver visit moves beams by a milliradian; a visit to a target gives heliostats an
-aim there. So that they come back whatever becomes of the visit, the plant itself sends each beam
-back to its aim (`giving_back`): when the visit says so, when a small movement was not renewed for a
-while, and when the mandate or the command authority under which it was moved is over. That needs a
-command authority, for clusters obey nobody else.
+A receiver visit moves beams by a milliradian; a visit to a target gives heliostats an aim there. So
+that the beams return whatever happens to the visit, the plant itself sends each beam back to its
+aim (`giving_back`): when the visit requests it, when a small movement has not been renewed for a
+while, and when the mandate or the command authority under which it was moved has ended. That
+requires a command authority, because clusters accept no other commands.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Parameters of local controllers: compared with the wanted ones at connection, then pushed."""
+"""Parameters of local controllers: compared with the wanted ones on connection, then sent."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Accepted commands under way: their records, their messages, and their results."""
+"""Accepted commands in progress: their records, their messages, and their results."""
 
 import struct
 from collections import deque

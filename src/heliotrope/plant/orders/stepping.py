@@ -1,9 +1,10 @@
-"""Fine steps for a measurement, and rough steps again after it.
+"""Fine steps for a measurement, and coarse steps again afterwards.
 
-Motors whose drivers rest stop at full steps only (ROUGH), too coarse to measure by: for the time of
-a visit they take microsteps. So that they step roughly again whatever becomes of the visit, the
-plant itself orders both: fine steps while a visit needs them, rough ones as soon as none does and
-motions are accepted. That needs somebody's command authority, for clusters obey nobody else.
+Motors whose drivers switch off at rest stop only at full steps (ROUGH), which are too coarse for
+measurements, so they use microsteps for the duration of a visit. So that they return to coarse
+steps whatever happens to the visit, the plant itself orders both: fine steps while a visit needs
+them, coarse steps as soon as no visit does and motions are accepted. That requires a command
+authority, because clusters accept no other commands.
 """
 
 from collections import Counter

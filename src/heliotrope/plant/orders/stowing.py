@@ -1,7 +1,8 @@
-"""The queue of an ordinary STOW of many heliostats: they go one after the other, not all at once.
+"""The queue for an ordinary STOW of many heliostats, which start one after the other.
 
-As STOW ALL of Malan's controller (thesis, table D.1, 0xD9), it spares the supply the current of all
-drives that start together. Emergencies, the safety table and lost leases never wait here.
+Like STOW ALL of Malan's controller (thesis, table D.1, 0xD9), it protects the power supply from the
+current of all drives starting together. Emergencies, the safety table and expired leases never wait
+here.
 """
 
 from collections.abc import Collection, Iterable

@@ -30,21 +30,22 @@ class Ticket:
     Attributes
     ----------
     identity
-        Identity of its record in the audit.
+        Identity of its audit record.
     name, heliostats
         The command and its heliostats.
     refusals
         Reasons why it was refused or failed, by heliostat.
     blocked
-        Those of the reasons for which the plant has not sent it.
+        The subset of these reasons for which the plant has not sent the command.
     steps
-        What each heliostat of an operation does or waits for now, or its result; none of a command.
+        What each heliostat of an operation is doing or waiting for now, or its result; empty for a
+        command.
     accepted_at
         Monotonic s.
     recorded
-        Whether its record was on the disk before it was sent; False for DEFOCUS and STOW.
+        Whether its record was on disk before it was sent; False for DEFOCUS and STOW.
     sent
-        Whether a message of it has left the plant.
+        Whether a message with the command has left the plant.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class Ticket:
         self._news = asyncio.Event()
 
     def record(self) -> None:
-        """Note that its record is on the disk."""
+        """Note that its record is on disk."""
         self.recorded = True
         self._news.set()
 
@@ -72,7 +73,7 @@ class Ticket:
         return f"<Ticket {self.identity} {self.text}>"
 
     def advance(self, heliostats: Iterable[str], stage: Stage, text: str = "") -> None:
-        """Note a stage that heliostats have reached; it never goes back, and a final one stays."""
+        """Note a stage that heliostats have reached; stages never go back; a final one stays."""
         rank = RANK[stage]
         rows = [self._row[name] for name in heliostats if name in self._row]
         if not rows:
@@ -89,7 +90,7 @@ class Ticket:
             self._news.set()
 
     def step(self, texts: Mapping[str, str], stage: Stage | None) -> None:
-        """Note what heliostats do or wait for, by name, and their stage; None: no new one."""
+        """Note what heliostats do or wait for, by name, and their stage; None: unchanged."""
         self.steps.update(texts)
         if stage is None:
             return
@@ -109,7 +110,7 @@ class Ticket:
         self._until[np.array(rows, dtype=np.intp)] = until
 
     def expire(self, now: float) -> None:
-        """End the ticket for heliostats that have not answered in time."""
+        """End the ticket for heliostats that have not replied in time."""
         late = np.flatnonzero((self._stage < FINAL) & (now >= self._until))
         for i in late:
             acknowledged = self._stage[i] == RANK[Stage.ACKNOWLEDGED]
@@ -121,7 +122,7 @@ class Ticket:
             self.advance([self.heliostats[i]], Stage.FAILED, text)
 
     def waiting(self, heliostats: Iterable[str]) -> tuple[str, ...]:
-        """Return those of some heliostats that have not ended."""
+        """Return which of some heliostats have not ended."""
         return tuple(name for name in heliostats if self._stage[self._row[name]] < FINAL)
 
     def unacknowledged(self) -> tuple[str, ...]:
@@ -144,14 +145,14 @@ class Ticket:
         return _STAGES.get(int(self._stage[self._row[heliostat]]))
 
     def counted(self) -> dict[str, int]:
-        """Return the number of heliostats at each stage; "waiting" means in the plant."""
+        """Return the number of heliostats at each stage; "waiting" means queued in the plant."""
         found = np.bincount(self._stage, minlength=FINAL + 3)
         words = ("waiting", *(stage.value for stage in RANK))
         return {word: int(n) for word, n in zip(words, found, strict=True) if n}
 
     @property
     def text(self) -> str:
-        """One line: the number at each stage, and the reasons of most heliostats."""
+        """One line: the number at each stage, and the most frequent reasons."""
         parts = ", ".join(f"{n} {word}" for word, n in self.counted().items())
         left = self.waiting(self.steps)
         # The results of those that are done are said once nothing else is to be said.
@@ -166,7 +167,7 @@ class Ticket:
         stage
             ACCEPTED to DONE.
         timeout
-            s, by the plant's clock; False when it expires.
+            s, by the plant's clock; returns False when it expires.
         """
         until = self._clock.monotonic() + timeout
         while not (self._stage >= RANK[stage]).all():
@@ -178,9 +179,9 @@ class Ticket:
         return bool((self._stage <= FINAL).all())
 
     async def written(self, timeout: float) -> bool:
-        """Wait until its record is on the disk, or it has ended without one; return which.
+        """Wait until its record is on disk, or it has ended without one; return which.
 
-        ``timeout`` is in s, by the plant's clock; False when it expires.
+        ``timeout`` is in s, by the plant's clock; returns False when it expires.
         """
         until = self._clock.monotonic() + timeout
         while not (self.recorded or self.finished):

@@ -1,7 +1,7 @@
-"""Points that were given to local controllers, and whether they were taken.
+"""Points that were sent to local controllers, and whether they were accepted.
 
 The plant proves and records a point before it is sent, and counts on it once it is sent. A local
-controller that is busy refuses it, and goes on with the one before.
+controller that is busy refuses it, and continues with the previous point.
 """
 
 from collections.abc import Sequence

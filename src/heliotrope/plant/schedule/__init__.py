@@ -1,8 +1,8 @@
-"""The schedule of calibration: which heliostat is photographed next, on which target.
+"""The calibration schedule: which heliostat is photographed next, on which target.
 
-Begin with `Scheduler`: it decides from time, sun and states alone, so days are tried out in
-seconds. `PlantSchedule` runs it in a plant at work. `knowledge` holds the expected error of each
-heliostat, and `choice` finds the best visit of a moment.
+Begin with `Scheduler`: it decides from time, sun vector and states alone, so that whole days can be
+simulated in seconds. `PlantSchedule` runs it in a running plant. `knowledge` holds the expected
+error of each heliostat, and `choice` finds the best visit at a given moment.
 """
 
 from heliotrope.plant.schedule.choice import Assignment

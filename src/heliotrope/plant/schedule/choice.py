@@ -1,7 +1,7 @@
-"""The best visit of a moment: all heliostats screened by bounds, the best of them judged exactly.
+"""The best visit at a moment: all heliostats screened by bounds, the best judged exactly.
 
-Screening looks only at angles, as if each mirror turned about its foot. The candidates are judged
-in the order of their bounds, including shading and blocking by neighbours.
+Screening considers only angles, as if each mirror rotated about its foot. The candidates are then
+judged in the order of their bounds, including shading and blocking by neighbours.
 """
 
 from collections.abc import Sequence
@@ -43,17 +43,17 @@ class Assignment:
     heliostat, target
         Names.
     at, until
-        Beginning and expected end, POSIX s.
+        Start and expected end, POSIX s.
     before, after
-        Expected beam error over the year before and after it, rad RMS (2-D).
+        Expected beam error over the year before and after the visit, rad RMS (2-D).
     predicted
         Expected beam error at the photograph, including the camera's noise, rad RMS (2-D).
     seen
-        Chance that the beam is wholly on the target at the first look.
+        Probability that the beam is completely on the target in the first photograph.
     overdue
-        Whether it was chosen for its age and not for its gain.
+        Whether it was chosen because of its age and not because of its gain.
     reason
-        Why it was chosen, for people.
+        Why it was chosen, for display.
     """
 
     heliostat: str

@@ -1,9 +1,10 @@
-"""Knowledge of the heliostats of a plant, and its decay with time.
+"""Knowledge about the heliostats of a plant, and its decay with time.
 
 The covariance of a heliostat's parameters is that of its calibration, or of the priors before the
-first. The zeros of the drives drift, so the covariance grows with the time since the calibration.
-The effect of parameter errors on the beam over the year is a quadratic form that changes slowly
-over the field: it is computed for a sample of heliostats; the others take it from the nearest.
+first calibration. The zeros of the drives drift, so the covariance grows with the time since the
+calibration. The effect of parameter errors on the beam over the year is a quadratic form that
+varies slowly over the field: it is computed for a sample of heliostats, and all others use that of
+the nearest sample.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,6 @@
-"""The schedule of a running plant: time, sun and states from the controller, results back.
+"""The schedule of a running plant: time, sun vector and states from the controller, results back.
 
-It is the `Scheduling` of automatic control.
+It implements `Scheduling` for automatic control.
 """
 
 from collections.abc import Iterator, Sequence
@@ -39,7 +39,7 @@ class _Ready:
 
 
 def settings_for(cycle: CycleSettings, settings: Settings | None = None) -> Settings:
-    """Return settings of a schedule whose visits are those of a calibration cycle."""
+    """Return schedule settings whose visits match those of a calibration cycle."""
     return replace(
         settings or Settings(),
         model=cycle.first_model,
@@ -55,9 +55,10 @@ class PlantSchedule:
     Parameters
     ----------
     plant
-        Source of time, sun and states; the schedule learns each calibration of its `beliefs`.
+        Source of time, sun vector and states; the schedule takes each calibration from its
+        `beliefs`.
     scheduler
-        With the ``names`` of ``plant.field``.
+        Scheduler with the ``names`` of ``plant.field``.
 
     Attributes
     ----------
@@ -114,7 +115,7 @@ class PlantSchedule:
         return self.scheduler.reason
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[PlannedVisit]:
-        """Return the coming visits; a new plan grows at each call while the old one is shown."""
+        """Return the planned visits; each call extends a new plan while the old one is shown."""
         now = self._plant.now()
         if self._coming is None and now - self._made >= REPLAN:
             self._draft = []
@@ -145,7 +146,7 @@ class PlantSchedule:
         )
 
     def shone(self, mirrors: int, lit: int, seconds: float) -> None:
-        """Take the time of a receiver visit, in which some of the mirrors lit there took part."""
+        """Record the time of a receiver visit, in which some of the heliostats on it took part."""
         self.scheduler.receiver_visits.append(ReceiverVisitTime(mirrors, lit, seconds))
 
     def _states(self, ready: npt.NDArray[np.bool_]) -> _Ready:

@@ -1,7 +1,7 @@
-"""Predicts the errors of the field for the rest of a day, from the schedule's knowledge.
+"""Predicts the field errors for the rest of a day, from the schedule's knowledge.
 
-The prediction is a plan as of `calibration.plan.plan_commission`, with the visits of the schedule:
-their times, the accuracy of a photograph, the least gain, and the goal.
+The prediction is a plan as from `calibration.plan.plan_commission`, with the schedule's own visit
+times, photograph accuracy, minimum gain and goal.
 """
 
 from collections.abc import Sequence

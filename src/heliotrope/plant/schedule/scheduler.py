@@ -1,12 +1,12 @@
-"""The schedule of calibration: which heliostat is photographed next, on which target.
+"""The calibration schedule: which heliostat is photographed next, on which target.
 
-A decision has two steps. All heliostats are screened by angles and by the most that a visit could
-bring: the whole of their expected squared beam error, over the time of a visit. In the order of
-this bound they are judged exactly, a chunk at a time: stops, the way of the drives, shading,
-blocking, and by how much the error would fall. The decision is made when no bound is above the best
-value found. Heliostats that have waited too long for a calibration come first.
+A decision has two steps. All heliostats are screened by angles and by an upper bound on the gain of
+a visit: the whole of their expected squared beam error, divided by the duration of a visit. In the
+order of this bound they are judged exactly, a chunk at a time, considering stops, the travel of the
+drives, shading, blocking, and by how much the error would fall. The decision is made when no bound
+exceeds the best value found. Heliostats that have waited too long for a calibration come first.
 
-Nothing here reads a clock or moves a mirror: time, sun and states are arguments.
+This module reads no clock and moves no heliostat: time, sun vector and states are arguments.
 """
 
 from collections import deque
@@ -75,12 +75,12 @@ class Visited:
     calibrated
         Whether the heliostat has a new calibration.
     measured
-        Beam error of the photographs of this visit under the calibration before it, rad RMS (2-D);
+        Beam error in the photographs of this visit under the previous calibration, rad RMS (2-D);
         NaN if none could be used.
     text
-        The same for people.
+        The same for display.
     together
-        Whether it was on the target together with others.
+        Whether it was on the target together with other heliostats.
     """
 
     heliostat: str
@@ -112,16 +112,16 @@ class Comparison:
     Attributes
     ----------
     visits, calibrated
-        Number of visits, and number of those that brought a new calibration.
+        Number of visits, and number of visits that produced a new calibration.
     measured, predicted
-        Beam error found at the photographs, and expected there, rad RMS (2-D), over visits with
+        Beam error measured in the photographs, and expected there, rad RMS (2-D), over visits with
         both; NaN if there are none.
     longer
-        Mean time of a visit alone, as a share of the expected time; NaN without visits.
+        Mean duration of a single visit, as a fraction of the expected duration; NaN without visits.
     surprises
         Heliostats found more than `SURPRISE` times as far off as expected.
     alone
-        Number of visits of one heliostat, and number of those that brought a new calibration.
+        Number of single visits, and number of those that produced a new calibration.
     joint_visits
         Joint visits.
     """
@@ -142,7 +142,7 @@ class Comparison:
 
     @property
     def pace(self) -> float:
-        """Mean time for each calibration alone, as a share of the expected time of a visit.
+        """Mean time per single calibration, as a fraction of the expected visit duration.
 
         NaN before there are `ENOUGH` visits.
         """
@@ -165,7 +165,7 @@ class Comparison:
 
 
 def compare(finished: Iterable[Finished]) -> Comparison:
-    """Compare finished visits with what was expected of them."""
+    """Compare finished visits with their expected results."""
     made = list(finished)
     both = [f for f in made if np.isfinite(f.visited.measured)]
     nan = float("nan")
@@ -205,7 +205,7 @@ class States(Protocol):
 
     @property
     def state(self) -> npt.NDArray[np.uint8]:
-        """States of `lcu.states`, any other number where unknown, (N,)."""
+        """States from `lcu.states`, any other number if unknown, (N,)."""
         ...
 
     @property
@@ -224,31 +224,32 @@ class Scheduler:
     settings
         See `Settings`.
     now
-        Beginning: the age of uncalibrated heliostats counts from here, and its year gives the suns.
+        Start time: the age of uncalibrated heliostats counts from here, and its year determines the
+        sun positions.
     names
-        Order of the heliostats in `States`; default that of the design.
+        Order of the heliostats in `States`; by default that of the design.
 
     Attributes
     ----------
     names
         The heliostats.
     reason
-        Why the last decision was as it was, or why there was none.
+        Why the last decision was made, or why there was none.
     running
-        Assignments under way, by heliostat.
+        Assignments in progress, by heliostat.
     finished
-        The last visits, each with its assignment.
+        The latest visits, each with its assignment.
     receiver_visits
-        The last receiver visits; they are not chosen here.
+        The latest receiver visits, which are not chosen here.
     attempts
-        Visits that failed, by heliostat; in POSIX s.
+        Failed visits, by heliostat; in POSIX s.
 
     Raises
     ------
     InputError
-        No target, names that are not those of the design, or a time without zone.
+        If there is no target, the names are not those of the design, or a time has no time zone.
     UnknownNameError
-        A model that the mechanisms do not have.
+        If the mechanisms do not have the model.
     """
 
     def __init__(
@@ -285,7 +286,7 @@ class Scheduler:
         return np.asarray(np.sqrt(self._known.squares(_unix(now_utc))))
 
     def age(self, now_utc: datetime) -> FloatArray:
-        """Return the time since the last calibration, or since the beginning, s, (N,)."""
+        """Return the time since the last calibration, or since the start, s, (N,)."""
         return self._known.ages(_unix(now_utc))
 
     def learn(self, record: HeliostatCalibration) -> None:
@@ -312,10 +313,10 @@ class Scheduler:
         self._known.grow_as(self._find(record.heliostat), record.growth)
 
     def observe(self, heliostat: str, error: float, now_utc: datetime) -> bool:
-        """Take a beam error seen in operation, rad; return whether it is a surprise.
+        """Take a beam error observed in operation, rad; return whether it is a surprise.
 
-        An error above `SURPRISE` times the expected one means that the heliostat has changed: its
-        expected error becomes the one seen.
+        An error above `SURPRISE` times the expected error means that the heliostat has changed; its
+        expected error is then set to the observed one.
 
         Raises
         ------
@@ -345,20 +346,20 @@ class Scheduler:
         holds: Collection[str] = (),
         weather: Weather | None = None,
     ) -> Assignment | None:
-        """Return the next assignment, and note it as under way; None if none is due, see `reason`.
+        """Return the next assignment, noted as in progress; None if none is due, see `reason`.
 
-        Call `done` or `cancel` when it has ended, after `learn` if it gave a new calibration.
+        Call `done` or `cancel` when it has ended, after `learn` if it produced a new calibration.
 
         Parameters
         ----------
         now_utc, sun
-            Time, and the unit vector to the sun, ENU, (3,).
+            Time, and sun vector, ENU, (3,).
         states
             States of the field.
         free_targets
             Targets without a beam, each with a camera that is ready.
         holds
-            Heliostats to leave alone.
+            Heliostats to leave out.
         weather
             Weather, as far as it is measured.
 
@@ -431,7 +432,7 @@ class Scheduler:
         return finished
 
     def cancel(self, heliostat: str) -> None:
-        """Forget an assignment that did not begin, or failed through no fault of the heliostat."""
+        """Discard an assignment that did not begin, or failed through no fault of the heliostat."""
         self.running.pop(heliostat, None)
         self._slopes.pop(heliostat, None)
 
@@ -488,16 +489,16 @@ class Scheduler:
         holds: Collection[str] = (),
         most: int = 20,
     ) -> list[Assignment]:
-        """Return the next visits, if the sky stays clear and each yields what is expected.
+        """Return the next visits, if the sky stays clear and each has the expected result.
 
         Parameters
         ----------
         now_utc, horizon
-            Beginning and length of the plan.
+            Start and length of the plan.
         states, holds
             As for `next`; None: all heliostats are ready.
         most
-            Longest plan, visits: each takes as long as a decision.
+            Maximum number of visits in the plan; each takes as long as a decision.
         """
         coming = self.upcoming(now_utc, horizon, states, holds)
         return list(islice((assignment for assignment in coming if assignment is not None), most))
@@ -509,7 +510,7 @@ class Scheduler:
         states: States | None = None,
         holds: Collection[str] = (),
     ) -> Iterator[Assignment | None]:
-        """Yield the visits of `plan`, None in between: each step is one decision at most."""
+        """Yield the visits of `plan`, and None in between; each step is at most one decision."""
         now = _unix(now_utc)
         end, known = now + horizon.total_seconds(), self._known.copy()
         judge = self._judge.of(known)

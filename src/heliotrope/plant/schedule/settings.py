@@ -1,4 +1,4 @@
-"""Settings of the schedule, and the weather that prevents photographs."""
+"""Settings of the schedule, and the weather limits for photographs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,14 +13,14 @@ from heliotrope.geometry import FloatArray
 
 @dataclass(frozen=True)
 class Weather:
-    """Weather that prevents photographs; NaN where it is not measured.
+    """Weather that may prevent photographs; NaN where it is not measured.
 
     Attributes
     ----------
     dni
         Direct normal irradiance, W/m².
     wind
-        m/s.
+        Wind speed, m/s.
     """
 
     dni: float = float("nan")
@@ -38,29 +38,29 @@ class Settings:
     Attributes
     ----------
     model, priors
-        Parameters that are learnt, and standard deviations that replace the table's.
+        Parameters that are learnt, and standard deviations that replace those of the table.
     limits
-        Limits of the sun, the incidence and the obliquity.
+        Limits on the sun elevation, the incidence and the obliquity.
     shots, interval, sigma
-        Photographs of a visit, s between them, and the standard deviation of a beam, rad.
+        Number of photographs per visit, s between them, and the standard deviation of a beam, rad.
     settle
-        Further time of a visit, s: until the mirror stands still, answers, parameters.
+        Additional time of a visit, s: until the heliostat is steady, replies, parameters.
     look
-        Time of a further look for a beam that is not on the target, s; None: there is no search.
+        Time of a further attempt for a beam that is not on the target, s; None: there is no search.
     goal
-        Expected beam error, rad RMS, below which a heliostat is left alone until it is due.
+        Expected beam error, rad RMS, below which a heliostat is not visited until it is due.
     worth
-        Least share of the expected squared error that a visit must take away.
+        Minimum fraction of the expected squared error that a visit must remove.
     most_age
-        Age of a calibration from which its heliostat comes before all gains, s.
+        Age of a calibration above which its heliostat takes precedence over all gains, s.
     retry
-        Wait after a visit that failed, s; doubled each time, until it is given up (`VISITS`).
+        Wait after a failed visit, s; doubled each time, until it is given up (`VISITS`).
     glare
-        Least angle between the sun and a camera's line to its target, rad.
+        Minimum angle between the sun and a camera's line of sight to its target, rad.
     most_hidden
-        Largest share of a mirror that neighbours may hide from the sun or from the target.
+        Maximum fraction of a mirror that neighbours may shade or block.
     least_dni, most_wind
-        W/m² and m/s.
+        Minimum irradiance and maximum wind, W/m² and m/s.
     """
 
     model: str | tuple[str, ...] = "malan8"
@@ -97,11 +97,11 @@ class Settings:
 
     @property
     def visit(self) -> float:
-        """Time of a visit without driving and searching, s."""
+        """Duration of a visit without slewing and searching, s."""
         return self.settle + self.shots * self.interval
 
     def closed(self, sun: FloatArray, weather: Weather) -> str | None:
-        """Return the reason why a sun (3,) and weather allow no photograph, None if they do."""
+        """Return why a sun vector (3,) and weather allow no photograph, None if they do."""
         elevation = float(np.arcsin(np.clip(sun[2], -1.0, 1.0)))
         if elevation < self.limits.min_elevation:
             lowest = np.degrees(self.limits.min_elevation)

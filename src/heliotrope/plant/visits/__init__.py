@@ -1,10 +1,10 @@
 """Visits of a heliostat to a calibration target.
 
-Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (plainly, or with
-a search for the beam: `Centring`), fits them, and lets the plant believe a better calibration.
-`JointCycle` calibrates several on one target at once, told apart by their movements;
-`ReceiverCycle` does so where they shine, on a receiver.
-`Visit` is the way there and back; `TargetCamera` is the protocol of a camera.
+Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (directly, or
+with a search for the beam: `Centring`), fits them, and updates the plant's belief if the
+calibration is better. `JointCycle` calibrates several heliostats on one target at once, identified
+by their movements; `ReceiverCycle` does so on a receiver, while they track it. `Visit` is the
+travel to the target and back; `TargetCamera` is the protocol of a camera.
 """
 
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult

@@ -1,14 +1,15 @@
-"""The calibration cycle: from photographs of one mirror's beam to a better mirror.
+"""The calibration cycle: from photographs of one heliostat's beam to better parameters.
 
-A heliostat goes to a calibration target, is photographed there, and returns. Its new sightings join
-those already known; all of them together are fitted once, and the drift is followed through them to
-the present (`calibration.learn.present`). A fit that is better than the present
-calibration is pushed to the local controller, read back, and taken as the heliostat's calibration.
-Nothing is pushed after too few sightings, a fit that did not converge, values far from what an
-installation can be, or a fit that misses by more than before: the heliostat then keeps what it has.
-A first calibration, a large change, and one by photographs that the present calibration did not
-expect are confirmed by one more photograph before they are taken; if it contradicts them, the old
-parameters are pushed back. The photograph that has confirmed them is learnt from after that.
+A heliostat goes to a calibration target, is photographed there, and returns. Its new sightings are
+added to those already known; all of them together are fitted once, and the drift is followed
+through them to the present (`calibration.learn.present`). A fit that is better than the present
+calibration is sent to the local controller, read back, and adopted as the heliostat's calibration.
+Nothing is sent after too few sightings, a fit that did not converge, values far outside the range
+of a plausible installation, or a fit with a larger error than before; the heliostat then keeps its
+present calibration. A first calibration, a large change, and a calibration from photographs that
+the present one did not expect are confirmed by one more photograph before they are adopted; if it
+contradicts them, the old parameters are sent back. The confirming photograph is included in the
+learning afterwards.
 """
 
 from collections.abc import Awaitable, Callable
@@ -74,20 +75,21 @@ class CycleResult:
     outcome
         Whether the heliostat has a new calibration, or why not.
     text
-        The same for people, one line.
+        The same for display, one line.
     rejected
         Why photographs were not used, in words.
     known, new
-        Sightings known of the heliostat now, and how many of them this visit brought.
+        Number of sightings now known for the heliostat, and how many of them this visit added.
     measured
-        Beam error of this visit's photographs under the earlier calibration, rad RMS; NaN without.
+        Beam error in this visit's photographs under the previous calibration, rad RMS; NaN if there
+        is none.
     before, after
-        Beam error over all sightings under the earlier calibration and after the fit, rad RMS; NaN
+        Beam error over all sightings under the previous calibration and after the fit, rad RMS; NaN
         without a fit.
     record
         The new calibration; None if nothing changed.
     verdict
-        What a joint visit proves about the mirror; None for one that was alone.
+        What a joint visit proves about the heliostat; None for a single visit.
     """
 
     heliostat: str
@@ -103,7 +105,7 @@ class CycleResult:
     verdict: Verdict | None = None
 
     def then(self, again: "CycleResult") -> "CycleResult":
-        """Return the result of a visit whose verification was learnt from, too: ``again``."""
+        """Return the result of a visit that also learnt from its verification: ``again``."""
         new, known = self.new + again.new, max(self.known, again.known)
         if again.record is None:
             return replace(self, known=known, new=new)
@@ -141,20 +143,21 @@ class Leaving:
 
 
 class CalibrationCycle:
-    """The calibration of heliostats of a plant, one visit at a time.
+    """Calibration of the heliostats of a plant, one visit at a time.
 
     Parameters
     ----------
     plant
-        Running; its `beliefs` take the new calibrations.
+        Running plant; its `beliefs` take the new calibrations.
     camera
         Camera of its targets.
     settings
         See `CycleSettings`.
     centring
-        Search and centring of a beam that misses; None: photographs are taken where it is.
+        Search and centring of a beam that misses; None: photographs are taken without a search.
     unhidden
-        Corrects centroids for neighbours that shade and block; None: they count as they are.
+        Corrects centroids for shading and blocking by neighbours; None: centroids are used
+        uncorrected.
     worker
         Computes fits.
 
@@ -196,10 +199,10 @@ class CalibrationCycle:
     async def run(
         self, person: Person, token: int, heliostat: str, target: str, tell: Tell | None = None
     ) -> CycleResult:
-        """Calibrate one heliostat, and bring it back to where it was: standby, or its aim.
+        """Calibrate one heliostat, and return it to where it was: standby, or its aim.
 
-        It works under a mandate of its own: whoever takes the command authority meanwhile, it goes
-        on. A person's order to the heliostat ends it.
+        It works under its own mandate and continues whoever takes the command authority in the
+        meantime. An operator's order to the heliostat ends it.
 
         Parameters
         ----------
@@ -230,7 +233,7 @@ class CalibrationCycle:
     async def search(
         self, person: Person, token: int, heliostat: str, target: str, tell: Tell | None = None
     ) -> CycleResult:
-        """Search the beam of one heliostat on a target, as a camera sees it; change nothing.
+        """Search for the beam of one heliostat on a target, using the camera; change nothing.
 
         The parameters are those of `run`.
         """
@@ -290,7 +293,7 @@ class CalibrationCycle:
     async def alone(
         self, target: Target, heliostat: str, shot: Shot, standing: Standing | None
     ) -> Shot:
-        """Return a shot as if no neighbour hid a part of its mirror; see `Unhidden.shot`."""
+        """Return a shot as if no neighbour obstructed its mirror; see `Unhidden.shot`."""
         if self.unhidden is None:
             return shot
         return await self.unhidden.shot(target, heliostat, shot, standing)
@@ -316,10 +319,11 @@ class CalibrationCycle:
         confirming
             Confirms new parameters; None: a photograph of this heliostat alone.
         least
-            Sightings that the fit needs; None: as in the settings.
+            Number of sightings that the fit needs; None: as in the settings.
         leaving
-            It tracks a receiver, and leaves it if its parameters change. A change that a photograph
-            must confirm is left to a visit to a target; None: it is at standby.
+            Set if the heliostat tracks a receiver, which it leaves only if its parameters change. A
+            change that a photograph must confirm is left to a visit to a target. None: the
+            heliostat is at standby.
         """
         fewest = self.settings.least if least is None else least
         confirm, say = confirming or self.verification.problem, tell or _nobody

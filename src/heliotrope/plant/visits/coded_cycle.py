@@ -1,12 +1,12 @@
-"""The coded visit: many mirrors on one surface at once, each told apart by its own movements.
+"""The coded visit: several heliostats on one surface at once, identified by their movements.
 
-Over a series of photographs each beam moves by its code (`imaging.coded`); a photograph is taken
-only when all have settled. Each proven beam is a sighting, which takes the path of an ordinary
-visit's: one fit, its safeguards, verification. What is not proven is named, and nothing is learnt
-from it.
+Over a series of photographs each beam moves according to its code (`imaging.coded`); a photograph
+is taken only when all have settled. Each proven beam is a sighting, which is processed like that of
+an ordinary visit, with one fit, the same safeguards, and verification. Beams that are not proven
+are named, and nothing is learnt from them.
 
-A visit to a target is a *joint visit*, one of mirrors that shine on a receiver a *receiver visit*.
-They differ in how beams come and leave, in their light, and in the use of new parameters.
+A visit to a target is a *joint visit*, a visit of heliostats that track a receiver is a *receiver
+visit*. They differ in how beams arrive and leave, in their light, and in the use of new parameters.
 """
 
 import asyncio

@@ -1,7 +1,7 @@
-"""Beams of a coded visit: where they stand on a surface, and the codes that they move by.
+"""Beams of a coded visit: their positions on a surface, and the codes by which they move.
 
-A beam moves by a few tenths of a milliradian to a few milliradians, or by two of the steps in which
-its drives move it if that is more.
+A beam moves by a few tenths of a milliradian to a few milliradians, or by two drive steps if that
+is more.
 """
 
 from collections.abc import Mapping

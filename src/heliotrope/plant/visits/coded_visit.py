@@ -1,9 +1,10 @@
-"""Many heliostats on one target or receiver: their way there, their aims, and their way back.
+"""Several heliostats at one target or receiver: their travel there, their aims, and their return.
 
-One that is refused, is lost or leaves its aim drops out: it is brought to standby, or its beam is
-taken off the target, and the others go on. So do they when a person's order takes one out of the
-visit; that one is left to the person. The visit ends only with what ends it for all: an emergency,
-the end of its mandate, a cancelled task. Then all beams leave the target.
+A heliostat that is refused, is lost or leaves its aim drops out: it is brought to standby, or its
+beam is moved off the target, and the others continue. They also continue when an operator's order
+removes a heliostat from the visit; that heliostat is left to the operator. The visit ends only for
+reasons that affect all: an emergency, the end of its mandate, a cancelled task. All beams then
+leave the target.
 """
 
 import asyncio

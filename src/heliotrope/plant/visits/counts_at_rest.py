@@ -1,4 +1,4 @@
-"""Step counts of a heliostat in a coded visit, while its beam is beside its aim for photographs."""
+"""Step counts of a heliostat in a coded visit, while its beam is displaced for photographs."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Expected errors of beams, by the present beliefs about their mirrors."""
+"""Expected beam errors, from the present beliefs about the heliostats."""
 
 from collections.abc import Mapping, Sequence
 

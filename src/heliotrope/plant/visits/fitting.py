@@ -1,7 +1,8 @@
-"""Fits of the plant's sightings of its heliostats, and their judgement.
+"""Fits of the plant's sightings of its heliostats, and their acceptance.
 
-One heliostat is fitted after a visit, many after a flight. Both use all that is known of a mirror:
-its photographs, and its rows of flights with the errors that they share with other mirrors.
+One heliostat is fitted after a visit, a large number after a flight. Both fits use all available
+information on a heliostat: its photographs, and its flight records with the errors that they share
+with other heliostats.
 """
 
 from collections.abc import Mapping, Sequence

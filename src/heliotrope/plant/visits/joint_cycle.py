@@ -1,10 +1,10 @@
-"""The joint visit: many mirrors come to one target, and go home before their beams are told apart.
+"""The joint visit: several heliostats come to one target, and leave before evaluation.
 
 The empty target is photographed first. New parameters are learnt as after an ordinary visit.
 
-Heliostats that were never calibrated go together, each with a code of its own. Those that store
-their first parameters come back together, and a second series of photographs must prove each at
-the place that its parameters predict; it is their second sighting.
+Heliostats that were never calibrated go together, each with its own code. Those that store their
+first parameters return together, and a second series of photographs must prove each beam at the
+position that its parameters predict, which is also their second sighting.
 """
 
 import asyncio
@@ -68,7 +68,8 @@ class JointCycle(CodedCycle):
     settings
         See `JointSettings`.
     attempts
-        Joint visits that have not proven a heliostat; those given up go alone.
+        Number of joint visits that did not prove a heliostat; heliostats that exceed the limit go
+        alone.
     """
 
     kind, comes = "joint visit", True
@@ -92,10 +93,10 @@ class JointCycle(CodedCycle):
         return 0 < self.attempts.counts.get(heliostat, 0) < LOOKS
 
     def note(self, result: CycleResult) -> None:
-        """Note the result of a visit, joint or alone: whether the heliostat may come together.
+        """Note the result of a visit, joint or single: whether the heliostat may join again.
 
-        Where the beams of all new mirrors are beside the target, it is as dark as under a cloud:
-        they are looked for at the next place, but no cloud ends the search.
+        If the beams of all new heliostats miss the target, the target is as dark as under a cloud.
+        The search therefore continues at the next position, and a cloud does not end it.
         """
         name, now, text = result.heliostat, self._plant.now(), result.text
         new = self._plant.beliefs.record(name) is None
@@ -113,12 +114,12 @@ class JointCycle(CodedCycle):
             self.attempts.give_up(name, text, now)
 
     def first(self, heliostats: Sequence[str], target: Target) -> bool:
-        """Return whether a visit is one of own codes: some are new, or not known well enough."""
+        """Return whether a visit uses individual codes: some are new, or not known well enough."""
         errors = errors_on(self._plant, target, heliostats, self.settings).values()
         return bool(self.settings.first) and not all(e <= self.settings.known for e in errors)
 
     def having_place(self, heliostats: Sequence[str], target: str) -> tuple[str, ...]:
-        """Return those of some heliostats that have a place in a visit now."""
+        """Return which of some heliostats have a place in a visit now."""
         return self._arranged(self.face(target), tuple(heliostats)).names
 
     # -- a visit ---------------------------------------------------------------------------

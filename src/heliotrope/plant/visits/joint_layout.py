@@ -1,15 +1,14 @@
-"""Where the beams of a joint visit stand on their target, and which codes they share.
+"""Beam positions of a joint visit on its target, and which codes the beams share.
 
-Each beam gets a place in a grid that leaves room to the border. Beams that do not overlap share a
-code, so that few photographs are needed. The light of all of them together stays below what the
-target may take.
+Each beam gets a place in a grid with a margin to the border. Beams that do not overlap share a
+code, so that only a few photographs are needed. The total light stays below the target's limit.
 
-The beam of a mirror that was never calibrated misses by metres, so that places cannot be kept
-apart: each mirror has a code of its own, and moves widely to the right and left, which needs half
-as many photographs as movements along both axes. Mirrors that may miss by more aim nearer to the
-middle; one that was missed before aims beside the target, so that its beam comes onto it. The
-target must not become too bright wherever the beams truly are: the expected light and twice its
-standard deviation count.
+The beam of a heliostat that was never calibrated misses by metres, so separate places cannot be
+guaranteed. Each such heliostat has its own code, and moves widely to the right and left, which
+needs half as many photographs as movements along both axes. Heliostats with a larger expected miss
+aim nearer to the middle; a heliostat whose beam was not found before aims beside the target, so
+that its beam comes onto the target. The target must not become too bright wherever the beams truly
+are, so the expected light plus twice its standard deviation counts.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The model that each heliostat of a running plant is fitted with."""
+"""The model with which each heliostat of a running plant is fitted."""
 
 from heliotrope.calibration.learn.own_model import OwnModel, choose_own_model
 from heliotrope.calibration.sightings import Sightings

@@ -1,8 +1,8 @@
-"""Takes off a photographed centroid how far neighbours that shade and block the mirror moved it.
+"""Corrects a photographed centroid for the shift caused by shading and blocking neighbours.
 
-The plant knows how the neighbours stood: their step counts are reported, and their mechanisms are
-believed. Most mirrors are clear, which a test of corners shows at once; the shift of one that is
-not takes some milliseconds, and is computed where it does not hold up the loop.
+The plant knows the poses of the neighbours, because their step counts are reported and their
+mechanisms are believed. Most mirrors are unobstructed, which a corner test shows at once; the shift
+of an obstructed mirror takes some milliseconds, and is computed outside the event loop.
 """
 
 from dataclasses import dataclass, replace
@@ -51,14 +51,14 @@ class Standing:
 
 
 class Unhidden:
-    """Centroids as if no neighbour stood in the light.
+    """Centroids corrected as if no neighbour obstructed the light.
 
     Parameters
     ----------
     plant
-        Knows the mirrors' places, sizes and step counts.
+        Plant that knows the positions, sizes and step counts of the mirrors.
     worker
-        Computes a shift.
+        Function that computes a shift.
     """
 
     def __init__(self, plant: PlantController, worker: Worker) -> None:
@@ -70,22 +70,22 @@ class Unhidden:
     async def shot(
         self, target: Target, heliostat: str, shot: Shot, standing: Standing | None = None
     ) -> Shot:
-        """Return a shot with the centroid that its mirror would have alone.
+        """Return a shot with the centroid that its mirror would have without neighbours.
 
         Parameters
         ----------
         target, heliostat
-            The target (or face of a receiver), and the name of the mirror.
+            The target (or receiver face), and the name of the heliostat.
         shot
             As photographed.
         standing
-            Of the field at the exposure; None: it has not changed since.
+            Step counts of the field at the exposure; None: unchanged since then.
 
         Notes
         -----
-        The shift of the centroid is uncertain by a quarter of itself (`calibration.obstruction`),
-        and by all of it if a neighbour in the way was turning, or was not heard for half a minute.
-        Neighbours whose step counts were never known are left out.
+        The shift of the centroid is uncertain by a quarter of its size (`calibration.obstruction`),
+        and by all of it if an obstructing neighbour was moving, or did not report for half a
+        minute. Neighbours whose step counts were never known are left out.
         """
         if shot.reasons or not np.isfinite(shot.point).all():
             return shot

@@ -1,9 +1,9 @@
-"""The photographs of a visit: plainly where the beam is, or with a search and a centred beam.
+"""The photographs of a visit: directly where the beam is, or with search and centring.
 
-A mirror that was never calibrated may miss by more than the target is wide. If the first photograph
-shows no light, the aim moves along a square spiral in the target's plane until light appears, and
-then by as much as the beam is off the middle. Only light on the target counts, and only light that
-moves as the aim moves: other beams cross targets while a field is raised.
+A heliostat that was never calibrated may miss by more than the width of the target. If the first
+photograph shows no light, the aim moves along a square spiral in the target plane until light
+appears, and then by the distance of the beam from the middle. Only light on the target counts, and
+only light that moves as the aim moves, because other beams cross targets while a field is raised.
 """
 
 import math
@@ -37,16 +37,16 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Shot:
-    """One beam as a photograph of a target shows it.
+    """One beam as seen in a photograph of a target.
 
     Attributes
     ----------
     point
         Centroid, ENU, m, (3,).
     at
-        Middle of the exposure, s of the plant's monotonic clock.
+        Middle of the exposure, s on the plant's monotonic clock.
     covariance
-        Of the point, m²: a variance or (3, 3).
+        Covariance of the point, m²: a variance or (3, 3).
     reasons
         Why it cannot be used; () if it can.
     """
@@ -57,14 +57,14 @@ class Shot:
     reasons: tuple[str, ...] = ()
 
     def wider(self, covariance: FloatArray) -> "Shot":
-        """Return the shot with a point that is less sure by a covariance, m², (3, 3)."""
+        """Return the shot with the covariance of its point increased, m², (3, 3)."""
         given = np.asarray(self.covariance, dtype=np.float64)
         own = given * np.eye(3) if given.ndim == 0 else given
         return replace(self, covariance=own + covariance)
 
 
 class TargetCamera(Protocol):
-    """A camera that photographs targets and reads the photographs."""
+    """A camera that photographs targets and evaluates the photographs."""
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return a heliostat's beam in a new photograph."""
@@ -80,7 +80,7 @@ class Photographs:
     used
         Each with the step counts of the two axes, (2,), at its exposure.
     rejected
-        Why others were not used, in words.
+        Why other photographs were not used, in words.
     found
         Whether the beam was seen at all.
     """

@@ -1,11 +1,12 @@
-"""The receiver visit: mirrors that track a receiver are measured where they shine.
+"""The receiver visit: heliostats that track a receiver are measured while they do.
 
-A few dozen mirrors that track the receiver move their beams by a milliradian, each by a code of its
-own, while all others shine on. A camera sees the receiver. The movements are orders of the plant
-like any other, each proven before it is sent; the plant takes the beams back to their aims whatever
-becomes of the visit (`movements`). A mirror leaves the receiver only for new parameters that are
-worth it, a few mirrors at a time, and only where no photograph must confirm them: that is left to a
-visit to a target, and so is every mirror of which something is wrong.
+A few dozen heliostats that track the receiver move their beams by a milliradian, each by its own
+code, while all others keep tracking. A camera observes the receiver. The movements are orders of
+the plant like any other, each proven before it is sent; the plant moves the beams back to their
+aims whatever happens to the visit (`movements`). A heliostat leaves the receiver only for new
+parameters that are worth it, a few heliostats at a time, and only if no photograph must confirm
+them. Changes that need confirmation, and heliostats with any fault, are left to a visit to a
+target.
 """
 
 import asyncio
@@ -41,7 +42,7 @@ _SEEN = 0.5
 
 
 class ReceiverCycle(CodedCycle):
-    """Calibration of heliostats that track a receiver; those that take no part stay as they are.
+    """Calibration of heliostats that track a receiver; all others keep tracking undisturbed.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """The choice of heliostats that take part in a receiver visit.
 
-Each beam stays about its own aim. Every movement ends on the receiver, and all of them together
-cost no more of the power than is allowed.
+Each beam stays near its own aim. Every movement ends on the receiver, and all movements together
+cost no more power than is allowed.
 """
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""How finely the drives of a heliostat move its beam on a target."""
+"""How finely a heliostat's drives move its beam on a target."""
 
 import numpy as np
 import numpy.typing as npt

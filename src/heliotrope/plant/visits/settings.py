@@ -15,29 +15,30 @@ class CycleSettings:
     Attributes
     ----------
     shots, interval
-        Photographs of one visit, and the time between them, s.
+        Number of photographs per visit, and the interval between them, s.
     arrival
-        Longest time to reach an aim, s.
+        Maximum time to reach an aim, s.
     model
         Parameters to fit; see `calibration.fit.estimator.fit`. "auto": `SIMPLE` at first, then the
         simplest candidate that explains the heliostat's own sightings.
     least
-        Sightings that a fit needs, all visits together.
+        Number of sightings that a fit needs, over all visits.
     sigma
-        Standard deviation of a beam beside that of its centroid, rad, motions within hours
-        included. Half of it is taken to change from photograph to photograph until it is learnt.
+        Standard deviation of a beam excluding that of its centroid, rad, including motion within
+        hours. Until it is learnt, half of it is assumed to vary from photograph to photograph.
     most
-        Largest credible deviation of a parameter, in standard deviations of its prior.
+        Maximum credible deviation of a parameter, in standard deviations of its prior.
     gain
-        Largest accepted error after the fit, as a share of the error before (RMS over all
+        Maximum accepted error after the fit, as a fraction of the error before (RMS over all
         sightings).
     left
-        Largest accepted beam error after the fit, rad RMS: a robust fit settles on nonsense too.
+        Maximum accepted beam error after the fit, rad RMS, because a robust fit also converges on
+        wrong data.
     large
         Change of the beam by new parameters, rad, above which a photograph must confirm them. A
         first calibration is always confirmed.
     agreement
-        Largest distance of the beam from its predicted place in that photograph, in standard
+        Maximum distance of the beam from its predicted position in that photograph, in standard
         deviations of the distance.
     """
 
@@ -62,33 +63,34 @@ class CycleSettings:
 
     @property
     def first_model(self) -> str | tuple[str, ...]:
-        """The model of a heliostat with few sightings; its parameters are in every later one."""
+        """The model for a heliostat with few sightings; every later one has its parameters."""
         return SIMPLE if self.model == "auto" else self.model
 
 
 @dataclass(frozen=True)
 class Centring:
-    """Settings of the search for a beam that misses its target, and of its centring.
+    """Settings for the search for a beam that misses its target, and for centring the beam.
 
     Attributes
     ----------
     pitch
-        Distance between neighbouring aims of the search, as a share of the target's shorter side.
-        Malan's is 0.5, which finds as many beams of any size and takes longer
+        Distance between neighbouring search aims, as a fraction of the shorter side of the target.
+        Malan's value is 0.5, which finds as many beams of any size but takes longer
         (``examples/malan_search.py``).
     most
-        Aims to try beside the middle.
+        Number of aims to try in addition to the middle.
     near
-        A beam this close to the middle is not moved, as a share of the shorter side.
+        Distance from the middle within which a beam is not moved, as a fraction of the shorter
+        side.
     spread
-        How far off the middle later photographs are taken, as a share of the room that the beam
-        leaves on the target: the further apart sightings are, the more they tell. 0: all in the
-        middle.
+        How far off the middle later photographs are taken, as a fraction of the margin that the
+        beam leaves on the target, because sightings that are further apart are more informative. 0:
+        all in the middle.
     slope
-        Half the divergence of a beam, rad, beside the size of its mirror.
+        Half the divergence of a beam, rad, in addition to the size of its mirror.
     astray
-        Light this far from where the aim has moved it belongs to another heliostat, as a share of
-        the shorter side.
+        Distance from the expected position beyond which light belongs to another heliostat, as a
+        fraction of the shorter side.
     looks
         Number of searches, if the first light belongs to another heliostat.
     """

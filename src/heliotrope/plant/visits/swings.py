@@ -1,11 +1,11 @@
-"""The uncertainty of a photograph in which an axis may have taken up its play.
+"""The uncertainty of a photograph during which an axis may have taken up its backlash.
 
-An axis that goes down with the sun swings below its goal every few seconds, to come from below
-(`lcu.stepper`). The step counts, heard once a second or less often, miss most swings; but the goal
-falls as each begins. Where it fell between the counts before and after a photograph, the exposure
-was in the swing with a known chance, and the beam may be off by as much as the swing. Where it was
-heard in the swing beside the exposure, that chance is one. Where the goal did not fall, the mirror
-stood at it.
+An axis that moves down with the sun swings below its goal every few seconds, so as to approach the
+goal from below (`lcu.stepper`). The step counts, reported once per second or less often, miss most
+swings; but the goal drops when each swing begins. If it dropped between the counts before and after
+a photograph, the exposure fell into the swing with a known probability, and the beam may be off by
+as much as the swing. If the axis was reported in the swing next to the exposure, that probability
+is one. If the goal did not drop, the mirror was at its goal.
 """
 
 import math

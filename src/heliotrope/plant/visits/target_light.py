@@ -1,4 +1,4 @@
-"""The light on a surface, seen from its front, and the beams that it is made of."""
+"""The light on a surface, seen from its front, and the beams that compose it."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence

@@ -1,9 +1,9 @@
 """Verification of new parameters: one photograph of the beam where they send it.
 
-A fit explains whatever the photographs show, a false light as well as the beam. So the heliostat
-goes back to the target with its new parameters, to a place away from all earlier photographs, and
-its beam must be where they predict it. The photograph judges a fit that has not seen it; one that
-has confirmed its fit is then a sighting like any other.
+A fit explains whatever the photographs show, stray light as well as the beam. The heliostat
+therefore returns to the target with its new parameters, to a position away from all earlier
+photographs, and its beam must be where they predict it. The photograph tests a fit that has not
+used it; once it has confirmed the fit, it is a sighting like any other.
 """
 
 import asyncio

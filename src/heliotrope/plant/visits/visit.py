@@ -1,8 +1,8 @@
-"""A heliostat's visit to a target: the way there, the observed stay, and the way back.
+"""A heliostat's visit to a target: travel there, the observed stay, and the return.
 
-Whatever a visit takes it gives back on every way out: the place on the target (`BroughtHome`), the
-lock for writing parameters (`Visit.locked`), the aim and the receiver (`joint_visit.Returned`).
-Where it cannot, the plant does so later: see `plant.orders.giving_back`.
+Whatever a visit takes it releases on every exit: the place on the target (`BroughtHome`), the lock
+for writing parameters (`Visit.locked`), the aim and the receiver (`joint_visit.Returned`). If it
+cannot, the plant does so later: see `plant.orders.giving_back`.
 """
 
 import asyncio
@@ -122,7 +122,7 @@ class BroughtHome(ABC):
 
 
 class Visit(BroughtHome):
-    """One heliostat on its way to, and at, a target.
+    """One heliostat on its way to a target, or at the target.
 
     Parameters
     ----------
@@ -134,10 +134,10 @@ class Visit(BroughtHome):
     Attributes
     ----------
     row
-        Row of the heliostat in the field's table.
+        Index of the heliostat in the field table.
     boots
-        Boots of its local controller when the visit began: what a photograph says of its step
-        counts holds for these only.
+        Boot count of its local controller when the visit began; conclusions from a photograph about
+        its step counts are valid only for that boot.
     away
         Whether the heliostat has been sent to the target.
     """
@@ -168,7 +168,7 @@ class Visit(BroughtHome):
         Raises
         ------
         RefusedError
-            If it is not live.
+            If the heliostat is not live.
         """
         if not self.plant.field.live(self.plant.now())[self.row]:
             shown = self.plant.field.of(self.heliostat, self.plant.now()).text
@@ -176,20 +176,20 @@ class Visit(BroughtHome):
         return int(self.plant.field.rows["state"][self.row])
 
     async def obey(self, what: str, order: Order, limit: float) -> None:
-        """Give an order, and wait until it is done and a report is from after its end.
+        """Give an order, and wait until it is done and a later report has arrived.
 
         Parameters
         ----------
         what, order
-            The command, for people; and what gives it; see `carried_out`.
+            The command, for display, and the function that gives it; see `carried_out`.
         limit
             s.
 
         Raises
         ------
         RefusedError
-            If it is refused, or not done within ``limit`` s, or nothing is heard after it; or if
-            another order has taken the heliostat out of the visit.
+            If it is refused, or not done within ``limit`` s, or no report follows; or if another
+            order has removed the heliostat from the visit.
         """
         if failed := await carried_out(self.plant, order, self.names, limit, self.look):
             raise BeamError(what, failed)
@@ -208,7 +208,7 @@ class Visit(BroughtHome):
         await self.obey(name, lambda some: plant.command(person, token, name, some, values), limit)
 
     async def aim(self, point: FloatArray, limit: float = 120.0) -> None:
-        """Give the heliostat an aim and wait until it has taken it; see `obey`."""
+        """Give the heliostat an aim and wait until it has accepted it; see `obey`."""
         person, token, plant = self.mandate.person, self.mandate.token, self.plant
         await self.obey(
             "AIM", lambda some: plant.aim(person, token, dict.fromkeys(some, point)), limit
@@ -216,14 +216,14 @@ class Visit(BroughtHome):
 
     @asynccontextmanager
     async def locked(self) -> AsyncIterator[None]:
-        """Lock the heliostat, which is at standby, for a block, and bring it to standby again.
+        """Lock the heliostat, which is at standby, for a block, and bring it back to standby.
 
-        Parameters are only exchanged while nothing can move.
+        Parameters are exchanged only while nothing can move.
 
         Raises
         ------
         RefusedError
-            See `command`. Where it cannot be unlocked now, the plant unlocks it later.
+            See `command`. If it cannot be unlocked now, the plant unlocks it later.
         """
         await self.command("LOCK")
         try:
@@ -239,12 +239,12 @@ class Visit(BroughtHome):
         await self.command("IDLE")
 
     async def go(self, limit: float, point: FloatArray | None = None) -> None:
-        """Send the heliostat to the target and wait until it is there.
+        """Send the heliostat to the target and wait until it has arrived.
 
         Parameters
         ----------
         limit
-            Longest time, s.
+            Maximum time, s.
         point
             Aim on the target, ENU, m, (3,); None: its centre.
 
@@ -290,7 +290,7 @@ class Visit(BroughtHome):
         return self.left() < ARRIVED and not coarse
 
     def left(self) -> float:
-        """Return how far the axes are from their goals, rad, the further one."""
+        """Return how far the axes are from their goals, rad, for the axis that is further away."""
         node = self.plant.field.rows[self.row]
         here = np.array([node["primary"], node["secondary"]], dtype=np.float64)
         goal = np.array([node["primary_goal"], node["secondary_goal"]], dtype=np.float64)
@@ -302,7 +302,7 @@ class Visit(BroughtHome):
         Raises
         ------
         RefusedError
-            If another order has taken the heliostat out of the visit.
+            If another order has removed the heliostat from the visit.
         """
         await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
         if wrong := self.mandate.refused((self.heliostat,)):
@@ -310,7 +310,7 @@ class Visit(BroughtHome):
         self.note()
 
     def note(self) -> None:
-        """Note the step counts as last heard, if they are new."""
+        """Note the last reported step counts, if they are new."""
         # Counts may be polled less often than the state; their own age says when they were true.
         counted = float(self.plant.field.counted_at[self.row])
         node = self.plant.field.rows[self.row]
@@ -323,15 +323,16 @@ class Visit(BroughtHome):
             self._there.append(bool(tracks) and self.left() < ARRIVED)
 
     async def counts_at(self, instant: float, limit: float = 10.0) -> FloatArray:
-        """Return the step counts at an instant, between the rows before and after it, (2,).
+        """Return the step counts at an instant, interpolated between adjacent reports, (2,).
 
-        Only rows at the goals count. An axis that goes down with the sun swings below its goal now
-        and then, to come from below: a row from such a moment says nothing of the next second.
+        Only reports at the goals count. An axis that moves down with the sun swings below its goal
+        from time to time, so as to approach from below; a report from such a moment says nothing
+        about the next second.
 
         Raises
         ------
         RefusedError
-            If it was not heard at its goals before, and within ``limit`` s after.
+            If it was not reported at its goals before, and within ``limit`` s after.
         """
         until = self.plant.now() + limit
         while not (sum(self._there) > 1 and self._heard_there()[-1] >= instant):
@@ -350,9 +351,9 @@ class Visit(BroughtHome):
         return np.asarray(counts[after - 1] + share * (counts[after] - counts[after - 1]))
 
     def fell(self, instant: float) -> tuple[FloatArray, float]:
-        """Return how far the goals fell about an instant, steps, (2,), and within what time, s.
+        """Return how far the goals dropped around an instant, steps, (2,), and within what time, s.
 
-        Between the rows before and after it that `counts_at` takes, which it has waited for.
+        Between the reports before and after the instant that `counts_at` uses and has waited for.
         """
         times = self._heard_there()
         goals = [row for row, there in zip(self._goals, self._there, strict=True) if there]
@@ -374,15 +375,15 @@ class Visit(BroughtHome):
         return np.array(self._times), np.array(self._counts).reshape(-1, 2)
 
     def taken_off(self) -> None:
-        """Take its beam off where another order has left it at an aim with unproven parameters."""
+        """Move its beam off if another order has left it at an aim with unverified parameters."""
         state = int(self.plant.field.rows["state"][self.row])
         if state in states.ON_AIM:
             self.plant.defocus(f"visit of {self.mandate.person.name}", (self.heliostat,))
 
     async def home(self) -> None:
-        """Bring it back to standby; where that is not possible, take its beam off the target.
+        """Bring it back to standby or, if that is not possible, move its beam off the target.
 
-        One that another order has taken out of the visit is left to that.
+        A heliostat that another order has removed from the visit is left to that order.
         """
         if not self.away:
             return

@@ -1,4 +1,4 @@
-"""Run by Alembic: takes the connection that `Database.migrate` gives it."""
+"""Run by Alembic; uses the connection that `Database.migrate` passes."""
 
 from alembic import context
 

@@ -1,8 +1,8 @@
 """Simulated local controllers, their clocks, flash and motors, and the bus they share.
 
-`Board` runs the firmware's own code (`heliotrope.lcu`) on a simulated machine; `TwinBus` carries
+`Board` runs the firmware's own code (`heliotrope.lcu`) on simulated hardware; `TwinBus` carries
 frames to its stations and can damage them (`BusFaults`); `SimulatedTime`, `DriftingClock`: the
-times of a cluster with faults. Begin with `Board`.
+clocks of a cluster with faults. Begin with `Board`.
 """
 
 from heliotrope.twin.boards.board import Board, Witness

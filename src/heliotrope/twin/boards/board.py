@@ -1,8 +1,8 @@
-"""A board of a heliostat, true to the firmware: a real `lcu.node.Node` on simulated hardware.
+"""A simulated heliostat board with the real firmware: an `lcu.node.Node` on simulated hardware.
 
-The board has flash, a millisecond counter, two motors with step timers, and a supply that may
-fail at any instant, even within a write of flash. `Board` is a `Station` of a bus; `step` advances
-its time. A `Witness` sees all its actions without affecting them.
+The board has flash, a millisecond counter, two motors with step timers, and a supply that may fail
+at any instant, even during a flash write. `Board` is a `Station` on a bus; `step` advances its
+time. A `Witness` sees all its actions without affecting them.
 """
 
 import contextlib
@@ -69,16 +69,16 @@ class Board:
     Parameters
     ----------
     outfit
-        The heliostat: name, addresses, mechanism, journal. The board may be another mirror's; see
-        `exchange`.
+        The heliostat: name, addresses, mechanism, journal. The board may belong to another
+        heliostat; see `exchange`.
     seed
         Seed of flash, motors and random choices.
     ticks
         Its millisecond counter.
     play, miss
-        Of the motors; see `MotorAxis`.
+        Backlash and missed steps of the motors; see `MotorAxis`.
     wind
-        Wind that turns the mirror; None: no wind.
+        Wind that deflects the mirror; None: no wind.
 
     Attributes
     ----------
@@ -87,15 +87,15 @@ class Board:
     axes
         Motors.
     slip
-        Position of the motors beyond the node's counts, steps: set at each boot, and by ZERO.
+        Position of the motors relative to the node's counts, steps: set at each boot, and by ZERO.
     now
         True time of the last event, in s.
     tilt
-        Reading of the accelerometer, or None.
+        Accelerometer reading, or None.
     switched_off
         Whether the drives are switched off at the mirror.
     powered
-        Whether the motors' drivers are on.
+        Whether the motor drivers are on.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class Board:
     # -- the supply --------------------------------------------------------------------
 
     def power_on(self, now: float) -> None:
-        """Boot, unless the board runs; flash may fail within the boot."""
+        """Boot, unless the board is running; flash may fail during the boot."""
         if self.node is not None:
             return
         self.now = now
@@ -163,7 +163,7 @@ class Board:
         self._tell("boot")
 
     def zeroed(self) -> None:
-        """Note that its step counts were declared: how far the motors are from them."""
+        """Note that its step counts were declared, and how far the motors are from them."""
         if self.node is not None:
             self._counts_from([self.node.controller.motion.place(axis) for axis in (0, 1)])
 
@@ -184,15 +184,14 @@ class Board:
         self._die()
 
     def exchange(self, serial: int, items: Mapping[str, bytes] | NorFlash) -> NorFlash:
-        """Put another board at the mirror, while there is no supply; return the flash of this one.
+        """Install another board at the heliostat, while there is no supply; return the old flash.
 
         Parameters
         ----------
         serial
             Serial number of the other board.
         items
-            What it stores: it was last at stow, by these items; or the flash of a board that was
-            here before.
+            Items that it stores, as if last at stow; or the flash of a board that was here before.
         """
         assert self.node is None
         before, self._serial = self.flash, serial
@@ -207,7 +206,7 @@ class Board:
         return before
 
     def switch(self, now: float, *, off: bool) -> None:
-        """Switch the drives off, or on again, with the switch at the mirror."""
+        """Switch the drives off or on with the switch at the heliostat."""
         self._to(now)
         self.switched_off = off
         try:
@@ -250,7 +249,7 @@ class Board:
     # -- events ------------------------------------------------------------------------
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Take bytes from the bus; return the immediate answer."""
+        """Receive bytes from the bus; return the immediate reply."""
         self._to(now)
         if self.node is None:
             return b""
@@ -264,7 +263,7 @@ class Board:
         return self._spoken()
 
     def step(self, now: float) -> bytes:
-        """Run one pass of the main loop; return the bytes that it sends by itself."""
+        """Run one pass of the main loop; return the bytes that it sends without a request."""
         self._to(now)
         if self.node is None:
             return b""
@@ -319,7 +318,7 @@ class Board:
         Parameters
         ----------
         believed
-            Whether to leave out slip and wind: the position that the node believes.
+            Whether to ignore slip and wind, which yields the position that the node believes.
         """
         counts = [axis.joint for axis in self.axes]
         if believed:
@@ -341,7 +340,7 @@ class Board:
         sun
             Direction to the sun, (3,).
         believed
-            As in `mirror`.
+            As for `mirror`.
         """
         vertex, normal = self.mirror(believed=believed)
         return vertex, 2.0 * (normal @ sun) * normal - sun

@@ -1,8 +1,8 @@
-"""A bus in this process: the cluster at one end, boards or a vectorised field at the other.
+"""A bus within this process: the cluster at one end, boards or a vectorised field at the other.
 
-It implements `links.link.Bus`: one transaction at a time, urgent ones next, and nothing after its
-expiry. Bytes take their time at the baud rate. Faults are drawn from a seed and may be changed at
-any moment (`BusFaults`). Everything connected to the bus is a `Station`.
+It implements `links.link.Bus`: one transaction at a time, urgent frames next, and nothing after its
+expiry. Bytes take their transmission time at the baud rate. Faults are drawn from a seed and may be
+changed at any time (`BusFaults`). Everything connected to the bus is a `Station`.
 """
 
 import asyncio
@@ -25,19 +25,19 @@ class Station(Protocol):
     """A device connected to a bus."""
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Take bytes at a time in s; return the immediate answer, or b""."""
+        """Receive bytes at a time in s; return the immediate reply, or b""."""
         ...
 
 
 class Tap(Protocol):
-    """A listener to all traffic, which does not disturb it."""
+    """A listener to all traffic that does not affect it."""
 
     def sent(self, frame: bytes, now: float) -> None:
         """Note bytes that the master sent."""
         ...
 
     def heard(self, place: int, data: bytes, how: str, now: float) -> None:
-        """Note bytes that a station is about to receive, and how: "whole", or a fault's name."""
+        """Note bytes that a station is about to receive: "whole", or with a named fault."""
         ...
 
     def answered(self, data: bytes, how: str, now: float) -> None:
@@ -54,14 +54,14 @@ class BusFaults:
     loss, corruption, burst, duplication, late, delay
         Probabilities, 0 to 1: nothing arrives; one bit is inverted; a run of bytes is noise; the
         frame arrives twice; it arrives only when the next frame is sent (out of order, or between
-        others); an answer takes longer, up to the time limit of the wait.
+        other frames); a reply is delayed, up to the timeout.
     stuck
-        A transmitter holds the line: nobody receives anything.
+        Whether a transmitter blocks the line, so that nobody receives anything.
 
     Raises
     ------
     InputError
-        A probability outside 0 to 1.
+        If a probability is outside 0 to 1.
     """
 
     loss: float = 0.0
@@ -112,16 +112,16 @@ class TwinBus:
     baud_rate
         Bits per second; 0: bytes take no time.
     turn_around
-        Time from the end of a frame to the answer, in s.
+        Time from the end of a frame to the reply, in s.
     tap
         Listens to everything.
 
     Attributes
     ----------
     faults
-        See `BusFaults`; may be set at any moment.
+        See `BusFaults`; may be set at any time.
     plugged
-        Whether the port is present; False simulates an adapter that is pulled out.
+        Whether the port is present; False simulates an unplugged adapter.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class TwinBus:
 
     @property
     def closed(self) -> bool:
-        """Whether the bus is closed for good."""
+        """Whether the bus is closed permanently."""
         return self._closing.is_set()
 
     async def run(self) -> None:
@@ -162,18 +162,18 @@ class TwinBus:
         await self._closing.wait()
 
     async def close(self) -> None:
-        """Close the bus for good."""
+        """Close the bus permanently."""
         self._closing.set()
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame that is not answered, and wait until it is out.
+        """Send a frame that expects no reply, and wait until it is sent.
 
         Raises
         ------
         LinkClosedError
-            When the bus is closed.
+            If the bus is closed.
         """
         async with self._turns.turn(urgent=urgent):
             outcome = self._may(expires)
@@ -190,14 +190,14 @@ class TwinBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the answer, or b"".
+        """Send a frame and return the reply, or b"".
 
         Raises
         ------
         InputError
-            A timeout that is not above 0.
+            If the timeout is not above 0.
         LinkClosedError
-            When the bus is closed.
+            If the bus is closed.
         """
         if not timeout > 0.0:
             raise InputError(f"bus: a timeout of {timeout} s; it must be above 0")
@@ -248,22 +248,22 @@ class TwinBus:
     # -- the wire --------------------------------------------------------------------------
 
     def carry(self, frame: bytes) -> bytes:
-        """Bring a frame of the master to all stations now; return their answers."""
+        """Deliver a frame from the master to all stations now; return their replies."""
         if self._tap is not None:
             self._tap.sent(frame, self._clock.monotonic())
         return self._back(self.inject(frame, late=True))
 
     def inject(self, frame: bytes, *, how: str = "whole", late: bool = False) -> bytes:
-        """Bring bytes to all stations, from the master or from a stranger; return all answers.
+        """Deliver bytes to all stations, from the master or from an intruder; return all replies.
 
         Parameters
         ----------
         frame
             Bytes.
         how
-            Reported to the tap for bytes that no fault of the bus touches.
+            Reported to the tap for bytes that no bus fault affects.
         late
-            Whether bytes that were held back arrive now, after these.
+            Whether delayed bytes arrive now, after these.
         """
         if self.faults.stuck:
             return b""

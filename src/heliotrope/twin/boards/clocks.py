@@ -1,4 +1,4 @@
-"""Clocks that drift and jump, and sources of time that fail, for simulated clusters."""
+"""Clocks that drift and jump, and time sources that fail, for simulated clusters."""
 
 import asyncio
 from collections.abc import Callable
@@ -14,21 +14,22 @@ SETTLE = 5.0
 
 
 class SimulatedTime:
-    """A `TimeKeeper` with a true time, and faults that may be set at any moment.
+    """A `TimeKeeper` with a true time, and faults that may be set at any time.
 
     Parameters
     ----------
     clock
-        Its ``monotonic`` measures the time passed; its ``utc`` at the start is the truth.
+        Clock whose ``monotonic`` measures the elapsed time, and whose ``utc`` at the start is the
+        truth.
     error
-        Error bound that it reports while nothing is wrong, in s.
+        Error bound that it reports while there is no fault, in s.
 
     Attributes
     ----------
     offset
         Error of the reported time, in s; set by `jump`.
     detects
-        Whether a jump is reported as one; a keeper that hides jumps is the worse fault.
+        Whether a jump is reported; a time keeper that hides jumps is the worse fault.
     quality
         Quality that it reports; "none" has no error bound.
     """
@@ -65,7 +66,7 @@ class SimulatedTime:
         return Time(utc_of_gps(gps).timestamp(), gps, error, self.quality, jumped)
 
     async def run(self) -> None:
-        """Wait until closed: there is nothing to do."""
+        """Wait until closed, because there is nothing to do."""
         await self._closing.wait()
 
     async def close(self) -> None:
@@ -74,16 +75,16 @@ class SimulatedTime:
 
 
 class DriftingClock:
-    """A computer's clocks: an inaccurate oscillator, and a calendar that may be set.
+    """A computer's clocks: an inaccurate oscillator, and a calendar clock that may be set.
 
     Parameters
     ----------
     source
-        Returns true monotonic seconds.
+        Function that returns true monotonic seconds.
     start
-        UTC when the clock is made.
+        UTC when the clock is created.
     drift
-        Relative excess of its rate: 50e-6 is a poor quartz.
+        Relative rate error: 50e-6 is a poor quartz.
     """
 
     def __init__(self, source: Callable[[], float], start: datetime, drift: float = 0.0) -> None:
@@ -92,15 +93,15 @@ class DriftingClock:
         self._inner = VirtualClock(source, start, rate=1.0 + drift)
 
     def monotonic(self) -> float:
-        """Return the oscillator's seconds: they never go back or jump."""
+        """Return the oscillator's seconds, which never go back or jump."""
         return self._inner.monotonic()
 
     def utc(self) -> datetime:
-        """Return the calendar's UTC."""
+        """Return the calendar clock's UTC."""
         return self._inner.utc()
 
     def jump(self, seconds: float) -> None:
-        """Set the calendar forward, or back."""
+        """Set the calendar clock forward, or back."""
         self._inner.jump(seconds)
 
 
@@ -110,7 +111,7 @@ class TickCounter:
     Parameters
     ----------
     start
-        Count at the true time 0; near ``ticks.PERIOD`` it soon wraps.
+        Count at true time 0; near ``ticks.PERIOD`` it soon wraps.
     drift
         Ratio.
     """

@@ -6,35 +6,35 @@ from heliotrope.errors import HeliotropeError
 
 
 class PowerCutError(HeliotropeError):
-    """The supply failed within a write or an erasure: the board stops at once."""
+    """The supply failed during a write or an erasure; the board stops at once."""
 
 
 class NorFlash:
-    """NOR flash in memory that refuses operations that real flash cannot perform.
+    """NOR flash in memory that rejects operations that real flash cannot perform.
 
     Parameters
     ----------
     seed
-        Seed of the bits that a cut leaves.
+        Seed of the bits that a power failure leaves.
     block_size, blocks
-        Bytes of a block, and number of blocks.
+        Bytes per block, and number of blocks.
 
     Attributes
     ----------
     budget
-        Bytes of writing and erasing after which the supply fails; None: it holds.
+        Number of bytes written and erased after which the supply fails; None: never.
     ragged
-        At a cut, all bytes of the operation hold some of their new bits and some of the old, as
-        if a page took them in any order; else only the byte of the cut does.
+        Whether a power failure leaves all bytes of the operation with a mixture of new and old
+        bits, as if a page stored them in any order; otherwise only the byte at the failure.
     erasures
         Count for each block.
 
     Raises
     ------
     PowerCutError
-        By ``write`` and ``erase``, at the cut.
+        Raised by ``write`` and ``erase``, at the power failure.
     ValueError
-        By ``write``, where a byte was written since its erasure: the journal never does that.
+        Raised by ``write`` if a byte was written since its erasure, which the journal never does.
     """
 
     def __init__(self, seed: int = 0, block_size: int = 4096, blocks: int = 6) -> None:

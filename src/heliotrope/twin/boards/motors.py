@@ -1,8 +1,8 @@
-"""Step timers and motors of one heliostat: they play the segments that a board emits.
+"""Step timers and motors of one heliostat, which execute the segments that a board emits.
 
-A segment is ``count`` pulses, with an interval after each. The timer plays the segments of an axis
-one after the other; segments not yet played when the supply fails are never made. Pulses turn the
-motor; the joint follows behind the play of the gear (backlash), and an overloaded motor misses
+A segment is ``count`` pulses, with an interval after each. The timer executes the segments of an
+axis one after the other; segments not yet executed when the supply fails are never made. Pulses
+move the motor; the joint follows after the backlash of the gear, and an overloaded motor misses
 some pulses.
 """
 
@@ -18,7 +18,7 @@ class MotorAxis:
     count
         Initial position, steps.
     play
-        Play of the gear, steps: after a reversal the joint stands still for this many.
+        Backlash of the gear, steps: after a reversal the joint does not move for this many steps.
     miss
         Probability that a segment loses one of its steps.
     chance
@@ -27,18 +27,18 @@ class MotorAxis:
     Attributes
     ----------
     emitted
-        Sum of all signed steps ordered, from the count at the start.
+        Sum of all signed steps ordered, relative to the count at the start.
     turned
         Position of the motor, steps.
     joint
-        Position of the joint, in steps of the motor: equal to it after motion from below, up to
-        ``play`` above it after a reversal.
+        Position of the joint, in motor steps: equal to the motor position after motion from below,
+        up to ``play`` above it after a reversal.
     missed
         Steps missed so far.
     fastest
-        Least interval of a segment since the start, µs.
+        Shortest segment interval since the start, µs.
     stalled
-        Whether the motor stands still, by ice or a broken coupling, whatever is ordered of it.
+        Whether the motor is blocked, by ice or a broken coupling, whatever is ordered.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class MotorAxis:
         self.fastest = min(self.fastest, interval_us)
 
     def play_to(self, now: float) -> None:
-        """Make the pulses that are due until a time in s."""
+        """Make the pulses that are due by a time in s."""
         while self._queue:
             direction, count, interval_us = self._queue[0]
             # The interval follows each pulse: the first pulse comes at once.
@@ -91,7 +91,7 @@ class MotorAxis:
         self.joint = min(max(self.joint, float(self.turned)), self.turned + self.play)
 
     def release(self, full: int) -> None:
-        """Take the current off: the rotor turns to the nearest of its full steps."""
+        """Switch the current off; the rotor moves to the nearest full step."""
         away = (self.turned + full // 2) % full - full // 2
         self._turn(-1 if away > 0 else 1, abs(away))
 
@@ -107,5 +107,5 @@ class MotorAxis:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is left to play."""
+        """Whether there are no more pulses to make."""
         return not self._queue

@@ -1,4 +1,4 @@
-"""Heliostats to simulate: imperfect mechanisms, and what their boards store of them."""
+"""Heliostats to simulate: imperfect mechanisms, and what their boards store about them."""
 
 import hashlib
 import math
@@ -29,7 +29,7 @@ RANGES = ((-20_000, 406_000), (-4000, 104_000))
 RECEIVER = (0.0, 0.0, 50.0)
 STANDBY = (12.0, 0.0, 40.0)
 DEFOCUS = (0.1, 0.05)
-#: What the boards of `outfits` store besides their mechanisms, but for the spread of the defocus.
+#: What the boards of `outfits` store besides their mechanisms, except the spread of the defocus.
 MACHINE = Machine(
     (AxisLimits(*RANGES[0], *LIMITS), AxisLimits(*RANGES[1], *LIMITS)), STOW, DEFOCUS, STANDBY
 )
@@ -54,7 +54,7 @@ class Outfit:
     items
         Items of its journal, by name: see `lcu.journal.ITEMS`.
     machine
-        Its motors and resting places.
+        Its motor limits and rest positions.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Outfit:
     machine: Machine = MACHINE
 
     def with_causes(self, causes: Mapping[str, float]) -> Mechanism:
-        """Return its mechanism with other imperfections (rad, by parameter) in place of its own."""
+        """Return its mechanism with its imperfections replaced by others (rad, by parameter)."""
         return _perfect(self.mechanism.position).with_parameters(causes)
 
     @property
@@ -90,14 +90,14 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
     count
         1 to 32.
     seed
-        Seed of places and imperfections.
+        Seed of positions and imperfections.
     places
         East and north of each heliostat, m; (): drawn.
 
     Raises
     ------
     InputError
-        Not 1 to 32 heliostats.
+        If there are not 1 to 32 heliostats.
     """
     if not 1 <= count <= MOST:
         raise InputError(f"{count} heliostats on a bus; give 1 to {MOST}")
@@ -154,7 +154,7 @@ def stow_beams(
 
 
 def mechanisms(fits: Sequence[Outfit]) -> Mechanism:
-    """Return the true mechanisms of heliostats as one, (N,)."""
+    """Return the true mechanisms of heliostats as one array, (N,)."""
     perfect = _perfect(np.stack([fit.mechanism.position for fit in fits]))
     return perfect.with_parameters(
         {name: np.array([fit.causes[name] for fit in fits]) for name in CAUSES}
@@ -162,5 +162,5 @@ def mechanisms(fits: Sequence[Outfit]) -> Mechanism:
 
 
 def own_items(address: int) -> dict[str, bytes]:
-    """Return the items that belong to a board itself, which the plant never pushes."""
+    """Return the items that belong to the board itself, which the plant never sends."""
     return {"address": struct.pack(CODES_OF["address"], address)}

@@ -1,4 +1,4 @@
-"""The wire of a bus as a pseudo-terminal: boards at one end, a serial port at the other."""
+"""The bus line as a pseudo-terminal: boards at one end, a serial port at the other."""
 
 import asyncio
 import os

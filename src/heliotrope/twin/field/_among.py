@@ -1,4 +1,4 @@
-"""Membership of small codes, by a table."""
+"""Membership tests for small codes, using a table."""
 
 from functools import lru_cache
 

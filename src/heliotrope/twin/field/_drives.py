@@ -1,7 +1,7 @@
 """Motors and gears of a whole field: from emitted steps to joint positions.
 
 Same as `twin.boards.motors` for one axis, except within a tick: steps are made when they are
-emitted, which on a board is up to a tenth of a second before its timer plays them.
+emitted, which on a board happens up to a tenth of a second before its timer executes them.
 """
 
 import numpy as np

@@ -1,12 +1,13 @@
 """A whole field of local controllers as arrays: the states and steps of `lcu`, without frames.
 
-All heliostats of a field do at once what a board does from stow to standby, tracking, defocused and
-back, in the same integers: poses come from the vectorised tracking of `mechanism`, steps from the
-kernels of this room. Step counts equal those of the firmware-true board wherever both exist.
+All heliostats of a field do simultaneously what a board does from stow to standby, tracking,
+defocused and back, in the same integer arithmetic: poses come from the vectorised tracking in
+`mechanism`, steps from the kernels in this package. Step counts equal those of a board with the
+real firmware wherever both exist.
 
 It models STOWED, APPROACHING, IDLE at standby, TRACKING, DEFOCUSED, STOWING, LOCKED and FAULT, the
-lease, and the autonomous way to defocus and stow. Power may be cut and restored; gears have play,
-motors lose steps, and the wind turns mirrors. Settings, searching and jogging need a board
+lease, and the autonomous path to defocus and stow. Power may fail and return; gears have backlash,
+motors lose steps, and the wind deflects mirrors. Settings, searching and jogging need a board
 (`twin.boards.board`).
 """
 
@@ -88,13 +89,13 @@ class Field:
     mechanism
         True mechanisms, batch shape (N,), each with two drives.
     machine
-        Limits and resting places, with a standby point: one for all, or one for each heliostat.
+        Limits and rest positions, with a standby point: one for all, or one per heliostat.
     believed
-        Mechanisms that the controllers store; None: the true ones.
+        Mechanisms that the controllers store; None: the true mechanisms.
     play, miss, seed
         See `Drives`.
     wind
-        Turns the mirrors; None: no wind.
+        Wind that deflects the mirrors; None: no wind.
 
     Attributes
     ----------
@@ -107,9 +108,9 @@ class Field:
     drives
         True positions of motors and joints.
     now_ms
-        Time since the beginning, ms.
+        Time since the start, ms.
     edition
-        Rises with every change: a reading at the same edition is still valid.
+        Increases with every change; a value read at the same edition is still valid.
     journals
         Journals of the controllers.
     aim
@@ -118,7 +119,7 @@ class Field:
     Raises
     ------
     InputError
-        Not an array of mechanisms with two drives each.
+        If it is not an array of mechanisms with two drives each.
     """
 
     def __init__(
@@ -208,7 +209,7 @@ class Field:
         return turned(angles, self._offset[rows], self._low[rows], self._high[rows])
 
     def still(self, rows: Rows | None = None) -> Bools:
-        """Whether each heliostat is at rest, (N,), or (M,) for some rows."""
+        """Whether each heliostat is at rest, (N,), or (M,) for some indices."""
         axes, queued = self.axes, self._queued
         if rows is not None:
             axes, queued = axes[rows], queued[rows]
@@ -217,12 +218,12 @@ class Field:
         return out
 
     def ready(self, rows: Rows) -> Bools:
-        """Whether heliostats have come to standby by the safe way, (M,)."""
+        """Whether heliostats have reached standby by the safe path, (M,)."""
         arrived: Bools = self._ready[rows]
         return arrived
 
     def at_stow(self, rows: Rows | None = None) -> Bools:
-        """Whether each heliostat is at stow and still, (N,), or (M,) for some rows."""
+        """Whether each heliostat is at stow and at rest, (N,), or (M,) for some indices."""
         count, stow = self.axes["count"], self._stow
         if rows is not None:
             count, stow = count[rows], stow[rows]
@@ -376,7 +377,7 @@ class Field:
     def take_sun(
         self, values: tuple[int, ...], rows: Rows | None = None, delay_ms: int = 0
     ) -> None:
-        """Take SUN of the wire, sent each second: it renews the lease.
+        """Receive a SUN message, sent every second, which renews the lease.
 
         Parameters
         ----------
@@ -396,14 +397,14 @@ class Field:
         self.hear(heard)
 
     def put_up(self, values: tuple[int, ...], aims: npt.ArrayLike) -> Bools:
-        """Put heliostats at stow on track, as if raised before; return a mask of them, (N,).
+        """Put stowed heliostats on track, as if raised before; return a mask of them, (N,).
 
-        Those that cannot bring their beams to their aims stay at stow.
+        Heliostats that cannot bring their beams to their aims stay at stow.
 
         Parameters
         ----------
         values
-            SUN of the wire; see `take_sun`.
+            SUN message; see `take_sun`.
         aims
             Aim points, (N, 3), m.
         """
@@ -422,13 +423,13 @@ class Field:
         return np.isin(np.arange(len(self)), rows)
 
     def hear(self, rows: Rows) -> None:
-        """Note that heliostats hear their cluster; a position is held only while they do."""
+        """Note that heliostats receive from their cluster; they hold a position only then."""
         self._heard[rows] = LEASE_MS
         held = (self.kind[rows] == HOLD) & (self.state[rows] != states.FAULT)
         self._aside[rows[held & (self.state[rows] >= 0)]] = NO_TURN
 
     def order(self, name: str, rows: Rows | None = None, aim: npt.ArrayLike | None = None) -> Bools:
-        """Give a command; return which heliostats take it, (N,).
+        """Give a command; return which heliostats accept it, (N,).
 
         Parameters
         ----------
@@ -442,7 +443,7 @@ class Field:
         Raises
         ------
         InputError
-            Another name, or AIM without an aim.
+            If the command is any other, or AIM has no aim.
         """
         chosen = np.arange(len(self)) if rows is None else np.asarray(rows)
         chosen = chosen[self.state[chosen] >= 0]
@@ -552,12 +553,12 @@ class Field:
     # -- faults and power ------------------------------------------------------------------
 
     def fail(self, rows: Rows, number: int) -> None:
-        """Give controllers a fault of `lcu.controller`, which lasts until `mend`.
+        """Set a fault of `lcu.controller`, which lasts until `mend`.
 
         Raises
         ------
         InputError
-            An unknown fault number.
+            If the fault number is unknown.
         """
         if not NO_FAULT < number <= LATCHED:
             raise InputError(f"field: fault {number}; give 1 to {LATCHED}, as lcu.names has them")
@@ -575,13 +576,13 @@ class Field:
         self._note_motions()
 
     def mend(self, rows: Rows) -> None:
-        """Remove the causes of faults; the faults themselves stay until CLEAR_FAULT."""
+        """Remove the causes of faults; the faults themselves remain until CLEAR_FAULT."""
         self._present[rows] = False
 
     def cut(self, rows: Rows, *, warned: bool = False) -> None:
         """Cut the power: motors stop, nothing is received. Steps already emitted are still made.
 
-        ``warned``: the brown-out detectors see it coming, which leaves a fault.
+        ``warned``: the brown-out detectors notice in time, which leaves a fault.
         """
         rows = rows[self.state[rows] >= 0]
         self.edition += 1
@@ -600,9 +601,9 @@ class Field:
             self.axes[name][rows] = self.axes["count"][rows]
 
     def restore(self, rows: Rows) -> None:
-        """Restore the power: locked and faulty controllers stay so, the others turn away.
+        """Restore the power: locked and faulty controllers stay so, all others turn away.
 
-        A turn that had begun goes on, and so does the straight way to stow.
+        A turn that had begun is continued, and so is the direct path to stow.
         """
         rows = rows[self.state[rows] < 0]
         self.edition += 1
@@ -629,7 +630,7 @@ class Field:
         Raises
         ------
         InputError
-            Not a multiple of `TICK_MS`.
+            If the time is not a multiple of `TICK_MS`.
         """
         if milliseconds % TICK_MS or milliseconds < 0:
             raise InputError(f"field: {milliseconds} ms is not a multiple of {TICK_MS} ms")
@@ -745,7 +746,7 @@ class Field:
     # -- truth -----------------------------------------------------------------------------
 
     def normals(self) -> FloatArray:
-        """Return the true normals of the mirrors now, (N, 3)."""
+        """Return the present true normals of the mirrors, (N, 3)."""
         return self.stand()[0]
 
     def stand(self) -> tuple[FloatArray, FloatArray]:
@@ -757,7 +758,7 @@ class Field:
         return self.wind.turned(pose.normal, place, 1e-3 * self.now_ms), pose.vertex
 
     def store(self, row: int, items: dict[str, bytes]) -> None:
-        """Store items in a controller's journal; a new armature counts from now on."""
+        """Store items in a controller's journal; a new armature takes effect at once."""
         self.journals.store(row, items)
         self.edition += 1
 
@@ -772,7 +773,7 @@ class Field:
         return np.where(good, np.arcsin(np.clip(off, 0.0, 1.0)), np.nan)
 
     def flux(self, sun: npt.ArrayLike, receiver: npt.ArrayLike, radius: float) -> float:
-        """Return the share of the field's light that passes a receiver; see `light_share`."""
+        """Return the fraction of the field's light that reaches a receiver; see `light_share`."""
         return light_share(*self.stand(), sun, receiver, radius)
 
 

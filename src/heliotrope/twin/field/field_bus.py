@@ -1,8 +1,9 @@
-"""A bus whose stations are rows of a vectorised field: frames in, frames out, in microseconds.
+"""A bus whose stations are rows of a vectorised field; each frame takes microseconds.
 
-One `FieldBus` is one cluster's bus. It answers QUERY_STATUS and QUERY_STEPS, takes SUN, and passes
-commands on to the `Field`. It has no noise, and gates only where it is given the keys of its local
-controllers (`Gates`); boards (`twin.boards`) on a `TwinBus` have both, and all other messages.
+One `FieldBus` is the bus of one cluster. It replies to QUERY_STATUS and QUERY_STEPS, receives SUN,
+and passes commands on to the `Field`. It has no noise, and has gates only if it is given the keys
+of its local controllers (`Gates`); boards (`twin.boards`) on a `TwinBus` have both, and all other
+messages.
 """
 
 import asyncio
@@ -82,20 +83,21 @@ class FieldBus:
     rows
         Indices of this cluster's heliostats in the field; their addresses are 1, 2, and so on.
     took
-        Called with the name and the rows of each command; None: not called.
+        Function called with the name and the indices of each command; None: no call.
     keys
-        Key of each local controller, in the same order: each then has a gate, and takes a key of
-        the bus. Without them every whole frame is obeyed, signed or not.
+        Key of each local controller, in the same order, which gives each a gate and lets it accept
+        a bus key. Without keys every valid frame is obeyed, signed or not.
 
     Attributes
     ----------
     plugged
-        Whether the port is there.
+        Whether the port is present.
 
     Raises
     ------
     InputError
-        Rows outside the field, or none; keys for another number of heliostats.
+        If indices are outside the field or empty, or there are keys for a different number of
+        heliostats.
     """
 
     def __init__(
@@ -127,7 +129,7 @@ class FieldBus:
 
     @property
     def closed(self) -> bool:
-        """Whether the bus is closed for good."""
+        """Whether the bus is closed permanently."""
         return self._closing.is_set()
 
     async def run(self) -> None:
@@ -135,13 +137,13 @@ class FieldBus:
         await self._closing.wait()
 
     async def close(self) -> None:
-        """Close the bus for good."""
+        """Close the bus permanently."""
         self._closing.set()
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame without an answer, and let other buses of the process take their turn."""
+        """Send a frame without a reply, and let other buses of the process take their turn."""
         del expires, urgent
         await asyncio.sleep(0)
         if self.closed:
@@ -160,7 +162,7 @@ class FieldBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the answer, or b""."""
+        """Send a frame and return the reply, or b""."""
         del timeout, expires, complete
         if urgent:
             # In an emergency all buses and the plant take turns.

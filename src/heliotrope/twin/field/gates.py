@@ -1,7 +1,7 @@
-"""What the local controllers of a `FieldBus` check: the gate of the firmware, one for each row.
+"""The checks of local controllers on a `FieldBus`: the firmware's gate, one per heliostat.
 
-Without gates a field obeys every frame. With them each row takes a key of the bus, and judges
-signatures, numbers, tokens, expiries, MACs and editions by the firmware's own code
+Without gates a field obeys every frame. With gates each heliostat accepts a bus key, and checks
+signatures, numbers, tokens, expiries, MACs and editions with the firmware's own code
 (`lcu.wire.Gate`, `lcu.signing.BusKeys`).
 """
 

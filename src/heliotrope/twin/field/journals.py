@@ -1,4 +1,4 @@
-"""Journals of the local controllers of a vectorised field, and the beliefs they give."""
+"""Journals of the local controllers in a vectorised field, and the mechanisms that they imply."""
 
 import struct
 from binascii import crc32

@@ -1,9 +1,10 @@
 """The observers that check the safety invariants.
 
-`Observer` watches one cluster with its boards, `PlantObserver` the plant, `BeamObserver` the true
-beams, `VisitObserver` what photographs have taught the plant, `ResultObserver` the results of
-visits, `ProgressObserver` the progress of automatic control, `ShownObserver` what the plant shows,
-`DayObserver` whether the field is at stow while the sun is low; `TITLES` names the invariants.
+`Observer` monitors one cluster with its boards, `PlantObserver` the plant, `BeamObserver` the true
+beams, `VisitObserver` what the plant has learnt from photographs, `ResultObserver` the results of
+visits, `ProgressObserver` the progress of automatic control, `ShownObserver` what the plant
+displays, and `DayObserver` whether the field is at stow while the sun is low; `TITLES` names the
+invariants.
 """
 
 from heliotrope.twin.invariants.beams import BeamObserver

@@ -1,4 +1,4 @@
-"""The observer's account of one heliostat."""
+"""The observer's record of one heliostat."""
 
 from collections import deque
 from struct import unpack

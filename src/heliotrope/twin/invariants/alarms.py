@@ -1,19 +1,19 @@
-"""The observer of alarms: each has its cause in the true world, is raised for it, and ends with it.
+"""The observer of alarms: each alarm has a true cause, is raised for it, and ends with it.
 
-An alarm excuses whom it names from work (`twin.invariants.quiet`), so an alarm without a cause
-hides whatever is wrong. The observer has a table of the alarms that faults of the simulation cause
-and of those that persons, weather and automatic control do; any other has no cause at all. One that
-faults cause is raised only while such a fault lasts, or soon after; once all is well it ends by
-itself, unless a person must end it. A board without power, a board in FAULT, and a cluster of which
-the plant hears nothing must be named within a time (invariant 16). The table and the times are its
-own.
+An alarm exempts the heliostats that it names from the work checks (`twin.invariants.quiet`), so an
+alarm without a cause would hide any fault. The observer has a table of the alarms that simulated
+faults cause and of those caused by operators, weather and automatic control; any other alarm has no
+valid cause. An alarm caused by a fault may be raised only while the fault lasts, or soon after;
+once everything is in order the alarm must clear by itself, unless an operator has to clear it. A
+board without power, a board in FAULT, and a cluster from which the plant receives nothing must be
+named within a time limit (invariant 16). The table and the time limits are the observer's own.
 
-Some alarms say that mirrors did what nobody ordered. Where no fault is near, only the plant itself
-can have done it, and its own act is no cause (L2).
+Some alarms report that heliostats did something that nobody ordered. If no fault is near, only the
+plant itself can have caused it, and the plant's own action is not a valid cause (L2).
 
-An alarm of a mirror that points elsewhere says that what should have kept it from moving has
-failed. It has a cause only where a cluster is wrong from the start, where what is believed changes,
-or where a fault is near.
+An alarm about a heliostat that points elsewhere reports that whatever should have prevented the
+motion has failed. It has a valid cause only if a cluster is wrong from the start, if a belief
+changes, or if a fault is near.
 """
 
 import re

@@ -1,10 +1,11 @@
-"""The observer of answers: what a board says of itself, and a cluster of its boards, is true.
+"""The observer of replies: what boards report of themselves, and clusters of boards, is true.
 
-A board answers questions at one instant of virtual time, so its answer is compared with the true
-board at that instant: where its motors are and whether they turn, how long ago it booted and the
-last sun left the cluster, how often it has booted, and what its journal holds. The rows and
-numbers of a cluster's status are compared with the answers that have reached it and with the true
-time (invariant 11). The meaning of each bit, and all limits, are the observer's own.
+A board replies to queries at one instant of virtual time, so its reply is compared with the true
+board at that instant: where its motors are and whether they turn, how long ago it booted and when
+the last sun vector left the cluster, how often it has booted, and what its journal contains. The
+rows and numbers in a cluster's status are compared with the replies that have reached the cluster
+and with the true time (invariant 11). The meaning of each bit, and all limits, are the observer's
+own.
 """
 
 import zlib

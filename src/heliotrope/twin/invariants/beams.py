@@ -1,9 +1,9 @@
-"""The observer of beams: the true beam of each mirror beside the place where it was sent.
+"""The observer of beams: the true beam of each heliostat compared with its intended position.
 
-It knows the true mirror (mechanism, joints, sun) and the orders that left the plant, each for a
-heliostat by its name. It reads the name of a board's state and nothing else of the code under test,
-so a wrong clock, site, armature or address, and false step counts, show as a beam beside its place.
-It checks invariants 12 to 15.
+It knows the true heliostat (mechanism, joints, sun vector) and the orders that left the plant, each
+for a heliostat by name. Apart from the name of a board's state it uses nothing from the code under
+test, so a wrong clock, site, armature or address, and false step counts, appear as a beam that is
+off its position. It checks invariants 12 to 15.
 """
 
 import math
@@ -178,29 +178,30 @@ class BeamObserver(Judge):
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
-        Boards by name of the cluster.
+        Boards by cluster name.
     sun
-        Returns the true direction to the sun, (3,), at a time in s.
+        Function that returns the true direction to the sun, (3,), at a time in s.
     keep_outs
-        Balls that no beam may enter.
+        Spheres that no beam may enter.
     losses
-        Number of mirrors that automatic control may lose together and raise again without a person;
-        None: only persons command.
+        Number of heliostats that automatic control may lose together and raise again without an
+        operator; None: only operators command.
     unsurveyed
-        Heliostats of which the plant file says something else than is true: until they are
-        calibrated, their beams are beside where they are sent, by no more than this makes.
+        Heliostats about which the plant file is wrong. Until they are calibrated, their beams are
+        off their intended positions, by at most the effect of that error.
 
     Attributes
     ----------
     losses
-        Number of losses after which the field waits for a person.
+        Number of losses after which the field waits for an operator.
     proofs
-        Number of emergency orders of which every heliostat was said to be done.
+        Number of emergency orders for which every heliostat was reported as done.
     contradicted
-        Whether a witness contradicts the time that plant and clusters share: then no mirror may
-        join the receiver, and the places of idle beams are unknown. Set by the owner.
+        Whether a witness contradicts the time that plant and clusters share. In that case no
+        heliostat may join the receiver, and the positions of idle beams are unknown. Set by the
+        owner.
     """
 
     def __init__(
@@ -251,7 +252,7 @@ class BeamObserver(Judge):
                 mirror.elsewhere = True
 
     def on_emergency(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note DEFOCUS or STOW from the plant."""
+        """Note a DEFOCUS or STOW from the plant."""
         del name
         for heliostat in heliostats or self._mirrors:
             mirror = self._mirrors[heliostat]
@@ -263,42 +264,42 @@ class BeamObserver(Judge):
     def on_accepted(
         self, person: Person, token: int, ticket: Ticket, what: str, now: float
     ) -> None:
-        """Note a command of a person that the plant has accepted."""
+        """Note an operator command that the plant has accepted."""
         del person, token
         if what not in ("ROUGH", "PARAMETERS"):
             self.resumed(ticket.heliostats, what, now)
 
     def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
-        """Note DEFOCUS or STOW by a person: the mirrors are not automatic control's any more."""
+        """Note an operator's DEFOCUS or STOW, which ends automatic control of the heliostats."""
         del person, what, now
         self.taken(ticket.heliostats)
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an emergency that a person has raised: after it no mirror is automatic control's."""
+        """Note an operator's emergency, which removes all heliostats from automatic control."""
         del owner, act, now
         self.taken(self._mirrors)
 
     def resumed(self, heliostats: Iterable[str], what: str, now: float) -> None:
-        """Note a command of a person that the plant has accepted."""
+        """Note an operator command that the plant has accepted."""
         self.taken(heliostats)
         if what in _RESUMES:
             for name in heliostats:
                 self._mirrors[name].resumed_at = now
 
     def taken(self, heliostats: Iterable[str]) -> None:
-        """Note that a person commands mirrors: automatic control may not have them any more."""
+        """Note that an operator commands heliostats, which automatic control may no longer move."""
         for name in heliostats:
             self._mirrors[name].assigned = False
 
     def given(self, heliostats: Iterable[str], now: float) -> None:
-        """Note that a person has given mirrors to automatic control; it lost none before."""
+        """Note that an operator has put heliostats under automatic control, without any losses."""
         for name in heliostats:
             mirror = self._mirrors[name]
             if not mirror.assigned:
                 mirror.assigned, mirror.assigned_at = True, now
 
     def released(self, now: float) -> None:
-        """Note that a person lets automatic control go on after a loss."""
+        """Note that an operator lets automatic control resume after a loss."""
         self._departures.clear()
         self._released_at = now
         for mirror in self._mirrors.values():
@@ -307,9 +308,9 @@ class BeamObserver(Judge):
                 mirror.seen_up = False
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
-        """Note a report that has come to the plant: what automatic control can know by it.
+        """Note a report that the plant has received, which is what automatic control can know.
 
-        What is lost is told by the true states; the report only tells since when that is known.
+        The true states determine what is lost; the report only determines since when that is known.
         """
         for name, row in zip(names, status.nodes(), strict=True):
             mirror, age = self._mirrors.get(name), 1e-3 * int(row["heard_ms"])
@@ -337,7 +338,7 @@ class BeamObserver(Judge):
             self.losses += 1
 
     def on_progress(self, message: Progress, now: float) -> None:
-        """Forget the points before the one that is reported as done."""
+        """Drop the points before the one that is reported as done."""
         del now
         if message.stage is not Stage.DONE:
             return
@@ -353,18 +354,18 @@ class BeamObserver(Judge):
         self._alarms[alarm.condition, alarm.subject] = (now, alarm.active)
 
     def stalled(self, heliostat: str) -> None:
-        """Note that a drive has stalled, which only the flux sees: the whole proof is judged."""
+        """Note that a drive has stalled, which only the flux reveals; the whole proof is judged."""
         self._stalled.add(heliostat)
 
     def exchanged(self, heliostat: str) -> None:
-        """Note that another mirror's board is at a mirror: the place of its beam is unknown."""
+        """Note that a heliostat has another heliostat's board, so its beam position is unknown."""
         self._exchanged.add(heliostat)
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended, and its alarms with it.
+        """Note that the plant program has ended, and its alarms with it.
 
-        A mirror whose step counts were in doubt must be named anew by the next one, in the time
-        that any mirror has.
+        The next program must name each heliostat with doubtful step counts again, within the usual
+        time.
         """
         del now
         for mirror in self._mirrors.values():
@@ -380,14 +381,14 @@ class BeamObserver(Judge):
     # -- judgement ---------------------------------------------------------------------------
 
     def look(self, plant: PlantController | None, carried: Set[str], now: float) -> None:
-        """Judge all beams.
+        """Check all beams.
 
         Parameters
         ----------
         plant
-            None: it does not run.
+            The plant; None: it is not running.
         carried
-            Clusters that the plant reaches.
+            Clusters that the plant can reach.
         now
             s.
         """

@@ -1,8 +1,8 @@
 """The observer of the day: automatic control has the field at stow while the sun is low.
 
-It knows what persons have given to automatic control, and what they have done to it since, from
-these persons; the height of the sun, the boards, and which stretches are quiet (`quiet`). It shares
-no limit with the code under test (invariant 16).
+It knows from the operators what they have put under automatic control, and what they have done to
+it since; and it knows the elevation of the sun, the boards, and which periods are undisturbed
+(`quiet`). It shares no limit with the code under test (invariant 16).
 """
 
 from collections.abc import Iterable, Sequence, Set
@@ -29,16 +29,16 @@ _UP = (
 
 
 class DayObserver(Judge):
-    """Observes that the field is at stow while the sun is low; see the module.
+    """Checks that the field is at stow while the sun is low; see the module.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
         All heliostats.
     lowest
-        Elevation of the sun below which the field belongs at stow, rad.
+        Sun elevation below which the field belongs at stow, rad.
 
     """
 
@@ -51,30 +51,30 @@ class DayObserver(Judge):
         self._low_at, self._acted_at = inf, -inf
 
     def given(self, heliostats: Iterable[str], now: float) -> None:
-        """Note that a person has given heliostats to automatic control."""
+        """Note that an operator has put heliostats under automatic control."""
         for name in heliostats:
             self._assigned.setdefault(name, now)
 
     def taken(self, heliostats: Iterable[str]) -> None:
-        """Note that a person has moved heliostats: whose they are then is not judged."""
+        """Note that an operator has moved heliostats, whose positions are then not judged."""
         for name in heliostats:
             self._assigned.pop(name, None)
 
     def took(self, now: float) -> None:
-        """Note that a person has the command authority, or asks for it."""
+        """Note that an operator holds the command authority, or requests it."""
         self._acted_at = now
 
     def look(
         self, plant: PlantController | None, quiet: Set[str], sun: FloatArray, now: float
     ) -> None:
-        """Judge where the mirrors are.
+        """Check where the heliostats are.
 
         Parameters
         ----------
         plant
-            None: it does not run.
+            The plant; None: it is not running.
         quiet
-            Heliostats in a quiet stretch.
+            Heliostats in an undisturbed period.
         sun
             True direction to the sun, (3,).
         now

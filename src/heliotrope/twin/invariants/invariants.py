@@ -181,7 +181,7 @@ ASKED = {
 
 
 class InvariantError(HeliotropeError):
-    """An invariant is broken.
+    """An invariant was violated.
 
     Attributes
     ----------
@@ -305,7 +305,7 @@ class Judge:
 
 
 class Observer(Judge):
-    """Listens to bus, boards and plant, and raises at the first broken invariant.
+    """Listens to bus, boards and plant, and raises at the first violated invariant.
 
     It is a `twin.boards.bus.Tap` and a `twin.boards.board.Witness`; `look` is called every half
     second.
@@ -313,26 +313,26 @@ class Observer(Judge):
     Parameters
     ----------
     boards
-        Boards in the order of their places on the bus.
+        Boards in the order of their positions on the bus.
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     sun
-        Returns the true direction to the sun, (3,), at a time in s.
+        Function that returns the true direction to the sun, (3,), at a time in s.
     keep_outs
-        Balls that no commanded beam may enter.
+        Spheres that no commanded beam may enter.
 
     Attributes
     ----------
     frames, orders, runs
-        The ledgers, and the account of the plants' runs.
+        The ledgers, and the record of the plant runs.
     leased_at
         When the plant last sent a lease on a healthy line, s.
     jumped_at, disturbed_at
         When a clock or counter last jumped; when line, bus or cluster last failed; s.
     autonomy
-        Autonomy that the plant's leases grant, s.
+        Autonomy granted by the plant's leases, s.
     entered
-        How often each state was entered.
+        Number of times each state was entered.
     """
 
     def __init__(
@@ -357,21 +357,21 @@ class Observer(Judge):
             account.board.witness = self
 
     def call(self, names: Mapping[int, str]) -> None:
-        """Call each heliostat by the name that the cluster has for its address."""
+        """Call each heliostat by the name that the cluster uses for its address."""
         for account in self.accounts:
             account.name = account.written = names[account.address]
 
     def doubt(self, board: Board) -> None:
-        """Note that another board is at a mirror, or that a drive has stalled.
+        """Note that a heliostat has another board, or that a drive has stalled.
 
-        It stores other values than before, and the place of its beam is unknown.
+        The board stores other values than before, and the position of its beam is unknown.
         """
         self._by_address[board.outfit.address].unsure = True
 
     def edited(self, file: Mapping[str, str], now: float) -> None:
-        """Note what is wrong in the file that the cluster now begins with; see `Pod.file`.
+        """Note what is wrong in the file with which the cluster now starts; see `Pod.file`.
 
-        A heliostat that is missing there is addressed no more, so it counts as cut off.
+        A heliostat that is missing from the file is no longer addressed, so it counts as cut off.
         """
         for account in self.accounts:
             account.written = file.get(account.name, account.name)
@@ -383,7 +383,7 @@ class Observer(Judge):
     # -- the bus (Tap) ---------------------------------------------------------------------
 
     def sent(self, frame: bytes, now: float) -> None:
-        """Judge a frame that the cluster sends."""
+        """Check a frame that the cluster sends."""
         sent = self.frames.note(frame, now)
         if sent is None:
             self.check(6, False, now, "cluster", f"it sent {len(frame)} bytes that are not a frame")
@@ -472,7 +472,7 @@ class Observer(Judge):
         return fingerprint(account.board, gate=how in ("damaged", "twice"), clock=not by_cluster)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Note an answer that the master has received."""
+        """Note a reply that the master has received."""
         frames = wire.Reader().feed(data)
         # If a late answer came first, only the last frame is current.
         for frame in frames[-1:] if how == "late" else frames:
@@ -484,7 +484,7 @@ class Observer(Judge):
     # -- the boards (Witness) --------------------------------------------------------------
 
     def acted(self, board: Board, what: str, now: float) -> None:
-        """Judge an action of a board."""
+        """Check an action of a board."""
         account = self._by_address[board.outfit.address]
         node = board.node
         if what == "cut" or node is None:
@@ -603,7 +603,7 @@ class Observer(Judge):
     def stepped(
         self, board: Board, axis: int, direction: int, count: int, interval_us: int
     ) -> None:
-        """Judge a segment of steps: range, rate, and the order of the axes."""
+        """Check a segment of steps: range, rate, and the order of the axes."""
         account, now = self._by_address[board.outfit.address], board.now
         name, which = account.name, ("azimuth", "elevation")[axis]
         rate = 1e6 / max(1, interval_us)
@@ -634,7 +634,7 @@ class Observer(Judge):
         self.orders.note(order)
 
     def given_stow(self, heliostat: str, stow: tuple[int, int]) -> None:
-        """Note a stow position, steps, that a heliostat was sent."""
+        """Note a stow position, steps, that was sent to a heliostat."""
         for account in self.accounts:
             if account.name == heliostat:
                 account.stows.add(stow)
@@ -642,7 +642,7 @@ class Observer(Judge):
     def emergency(
         self, name: str, now: float, *, carried: bool, heliostats: Iterable[str] = ()
     ) -> None:
-        """Note DEFOCUS or STOW of heliostats (() for all); ``carried``: line and cluster work."""
+        """Note a DEFOCUS or STOW of heliostats (() for all); ``carried``: line and cluster work."""
         if carried:
             self._emergencies.append((name, now))
         whom = set(heliostats)
@@ -651,7 +651,7 @@ class Observer(Judge):
                 account.must(name, now)
 
     def jumped(self, now: float, place: int | None = None) -> None:
-        """Note a jump of a clock, or of the counter of the board at a place."""
+        """Note a jump of a clock, or of the counter of a board."""
         self.jumped_at = now
         if place is not None:
             self.accounts[place].jumped()
@@ -662,11 +662,11 @@ class Observer(Judge):
         self._dark_since = min(self._dark_since, now)
 
     def time_acknowledged(self) -> None:
-        """Note that a person has acknowledged the jump."""
+        """Note that an operator has acknowledged the jump."""
         self._dark_since = float("inf")
 
     def disturbed(self, now: float, *, crashed: bool = False) -> None:
-        """Note a failure of line, bus or cluster, which cancels what was due from the cluster."""
+        """Note a failure of line, bus or cluster, which cancels what the cluster was due to do."""
         self.disturbed_at = now
         self._emergencies.clear()
         if crashed:
@@ -675,7 +675,7 @@ class Observer(Judge):
                 account.forget()
 
     def on_progress(self, message: Progress, now: float) -> None:
-        """Judge a report to the plant about a command."""
+        """Check a progress report to the plant about a command."""
         order = self.orders.by_identity.get(message.identity)
         if order is None:
             return
@@ -695,7 +695,7 @@ class Observer(Judge):
                     self.check(11, reached, now, subject, saw)
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
-        """Judge a report to the plant: each heliostat's age and state must be true."""
+        """Check a status report to the plant: each heliostat's age and state must be true."""
         by_name = {account.name: account for account in self.accounts}
         for name, row in zip(names, status.nodes(), strict=True):
             account = by_name.get(name)
@@ -723,7 +723,7 @@ class Observer(Judge):
     # -- time ------------------------------------------------------------------------------
 
     def look(self, now: float) -> None:
-        """Judge everything that must have happened by now."""
+        """Check everything that must have happened by now."""
         for name, at in self._emergencies:
             saw = f"{name} was ordered {now - at:.2f} s ago and is not on the bus"
             self.check(4, now - at <= ORDER_WITHIN, now, "cluster", saw)

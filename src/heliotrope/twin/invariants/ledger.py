@@ -1,4 +1,4 @@
-"""Ledgers of a listener: the frames of the bus and the orders of the plant."""
+"""Ledgers of a listener: the frames on the bus and the orders of the plant."""
 
 from collections import Counter
 from collections.abc import Iterable

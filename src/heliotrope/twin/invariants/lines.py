@@ -1,9 +1,9 @@
-"""The observer of the line between the plant and a cluster: one that was lost comes back.
+"""The observer of the line between the plant and a cluster: a lost line must be restored.
 
-A cluster that never rejoins is safe, and its mirrors are never used again. The observer knows from
-the faults of the run when nothing stands between two programs that run (invariant 16). Then they
-must be connected within a time, and the plant's leases must come at their rate, whoever has the
-command authority. Its times are its own.
+A cluster that never reconnects is safe, but its heliostats are never used again. The observer knows
+from the faults of the run when nothing separates two running programs (invariant 16). They must
+then be connected within a time limit, and the plant's leases must arrive at their rate, whoever
+holds the command authority. The time limits are the observer's own.
 """
 
 from heliotrope.twin.invariants.invariants import Judge

@@ -1,4 +1,4 @@
-"""The observers of one plant, its program and its persons."""
+"""The observers of one plant, its program and its operators."""
 
 from dataclasses import dataclass
 

@@ -1,14 +1,14 @@
-"""The observer of persons: what a person has ordered or locked stands until it is ended (17).
+"""The observer of operators: what a person has ordered or locked lasts until it is ended (17).
 
-It keeps a ledger of its own, from the calls of persons and not from the plant: the emergencies that
-each person ordered, with their acts, and withdrew; the heliostats that each person locked, and the
-locks returned. While an order stands, the plant shows it under its owner's name, an emergency of at
-least that act holds, and no mirror is up once it has had the time to turn away. A heliostat that a
-person has locked stands still at stow until the last lock on it is returned, whatever is ordered,
-and nothing is written to it.
+It keeps its own ledger, from the calls that operators make and not from the plant: the emergencies
+that each person ordered, with their actions, and withdrew; the heliostats that each person locked,
+and the locks removed. While an order is active, the plant shows it under its owner's name, an
+emergency of at least that action is active, and no heliostat is up once it has had the time to turn
+away. A heliostat that a person has locked remains at rest at stow until its last lock is removed,
+whatever is ordered, and nothing is written to it.
 
-A board that starts anew is left out until it stands still again: what it does at a start no lock
-can prevent, which is why a person at a mirror uses its switch.
+A board that restarts is exempt until it is at rest again, because no lock can prevent what it does
+at start-up; that is why anyone who works at a heliostat uses its switch.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """The observer of the plant: what it accepts, records, shows and lets join, in true time.
 
-It works beside one `twin.invariants.Observer` for each cluster and, like them, trusts no report: it
+It works alongside one `twin.invariants.Observer` per cluster and, like them, trusts no report: it
 knows the holder of the authority from those who took it, the records from the disk, the age of a
-value from when the bus carried it, and the mirrors that join from the messages and the boards. It
+value from when the bus carried it, and the joining heliostats from the messages and the boards. It
 checks the plant's part of three invariants: 4 (authority), 10 (joining) and 11 (records, values and
 proofs).
 """
@@ -70,20 +70,20 @@ class PlantObserver(Judge):
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     disk
-        Holds the records.
+        Store that contains the records.
     settings
         Settings of the plant.
     clusters
         Observers of its clusters.
     automatic
-        Whether automatic control works beside the persons.
+        Whether automatic control is active alongside the operators.
 
     Attributes
     ----------
     old
-        Void tokens, and since when, s.
+        Invalid tokens, and since when, s.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class PlantObserver(Judge):
             cluster.orders.void(token, now + VOID_WITHIN)
 
     def granted(self, person: Person, token: int, now: float, *, seized: bool) -> None:
-        """Judge a grant of the authority."""
+        """Check a grant of the authority."""
         before = self._live(now)
         saw = f"{person.name} ({person.role.name.lower()}) was given the authority"
         good = person.role >= Role.OPERATOR
@@ -180,9 +180,9 @@ class PlantObserver(Judge):
         self._end(now)
 
     def gave_way(self, now: float, token: int = 0) -> None:
-        """Note that automatic control gives its authority to a person.
+        """Note that automatic control yields its authority to an operator.
 
-        ``token``: what it had, 0 if none. Its first lease with that may leave only after this.
+        ``token``: its token, 0 if none. The first lease with that token may leave only after this.
         """
         if self._by_itself():
             self._end(now)
@@ -216,13 +216,13 @@ class PlantObserver(Judge):
 
     @property
     def automatic(self) -> bool:
-        """Whether automatic control has the authority."""
+        """Whether automatic control holds the authority."""
         return self._by_itself()
 
     def holder(self, now: float) -> str | None:
-        """Return the person with the authority for some moments; None: it is not sure.
+        """Return the person certain to hold the authority; None: it is not certain.
 
-        Automatic control gives it back without a word.
+        Automatic control releases it without notice.
         """
         holder = self._live(now)
         if holder is None or holder[0] == AUTOMATIC:
@@ -231,7 +231,7 @@ class PlantObserver(Judge):
         return holder[0].name if sure else None
 
     def until(self, token: int, until: float) -> float:
-        """Return when an order with a token becomes void."""
+        """Return when an order with a token becomes invalid."""
         void = self.old.get(token)
         return until if void is None else min(until, void + VOID_WITHIN)
 
@@ -244,7 +244,7 @@ class PlantObserver(Judge):
     def on_accepted(
         self, person: Person, token: int, ticket: Ticket, what: str, now: float
     ) -> None:
-        """Judge a command that the plant has accepted."""
+        """Check a command that the plant has accepted."""
         holder = self._live(now)
         held = holder is not None and holder[:2] == (person, token)
         saw = f"{what} by {person.name} was accepted without the authority"
@@ -267,7 +267,7 @@ class PlantObserver(Judge):
     def on_refused(
         self, person: Person, token: int, asked: tuple[str, Sequence[str]], reason: str, now: float
     ) -> None:
-        """Judge the reason of a refusal, where it names the command authority or the role.
+        """Check the reason of a refusal, if it names the command authority or the role.
 
         A command that its holder may give is refused for other reasons after it has renewed the
         authority, or before.
@@ -296,17 +296,17 @@ class PlantObserver(Judge):
         self.check(11, right, now, "plant", f"{what} by {who} was accepted without its record")
 
     def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
-        """Note DEFOCUS or STOW, which the plant must take from anybody."""
+        """Note a DEFOCUS or STOW, which the plant must accept from anyone."""
         self.obeyed(person.name, what, now, ticket.identity)
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an emergency, which the plant must take from anybody."""
+        """Note an emergency, which the plant must accept from anyone."""
         self.obeyed(owner, act.name, now)
 
     def obeyed(self, who: str, what: str, now: float, identity: str = "") -> None:
-        """Note a command that the plant must take from anybody, and may record later.
+        """Note a command that the plant must accept from anyone, and may record later.
 
-        One that is repeated within a moment is the same one, with the same identity.
+        A repetition within a moment is the same command, with the same identity.
         """
         if identity and now - self._obeyed.get(identity, float("-inf")) < MOMENT:
             return
@@ -318,7 +318,7 @@ class PlantObserver(Judge):
         self._noted_at[who, what] = now
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended: records that it still owed are lost."""
+        """Note that the plant program has ended; records not yet written are lost."""
         self._end(now)
         self._count(now)
         self._accepted = Counter(self._recorded)
@@ -328,9 +328,9 @@ class PlantObserver(Judge):
         self._hangs = self._stands = False
 
     def hangs(self, now: float, *, on: bool, stands: bool) -> None:
-        """Note that the plant's messages wait, and may later go out together; or that they flow.
+        """Note that the plant's messages are held up, and may later be sent together; or flow.
 
-        ``stands``: nothing of its program runs.
+        ``stands``: the whole program is frozen.
         """
         if on or self._hangs:
             self._hung_at = now
@@ -341,7 +341,7 @@ class PlantObserver(Judge):
     # -- messages --------------------------------------------------------------------------
 
     def posted(self, members: Sequence[str], message: Message, now: float) -> None:
-        """Judge a message before it goes to a cluster with some heliostats."""
+        """Check a message to some heliostats before it goes to a cluster."""
         if self._automatic and isinstance(message, Lease | Command | Parameters):
             self._leased(message.token, now)
         if not isinstance(message, Command | Parameters | Emergency):
@@ -420,15 +420,15 @@ class PlantObserver(Judge):
         return {state for at, state in self._heard[name] if at >= since}
 
     def counted(self, name: str, steps: tuple[int, int], now: float) -> None:
-        """Note the true step counts of a heliostat that answers its cluster."""
+        """Note the true step counts of a heliostat that replies to its cluster."""
         self._true_counts[name].append((now, steps))
 
     def true_counts(self, name: str, since: float) -> list[tuple[int, int]]:
-        """Return the true step counts with which a heliostat has answered since a time, s."""
+        """Return the true step counts with which a heliostat has replied since a time, s."""
         return [steps for at, steps in self._true_counts[name] if at >= since]
 
     def look(self, plant: PlantController | None, now: float) -> None:
-        """Judge everything that must have happened by now; None: the plant does not run."""
+        """Check everything that must have happened by now; None: the plant is not running."""
         self.hangs(now, on=self._hangs, stands=self._stands)
         if self._by_itself() and plant is not None:
             grant, held = plant.authority.grant, self._holder

@@ -1,14 +1,15 @@
-"""The observer of progress: automatic control raises the field and calibrates it, in time.
+"""The observer of progress: automatic control raises and calibrates the field, in time.
 
-The persons report to it what they have given to automatic control, and the holder of the command
-authority. In a quiet stretch (`quiet`) a heliostat that was given must leave stow, and be measured
-when a target is free; a visit must end, and leave no beam on its target; no part of the work may
-fail; measurements come while some are not calibrated (16). One that stays at stow because volumes
-lie across its way must be named. What a visit has taken is given back: no mirror stays LOCKED
-without a visit, a person or an emergency that has it (L1). One that automatic control has tracks
-the receiver, or is in a visit, within a time (L3). An emergency, and what is out of service,
-outlive a restart (L4). Whoever takes the command authority ends no visit, and a mirror that is
-photographed steps finely, whatever a person sets (16). All times are the observer's own.
+The operators report to it what they have put under automatic control, and who holds the command
+authority. In an undisturbed period (`quiet`) a heliostat under automatic control must leave stow,
+and be measured when a target is free; a visit must end, and leave no beam on its target; no part of
+the work may fail; and measurements must continue while some heliostats are not calibrated (16). A
+heliostat that stays at stow because volumes obstruct its path must be named. Whatever a visit has
+taken is released: no heliostat stays LOCKED without a visit, a person or an emergency that holds it
+(L1). A heliostat under automatic control tracks the receiver, or is in a visit, within a time limit
+(L3). An emergency, and the list of heliostats out of service, survive a restart (L4). Taking the
+command authority ends no visit, and a heliostat that is being photographed uses fine steps,
+whatever an operator sets (16). All time limits are the observer's own.
 """
 
 from collections import Counter
@@ -55,25 +56,25 @@ PHOTOGRAPH = "photograph "
 
 
 class ProgressObserver(Judge):
-    """Observes the progress of automatic control; see the module.
+    """Checks the progress of automatic control; see the module.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
         All heliostats.
     targets
         Calibration targets.
     together
-        Whether heliostats wait for each other, to be measured at once.
+        Whether heliostats wait for each other, to be measured together.
     across
-        Whether keep-out volumes may lie across the ways from stow.
+        Whether keep-out volumes may obstruct the paths from stow.
     lowest
-        Elevation of the sun below which the field belongs at stow, rad.
+        Sun elevation below which the field belongs at stow, rad.
     dark
-        Heliostats whose beams no camera sees: the plant file is wrong about them, so that they
-        go beside the receiver and the targets, or the mirror is covered.
+        Heliostats whose beams no camera sees, because the plant file is wrong about them, so that
+        their beams miss the receiver and the targets, or because the mirror is covered.
 
     """
 
@@ -105,37 +106,37 @@ class ProgressObserver(Judge):
     # -- persons -----------------------------------------------------------------------------
 
     def given(self, heliostats: Sequence[str]) -> None:
-        """Note that a person has given heliostats to automatic control."""
+        """Note that an operator has put heliostats under automatic control."""
         self._assigned.update(heliostats)
 
     def taken(self, heliostats: Sequence[str]) -> None:
-        """Note that a person has moved heliostats, and may do so until they are given again."""
+        """Note that an operator has moved heliostats, and may do so until they are given back."""
         self._assigned.difference_update(heliostats)
 
     def commanded(self, what: str, heliostats: Sequence[str]) -> None:
-        """Note a command of a person that the plant has accepted: a lock has its owner."""
+        """Note an operator command that the plant has accepted: a lock has its owner."""
         if what == "LOCK":
             self._locked.update(heliostats)
         elif what == "UNLOCK":
             self._locked.difference_update(heliostats)
 
     def took(self, operations: Operations, now: float) -> None:
-        """Note that a person has taken the command authority."""
+        """Note that an operator has taken the command authority."""
         running = operations.automatic.view().running
         self._took_at = now
         here = (run for run in running if run.target in self._targets)
         self._begun = {run.target: set(run.heliostats) for run in here}
 
     def switched(self, *, on: bool) -> None:
-        """Note that a person has switched calibration on or off."""
+        """Note that an operator has switched calibration on or off."""
         self._calibrates = on
 
     def emergency(self, *, on: bool) -> None:
-        """Note that a person has raised an emergency, or that it was cleared."""
+        """Note that an operator has ordered an emergency, or that it was cleared."""
         self._called = on
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended."""
+        """Note that the plant program has ended."""
         del now
         self._ended, self._calibrates = True, True
         self._since.clear()
@@ -143,7 +144,7 @@ class ProgressObserver(Judge):
         self._begun.clear()
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
-        """Note that a person has taken heliostats out of service, or given them back."""
+        """Note that an operator has taken heliostats out of service, or put them back."""
         for name in heliostats:
             if out:
                 self._out.setdefault(name, now)
@@ -161,20 +162,20 @@ class ProgressObserver(Judge):
         *,
         governs: bool,
     ) -> None:
-        """Judge the progress.
+        """Check the progress.
 
         Parameters
         ----------
         operations
-            None: the plant's program does not run, or is frozen.
+            The plant; None: its program is not running, or is frozen.
         quiet
-            Heliostats in a quiet stretch.
+            Heliostats in an undisturbed period.
         sun
             True direction to the sun, (3,).
         now
             s.
         governs
-            Whether automatic control has the command authority.
+            Whether automatic control holds the command authority.
         """
         if operations is None:
             self._since.clear()

@@ -1,11 +1,11 @@
-"""The observer of work: in a quiet stretch, what was ordered is done.
+"""The observer of work: in an undisturbed period, what was ordered is done.
 
-A field that does less, or later, breaks no invariant of safety. Where nothing has failed near a
-heliostat for a while, and no alarm names it, this observer expects that SUN and STATUS come at
-their rates, that an order which the plant has sent leads to the state that it asks for, that the
-beam is on its point to within what the steps allow, that no mirror leaves its work by itself, and
-that the plant is told so (invariant 16). It knows the orders from the line, the boards, and the
-faults of the run; its times are its own.
+A field that does less than ordered, or does it later, violates no safety invariant. If nothing has
+failed near a heliostat for a while, and no alarm names it, this observer expects that SUN and
+STATUS arrive at their rates, that an order sent by the plant leads to the requested state, that the
+beam is at its point to within the step size, that no heliostat stops working by itself, and that
+the plant is informed (invariant 16). It knows the orders from the line, the boards, and the faults
+of the run; its time limits are its own.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set

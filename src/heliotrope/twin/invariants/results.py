@@ -1,10 +1,11 @@
-"""The observer of results: what visits bring, beside the photographs that were taken.
+"""The observer of results: what visits produce, compared with the photographs that were taken.
 
-The camera reports each photograph to it, and it reads the step counts of the true mirror then. A
-sighting that the plant keeps must have the time, the point and the step counts of a photograph, and
-the true sun. A result must count the sightings that it brought, and its errors must be those of the
-two calibrations, before and after. The store and the logbook must have it, and a new program must
-know what the one before it knew (16). Visits that bring nothing do not go on without end (L2).
+The camera reports each photograph to the observer, which reads the step counts of the true
+heliostat at that moment. A sighting that the plant stores must have the time, the point and the
+step counts of a photograph, and the true sun vector. A result must state the number of sightings
+that it added, and its errors must be those of the two calibrations, before and after. The store and
+the logbook must contain it, and a restarted program must know what the previous program knew (16).
+Visits without any result must not continue indefinitely (L2).
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -79,25 +80,26 @@ class _Account:
 
 
 class ResultObserver(Judge):
-    """Observes sightings and results; see the module.
+    """Checks sightings and results; see the module.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
         All heliostats.
     records
-        The store, which outlives the plant's program.
+        The store, which outlives the plant program.
     sun
-        Returns the true direction to the sun, (3,), at a time in s.
+        Function that returns the true direction to the sun, (3,), at a time in s.
     zero
         POSIX time at 0 s of the clock.
     dark
-        Heliostats of which the plant file is wrong, or whose mirror is covered, so that no
+        Heliostats about which the plant file is wrong, or whose mirror is covered, so that no
         photograph shows their beams.
     together
-        Whether heliostats are measured at once: that one lamp or cloud spoils all is seldom.
+        Whether heliostats are measured together, so that a single lamp or cloud that spoils all of
+        them is rare.
 
     """
 
@@ -129,7 +131,7 @@ class ResultObserver(Judge):
         self._accounts[heliostat].pictures.append(Picture(now, target, point, counts))
 
     def asked(self, heliostats: Sequence[str]) -> None:
-        """Note that a person wants heliostats calibrated now, whatever came of it before."""
+        """Note that an operator wants heliostats calibrated now, whatever the previous result."""
         for name in heliostats:
             self._accounts[name].vain = self._accounts[name].searched = 0
 
@@ -139,7 +141,7 @@ class ResultObserver(Judge):
             self._accounts[name].typed += 1
 
     def look(self, operations: Operations | None, now: float) -> None:
-        """Judge the results since the last check; None: the plant's program does not run."""
+        """Check the results since the last check; None: the plant program is not running."""
         if operations is None:
             return
         begins = operations is not self._program

@@ -1,8 +1,9 @@
-"""The observer of the runs of plants: a cluster obeys one at a time.
+"""The observer of plant runs: a cluster obeys one at a time.
 
 A run that is obeyed has the lease, and keeps it as long as its leases reach the cluster in time. No
-motion of another run may be put on the bus before that lease has ended. Nothing here rests on what
-a cluster reports: leases count when they reach it, and obedience shows on the bus.
+motion command of another run may be sent on the bus before that lease has expired. The observer
+does not rely on what a cluster reports: leases count when they reach the cluster, and obedience is
+visible on the bus.
 """
 
 from collections.abc import Iterable

@@ -1,9 +1,8 @@
-"""The observer of sensors: what the plant was given by them, and whether it acted.
+"""The observer of sensors: what readings the plant received, and whether it acted.
 
-A reading beyond its limit, or one that fails to come, must be named by an alarm within 10 s, and
-takes every mirror off the receiver within 30 s: part of invariant 2. The limits are the observer's
-own. A sensor that shows a wrong value within its limits is no business of the observer: nobody
-could know.
+A reading beyond its limit, or a missing reading, must be named by an alarm within 10 s, and take
+every beam off the receiver within 30 s, which is part of invariant 2. The limits are the observer's
+own. A sensor with a wrong value within its limits is not judged, because nobody could know.
 """
 
 import math

@@ -1,10 +1,10 @@
-"""The observer of what is shown: tables, one heliostat, summary and events, beside what happened.
+"""The observer of displays: tables, heliostat pages, summary and events, against the truth.
 
-It makes the same requests as a page. It knows from the boards where their motors stand and
-how their beams lie, from the bus what they have reported and when, and from the persons what they
-have done. A row must be what was reported; its age must be the true one; a calibration is shown
-with the error that its own covariance gives; each act of a person is an event, once, and no event
-names a person who did nothing (11).
+It makes the same requests as a page. It knows from the boards where their motors are and where
+their beams go, from the bus what they have reported and when, and from the operators what they have
+done. A row must be what was reported, and its age must be the true age; a calibration is shown with
+the error that follows from its own covariance; each action of a person is an event, exactly once,
+and no event names a person who did nothing (11).
 """
 
 from collections import deque
@@ -52,12 +52,12 @@ NOTED_WITHIN = 1.0
 
 
 class ShownObserver(Judge):
-    """Observes what is shown; see the module.
+    """Checks what is displayed; see the module.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
         All heliostats.
     homes
@@ -65,11 +65,11 @@ class ShownObserver(Judge):
     targets
         Calibration targets.
     plant
-        Observer of the plant, which has the reports of boards, and the holder of the authority.
+        Observer of the plant, which has the board reports and the holder of the authority.
     persons
-        Names of the persons whose acts are reported to it.
+        Names of the operators whose actions are reported to it.
     dark
-        Heliostats about which the plant file is wrong: the places of their beams are unknown.
+        Heliostats about which the plant file is wrong, so their beam positions are unknown.
 
     """
 
@@ -108,11 +108,11 @@ class ShownObserver(Judge):
     # -- persons -----------------------------------------------------------------------------
 
     def acted(self, operations: Operations | None, person: str, word: str, now: float) -> None:
-        """Note an act of a person in a program; its event there has this word in it."""
+        """Note an action of a person in a program, whose event contains this word."""
         self._acts.append((now, person, word, operations))
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
-        """Note that a person has taken heliostats out of service, or given them back."""
+        """Note that an operator has taken heliostats out of service, or put them back."""
         for name in heliostats:
             self._changed[name] = now
             if out:
@@ -125,7 +125,7 @@ class ShownObserver(Judge):
     def look(
         self, operations: Operations | None, quiet: Set[str], sun: FloatArray, now: float
     ) -> None:
-        """Judge the displays; None: the plant's program does not run, or is frozen."""
+        """Check the displays; None: the plant program is not running, or is frozen."""
         for name, board in self._boards.items():
             steps = np.array([(a.turned, a.emitted) for a in board.axes], dtype=np.float64).T
             self._counts[name].append((now, steps - board.slip))

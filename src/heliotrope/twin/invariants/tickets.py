@@ -1,10 +1,10 @@
-"""The observer of tickets: who gives a command learns in time what becomes of it.
+"""The observer of tickets: whoever gives a command is told in time what becomes of it.
 
-A ticket says for each heliostat how far its command has come. While the plant's program runs, a
-heliostat must have acknowledged it, or the ticket must have ended for it, within a time of the
-observer's own, whatever has failed; commands that wait for their turn to join are left out. One
-that has failed must say why (invariant 16). Every ticket ends, and DONE is true: the mirror has
-been in the state that its command asks for (L2).
+A ticket states for each heliostat how far its command has progressed. While the plant program runs,
+a heliostat must have acknowledged the command, or the ticket must have ended for it, within a time
+limit of the observer's own, whatever has failed; commands that wait for their turn to join are
+exempt. If the command has failed, the ticket must say why (invariant 16). Every ticket ends, and
+DONE is true: the heliostat has been in the state that its command requests (L2).
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,8 @@
-"""The observer of visits: what photographs have taught the plant, beside the true mirrors.
+"""The observer of visits: what the plant learnt from photographs, against the true mirrors.
 
-It judges two things that the plant keeps: a calibration, which must bring the mirror's true beam to
-its aim within the calibration's own covariance (12), and a sighting, which must show the mirror's
-own beam (16).
+It checks two things that the plant stores: a calibration, which must bring the heliostat's true
+beam to its aim within the calibration's own covariance (12), and a sighting, which must show the
+heliostat's own beam (16).
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -34,24 +34,24 @@ SAME_TIME = 1.0
 
 
 class VisitObserver(Judge):
-    """Observes calibrations and sightings.
+    """Checks calibrations and sightings.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
         All heliostats.
     targets
         Calibration targets.
     away
-        Returns how far a POSIX time, s, is from that of the nearest photograph, s.
+        Function that returns how far a POSIX time, s, is from that of the nearest photograph, s.
     followed
-        Whether visits follow the beam that they photograph, so that the light of another one is
-        never kept; without that, only a later photograph contradicts it.
+        Whether visits follow the beam that they photograph, so that light from another beam is
+        never stored; otherwise only a later photograph contradicts it.
     dark
-        Heliostats that are wrong by far more than the priors allow: a covariance that stands on
-        these is not judged.
+        Heliostats whose errors far exceed the priors; a covariance based on these priors is not
+        judged.
 
     """
 
@@ -74,12 +74,12 @@ class VisitObserver(Judge):
         self._slipped: set[str] = set()  # sightings from before tell nothing of now
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended; the next one knows what the store has kept."""
+        """Note that the plant program has ended; the next one knows what the store contains."""
         del now
         self._kept.clear()
 
     def look(self, plant: PlantController | None, sun: FloatArray, now: float) -> None:
-        """Judge the calibrations since the last check; None: the plant does not run."""
+        """Check the calibrations since the last check; None: the plant is not running."""
         if plant is None:
             return
         for name, board in self._boards.items():

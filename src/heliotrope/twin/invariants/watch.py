@@ -1,4 +1,4 @@
-"""The observers of automatic control of a run, and the reports of persons that they need."""
+"""The observers of automatic control in a run, and the operator reports that they need."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
-"""A simulated world for a plant at work, in paced or virtual time.
+"""Simulated surroundings for a running plant, in paced or virtual time.
 
-Begin with `World`: its `ports` go into `plant.assembly.PlantAssembly`. `PacedLoop` runs both at a
-chosen multiple of real time.
+Begin with `World`: its `ports` are passed to `plant.assembly.PlantAssembly`. `PacedLoop` runs both
+at a chosen multiple of real time.
 """
 
 from heliotrope.twin.live.boards import BoardField

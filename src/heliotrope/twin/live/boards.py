@@ -1,7 +1,7 @@
-"""A small field of firmware-true boards.
+"""A small field of boards that run the real firmware.
 
 Each heliostat is a `twin.boards.board.Board`: the real local controller on simulated hardware, with
-journal, MACs and editions. Boards stand on a `TwinBus` at its baud rate.
+journal, MACs and editions. The boards are connected to a `TwinBus` with its baud rate.
 """
 
 from collections.abc import Sequence
@@ -43,19 +43,19 @@ class BoardField:
     truth, believed
         True mechanisms, and those that the boards store, (N,).
     machines
-        Limits and resting places of each.
+        Limits and rest positions of each.
     seed
         Seed of flash and motors.
 
     Attributes
     ----------
     boards
-        One for each name, in the same order; switched on by `bus`.
+        One board per name, in the same order; switched on by `bus`.
 
     Raises
     ------
     InputError
-        Too many heliostats.
+        If there are too many heliostats.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class BoardField:
         return len(self.boards)
 
     def bus(self, rows: range) -> TwinBus:
-        """Return the bus of a cluster of some rows; its boards are switched on."""
+        """Return the bus of a cluster with some of the heliostats; its boards are switched on."""
         made = []
         for place, row in enumerate(rows):
             old = self.boards[row].outfit

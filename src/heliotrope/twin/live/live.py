@@ -1,9 +1,9 @@
-"""A simulated world for a plant: a field on buses, clusters, cameras, and the truth.
+"""Simulated surroundings of a plant: a field on buses, clusters, cameras, and the truth.
 
-`World` provides the ports of `plant.assembly.PlantAssembly`. Everything runs in one event loop:
-the plant's program and its operations, a cluster program for each bus, the field in ticks of 50 ms.
-Mirrors have the errors of a quick installation; the plant assumes perfect ones, and learns
-from photographs. The clock decides the speed: a `VirtualClock` on a `PacedLoop` (real time times a
+`World` provides the ports of `plant.assembly.PlantAssembly`. Everything runs in one event loop: the
+plant program and its operations, a cluster program for each bus, the field in ticks of 50 ms.
+Heliostats have the errors of a rough installation; the plant assumes perfect ones, and learns from
+photographs. The clock determines the speed: a `VirtualClock` on a `PacedLoop` (real time times a
 speed) or on a `VirtualLoop` (as fast as possible).
 """
 
@@ -67,35 +67,35 @@ _MOST_TICKS = 20
 #: Step counts of each heliostat are requested each second in plants up to this size, and every few
 #: seconds in larger ones.
 _SMALL, _STEPS_EVERY = 320, 5
-#: Settings of a calibration that removes the errors of a quick installation, with the deviation
-#: of a beam in this world, rad.
+#: Settings of a calibration that removes the errors of a rough installation, with the standard
+#: deviation of a beam in this simulation, rad.
 CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto", sigma=2e-4)
 
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """Options of a simulated world.
+    """Options of the simulated surroundings.
 
     Attributes
     ----------
     seed
         Seed of imperfections and noise.
     rendered
-        Whether photographs are drawn and read; else centroids come with noise.
+        Whether photographs are rendered and evaluated; otherwise centroids are returned with noise.
     worker
-        Computes beside the event loop; None: nothing does, as in virtual time.
+        Runs computations outside the event loop; None: there is none, as in virtual time.
     installed
-        Makes the true mechanisms from the nominal ones; None: with errors as large as in Malan's
-        field.
+        Function that derives the true mechanisms from the nominal ones; None: with errors as large
+        as in Malan's field.
     boards
-        Whether each heliostat is a firmware-true board; for small plants.
+        Whether each heliostat is a board with the real firmware; for small plants.
     centroid
         Variance of centroids that are not photographed, m².
     link
-        Returns a cluster's end of the link to its plant, by the name of the cluster; None: both
-        ends are in this process, and `World.links` has the plant's.
+        Function that returns a cluster's end of the link to its plant, by cluster name; None: both
+        ends are in this process, and `World.links` has the plant's ends.
     bus_key
-        Key with which the frames of every bus are signed; b"": none is, and a field of arrays
+        Key that signs the frames on every bus; b"": frames are not signed, and a field of arrays
         obeys every frame.
     pty
         Whether the bus of boards is a pseudo-terminal, which the cluster opens as a serial port.
@@ -125,10 +125,10 @@ class World:
     ----------
     design
         The plant: groups of any kind of mechanism with two drives and a machine table, each
-        heliostat on a cluster. Its mechanisms count as nominal, and its local controllers store
+        heliostat in a cluster. Its mechanisms count as nominal, and its local controllers store
         them with the parameters of its heliostats.
     clock
-        Clock of the loop that it will run in.
+        Clock of the event loop in which it will run.
     options
         See `WorldOptions`.
 
@@ -141,23 +141,24 @@ class World:
     field
         The simulated heliostats.
     links
-        Plant's end of the link to each cluster.
+        The plant's end of the link to each cluster.
     buses
         Bus of each cluster.
     clusters, far
-        Their programs; their ends of the links to a plant elsewhere, to be run within `running`.
+        Programs of the clusters; and their ends of the links to an external plant, to be run within
+        `running`.
     cameras
-        Cameras of the targets; None where the plant has its own, which are sent photographs.
+        Cameras of the targets; None if the plant has its own, which receive photographs.
     flux
         Sensor of the flux on the receivers; None without a receiver.
     beats
-        Ticks left out because the machine was too slow.
+        Number of ticks skipped because the computer was too slow.
 
     Raises
     ------
     InputError
-        A cluster whose heliostats are not consecutive, a target without a camera, a mechanism with
-        one drive, or a machine table that is missing or incomplete.
+        If the heliostats of a cluster are not consecutive, a target has no camera, a mechanism has
+        one drive, or a machine table is missing or incomplete.
     """
 
     def __init__(self, design: Plant, clock: Clock, options: WorldOptions | None = None) -> None:
@@ -275,7 +276,7 @@ class World:
         assigned: Assigned | None = None,
         facts: Callable[[], Mapping[str, Any]] = dict,
     ) -> Ports:
-        """Return this world as the ports of a plant, with places for its records."""
+        """Return these surroundings as the ports of a plant, with storage for its records."""
         return Ports(
             self.links,
             self.clock,
@@ -318,7 +319,7 @@ class World:
 
     @property
     def faces(self) -> tuple[Target, ...]:
-        """The face of the receiver on which mirrors are measured."""
+        """The face of the receiver on which heliostats are measured."""
         visits = self.design.receiver_visits
         return () if visits is None else (self.design.receiver(visits.receiver).face,)
 
@@ -338,7 +339,7 @@ class World:
             self.field.advance(50 * ticks)
 
     def put_up(self) -> None:
-        """Put a field of arrays on track, as on a working day; a plant must lead its clusters."""
+        """Put a field of arrays on track, as on a working day; a plant must control it."""
         gps = gps_seconds(self.clock.utc())
         utc = self.clock.utc().timestamp()
         values = sun.broadcast_values(round(gps), utc, self.design.site)
@@ -347,7 +348,7 @@ class World:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Run field, buses, links and clusters for the time of a block."""
+        """Run field, buses, links and clusters for the duration of a block."""
         async with asyncio.TaskGroup() as group:
             turns = group.create_task(self._turn())
             async with running(*self._parts), running(*self.clusters):
@@ -361,15 +362,15 @@ def steps_every(heliostats: int) -> int:
 
 
 def true_mechanisms(design: Plant, options: WorldOptions) -> Mechanism:
-    """Return the true mechanisms of a world, in the order of the design, (N,).
+    """Return the true mechanisms of the simulation, in the order of the design, (N,).
 
-    They do not depend on the parameters of the design's heliostats, which the local controllers of
-    the world store.
+    They do not depend on the parameters of the heliostats in the design, which the simulated local
+    controllers store.
 
     Raises
     ------
     InputError
-        A mechanism with one drive.
+        If a mechanism has one drive.
     """
     groups = design.groups.values()
     return together([_installed(group, options, i) for i, group in enumerate(groups)])

@@ -1,9 +1,9 @@
 """An event loop whose time runs at a chosen speed, and waits for late timers.
 
-Loop time is wall time times the speed, but it never passes a timer that has not fired. Where the
-machine is too slow for the speed, or stands still for a while, simulated time slows down instead of
-jumping over leases and deadlines; `PacedLoop.lag` gives by how much. Nor does it pass
-`PacedLoop.until`, by which a program waits for another.
+Loop time is wall time times the speed, but it never passes a timer that has not fired. If the
+computer is too slow for the speed, or stops for a while, simulated time slows down instead of
+jumping over leases and deadlines; `PacedLoop.lag` states by how much. Nor does loop time pass
+`PacedLoop.until`, which lets one program wait for another.
 """
 
 import asyncio
@@ -66,16 +66,16 @@ class PacedLoop(asyncio.SelectorEventLoop):
     Parameters
     ----------
     speed
-        Loop seconds per second of wall time, above 0 to 1000.
+        Loop seconds per second of wall time, above 0 and up to 1000.
     start
         First value of `time`, s.
     wall
-        Gives wall time, s.
+        Function that returns wall time, s.
 
     Raises
     ------
     InputError
-        A speed out of range.
+        If the speed is out of range.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class PacedLoop(asyncio.SelectorEventLoop):
 
     @property
     def speed(self) -> float:
-        """Loop seconds per second of wall time, if the machine keeps up; 0 stands still."""
+        """Loop seconds per second of wall time, if the computer keeps up; 0 stops the loop time."""
         return self._pace.speed
 
     @speed.setter
@@ -105,7 +105,7 @@ class PacedLoop(asyncio.SelectorEventLoop):
 
     @property
     def until(self) -> float:
-        """Loop time that is not passed, s; infinite if nothing holds it."""
+        """Loop time that must not be passed, s; infinite if there is no limit."""
         return self._pace.until
 
     @until.setter

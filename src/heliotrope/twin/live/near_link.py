@@ -1,7 +1,7 @@
-"""A link between plant and cluster in one process that takes no time and loses nothing.
+"""A link between plant and cluster within one process, without delay or loss.
 
-For whole fields: the heartbeats of real links would cost more than everything else where there are
-hundreds of clusters. `links.in_process` simulates what a real line does to messages.
+For whole fields, because with hundreds of clusters the heartbeats of real links would cost more
+than everything else. `links.in_process` simulates the effects of a real line on messages.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ class NearLink:
     name
         Name of the other end.
     plugged
-        Whether this end is plugged in; unplug one to cut the line.
+        Whether this end is plugged in; unplug it to cut the line.
     other
         The other end.
     """
@@ -48,7 +48,7 @@ class NearLink:
 
     @property
     def closed(self) -> bool:
-        """Whether the link is closed for good."""
+        """Whether the link is closed permanently."""
         return self._closing.is_set()
 
     @property
@@ -68,7 +68,7 @@ class NearLink:
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
     ) -> SendOutcome:
-        """Put a message at the other end."""
+        """Deliver a message to the other end."""
         del hold
         if self.closed:
             raise LinkClosedError(f"link to {self.name}: it is closed")
@@ -83,7 +83,7 @@ class NearLink:
         return SendOutcome.SENT
 
     def take(self, data: bytes, expires: float | None) -> None:
-        """Take a message from the other end."""
+        """Receive a message from the other end."""
         self._waiting.append((data, expires))
         self._news.set()
 
@@ -103,7 +103,7 @@ class NearLink:
             await self._news.wait()
 
     async def close(self) -> None:
-        """Close the link for good."""
+        """Close the link permanently."""
         self._closing.set()
         self._news.set()
 

@@ -1,4 +1,4 @@
-"""What the local controllers of a simulated field store: calibrations that its plant has kept."""
+"""What the local controllers of a simulated field store: calibrations saved by its plant."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The cameras of a simulated field, which are asked for photographs as real ones are."""
+"""The cameras of a simulated field, which deliver photographs on request like real cameras."""
 
 import asyncio
 import itertools

@@ -1,4 +1,4 @@
-"""The folder by which a plant reaches a simulated field: plant file, links file, keys, sensors."""
+"""The folder through which a plant reaches a simulated field: plant file, links file, keys."""
 
 import secrets
 from collections.abc import Mapping
@@ -28,15 +28,15 @@ class TwinFolder:
     Attributes
     ----------
     folder
-        Where they stand.
+        Path of the folder.
     keys
         Key of each cluster.
     plant
-        Host and port at which the plant listens to clusters.
+        Host and port on which the plant listens for clusters.
     serves
         Host and port of the simulated field's own server.
     secret
-        Part of the addresses of that server, which others on the machine cannot guess.
+        Part of that server's addresses, which other users of the computer cannot guess.
     """
 
     folder: Path
@@ -54,23 +54,23 @@ def write_folder(
     *,
     steps_every: int,
 ) -> TwinFolder:
-    """Write plant file, links file and keys of a simulated field into a folder of its own.
+    """Write the plant file, links file and keys of a simulated field into a separate folder.
 
     Parameters
     ----------
     design
         The plant; cameras get the addresses of the simulated field.
     folder
-        It must not hold another simulated field.
+        Folder, which must not contain another simulated field.
     plant, serves
-        Host and port at which the plant listens to clusters, and of the field's own server.
+        Host and port on which the plant listens for clusters, and of the field's own server.
     steps_every
         Time between requests for step counts, s.
 
     Raises
     ------
     InputError
-        If the folder holds such files already, or a plant without clusters.
+        If the folder already contains such files, or the plant has no clusters.
     """
     for name in (PLANT, LINKS, KEYS):
         if (folder / name).exists():
@@ -103,7 +103,7 @@ def write_folder(
 
 
 def read_folder(folder: Path) -> TwinFolder:
-    """Return the files of a simulated field that ran before, to run it again.
+    """Return the files of an earlier simulated field, to run it again.
 
     Raises
     ------

@@ -50,25 +50,26 @@ _SENSED = 1.0
 
 @dataclass(frozen=True)
 class TwinOptions:
-    """Options of a simulated field as a program.
+    """Options of a simulated field that runs as a program.
 
     Attributes
     ----------
     start
-        Its time at the beginning; None: it follows this machine's clock, as a real field does.
+        Simulated time at the start; None: it follows the computer's clock, as a real field does.
     speed
         Simulated seconds per second; only with ``start``.
     seed
-        Of how the mirrors really stand, and of all noise.
+        Seed of the true installation errors, and of all noise.
     boards
-        Whether each heliostat is a firmware-true board; for small plants.
+        Whether each heliostat is a board with the real firmware; for small plants.
     pty
         Whether the bus of boards is a pseudo-terminal.
     up
-        Whether the heliostats track as soon as the plant leads them; else they begin at stow.
+        Whether the heliostats track as soon as the plant controls them; otherwise they begin at
+        stow.
     waits
         Whether it waits for the file of what its local controllers store (`write_boards`), and for
-        the plant to begin.
+        the plant to start.
     """
 
     start: datetime | None = None
@@ -107,7 +108,7 @@ class TwinProgram:
         self._parts: _Parts | None = None
 
     def loop(self) -> asyncio.AbstractEventLoop:
-        """Return a new event loop for it; its time stands still until the field begins."""
+        """Return a new event loop for it, whose time does not advance until the field starts."""
         if self._options.start is None:
             return asyncio.SelectorEventLoop()
         loop = PacedLoop(self._options.speed)

@@ -1,7 +1,8 @@
 """What a simulated field serves over HTTP: photographs, the state of its clock, true errors.
 
-The standard library's server answers each request in a thread; what concerns the field is asked in
-the field's event loop. Photographs are drawn in a process of their own (`drawing.Drawer`).
+The standard library's server answers each request in a thread; requests that concern the field are
+executed in the field's event loop. Photographs are rendered in a separate process
+(`drawing.Drawer`).
 """
 
 import asyncio

@@ -1,7 +1,7 @@
-"""Acts of persons at a plant with automatic control, each by the calls that a page makes.
+"""Operator actions at a plant with automatic control, through the same calls that a page makes.
 
-Each act that the plant accepts is reported to the observers. Who acts, and when, is another matter:
-see `shift` and `crew`.
+Each action that the plant accepts is reported to the observers. Who acts, and when, is determined
+elsewhere: see `shift` and `crew`.
 """
 
 import asyncio

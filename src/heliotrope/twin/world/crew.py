@@ -1,10 +1,10 @@
-"""The persons of a working day: two operators, a script, and an attendant of the field.
+"""The people of a working day: two operators, a script, and a field attendant.
 
-They do what people do, and do it at instants that matter: when a visit is on its way, between its
-photographs, while a mirror is locked for its parameters, while the beams are taken apart. Two of
-them may act at once. The attendant withdraws emergencies, presses Resume, and gives the field back
-to automatic control, some time later. On one day in two everybody goes to lunch for good, and
-automatic control has the rest of the day. A run may plan what they do instead (`CrewAct`).
+They do what people do, at critical moments: when a visit is on its way, between its photographs,
+while a heliostat is locked for its parameters, while the beams are being separated. Two of them may
+act at once. Some time later the attendant withdraws emergencies, presses Resume, and gives the
+field back to automatic control. On every other day, on average, everyone leaves at lunchtime, and
+automatic control has the rest of the day. A run may plan their actions instead (`CrewAct`).
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""Apply the faults of a run to a simulated plant, and end them."""
+"""Applies the faults of a run to a simulated plant, and removes them."""
 
 import asyncio
 import math

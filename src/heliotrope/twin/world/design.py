@@ -30,7 +30,7 @@ def design_of(
     *,
     together: bool = False,
 ) -> Plant:
-    """Return a plant of some heliostats, calibrated to the truth.
+    """Return a plant with some heliostats, calibrated to the truth.
 
     Parameters
     ----------

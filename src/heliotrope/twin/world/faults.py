@@ -1,7 +1,7 @@
 """Faults of a simulated run, drawn from a seed as a list.
 
-A fault is data: kind, time, duration, heliostat, severity. The same seed gives the same list; a
-list that breaks an invariant is shrunk by leaving faults out (`shrunk`).
+A fault is data: kind, time, duration, heliostat, severity. The same seed yields the same list; a
+list that violates an invariant is reduced by leaving faults out (`shrunk`).
 """
 
 import random
@@ -12,7 +12,7 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import ticks
 from heliotrope.twin.world.worlds import OWN_FAULTS, pause_of, weights_of
 
-#: Everything that can go wrong: kind, weight in the draw, meaning.
+#: Everything that can go wrong: kind, weight in the random draw, meaning.
 KINDS = {
     "line_cut": (3, "plant and cluster do not hear each other"),
     "line_one_way": (1, "one of them does not hear the other"),

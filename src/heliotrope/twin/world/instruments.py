@@ -1,4 +1,4 @@
-"""Sensors of a simulated plant, which may lie: wind, and flux on the receiver."""
+"""Sensors of a simulated plant, which may report false values: wind, and flux on the receiver."""
 
 import math
 import random

@@ -1,8 +1,8 @@
 """An intruder on the bus: records and replays frames, forges them without token or key, adds noise.
 
-Only the MAC protects against an intruder who can replay recorded time and sun at the right moment,
-and only what is stored (see `lcu.wire`). This intruder speaks at random moments, one frame at a
-time.
+Against an intruder who can replay recorded time and sun messages at the right moment, only the MAC
+protects, and it protects only what is stored (see `lcu.wire`). This intruder transmits at random
+moments, one frame at a time.
 """
 
 import random

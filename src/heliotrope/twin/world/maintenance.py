@@ -1,8 +1,8 @@
-"""Persons who work at the mirrors of the world "repairs": they lock, return, write and mend.
+"""Maintenance staff in the environment "repairs": they lock, unlock, write and repair.
 
-Two of them lock mirrors, each with a lock of their own, mostly one that the other has locked too.
-They try to write to what is locked, declare the step counts of boards that do not know them, and
-confirm what a restored store has.
+Two people lock heliostats, each with their own lock, mostly heliostats that the other has locked
+too. They try to write to locked heliostats, declare the step counts of boards that do not know
+them, and confirm the contents of a restored store.
 """
 
 import math

@@ -1,10 +1,10 @@
-"""Scripted persons at a real plant: shifts, commands and mistakes, drawn from a seed.
+"""Scripted operators at a real plant: shifts, commands and mistakes, drawn from a seed.
 
-An operator and an engineer move the heliostats from state to state, change aims, raise and clear
-emergencies, push parameters, and break each other's authority. They also command with an authority
+An operator and an engineer move the heliostats from state to state, change aims, raise and withdraw
+emergencies, send parameters, and seize each other's authority. They also command with an authority
 that they have lost, and a viewer tries commands that the role does not allow. Every command that
-the plant accepts is reported to its observer. A rogue holds a plant's end of a line, with old
-tokens.
+the plant accepts is reported to its observer. A rogue plant holds the plant's end of a line, with
+old tokens.
 """
 
 import asyncio

@@ -1,7 +1,8 @@
-"""The camera of visits to targets: true centroids with noise, and photographs that lie.
+"""The camera of target visits: true centroids with noise, and false photographs.
 
-A beam wavers by as much as the plant believes before it has learnt it, so that the covariance of a
-calibration, which stands on that, is the true one, and `VisitObserver` can judge it.
+A beam fluctuates by as much as the plant assumes before it has learnt the fluctuation, so that the
+covariance of a calibration, which is based on that assumption, is correct, and `VisitObserver` can
+judge it.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The scene of a run: site, time, places of the heliostats, and keep-out volumes."""
+"""The scene of a run: site, time, heliostat positions, and keep-out volumes."""
 
 import math
 import random

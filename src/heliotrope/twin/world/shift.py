@@ -1,8 +1,8 @@
-"""Persons beside automatic control: they give it the field, and interrupt it now and then.
+"""Operators alongside automatic control: they give it the field, and interrupt it occasionally.
 
-They are rarely on duty. They give heliostats back, clear emergencies, and let automatic control go
-on after a loss; and now and then they take the command authority for a while, send a mirror to
-stow, take one out of service, or raise an emergency in the middle of a visit.
+They are rarely on duty. They give heliostats back, withdraw emergencies, and let automatic control
+resume after a loss. Occasionally they take the command authority for a while, send a heliostat to
+stow, take one out of service, or order an emergency in the middle of a visit.
 """
 
 import asyncio

@@ -1,9 +1,9 @@
 """Deterministic simulation: a real plant, clusters and nodes in virtual time, with faults.
 
-A seed and a length define a run. The seed gives the heliostats and clusters, the actions of
-persons, the list of faults, the drift of the clocks, and the order in which the event loop takes
-ready callbacks. The same seed gives the same run, so one command replays a broken invariant
-(`RunResult.command`). The observers (`twin.invariants`) judge every step.
+A seed and a length define a run. The seed determines the heliostats and clusters, the actions of
+people, the list of faults, the drift of the clocks, and the order in which the event loop runs
+ready callbacks. The same seed yields the same run, so one command replays a violated invariant
+(`RunResult.command`). The observers (`twin.invariants`) check every step.
 """
 
 import asyncio
@@ -143,7 +143,7 @@ class RunPlan:
     seconds
         Length in simulated time.
     heliostats
-        Number, 1 to 32; the seed puts them on one bus or on two.
+        Number of heliostats, 1 to 32; the seed puts them on one bus or on two.
     pause
         Mean time between faults, s.
     only
@@ -151,14 +151,14 @@ class RunPlan:
     faults
         Faults of the run; None: drawn from the seed.
     worlds
-        Names of `WORLDS` that this run adds to the usual one.
+        Names of `WORLDS` that this run adds to the usual environment.
     acts
-        Acts of the persons of a day ("days"); None: drawn from the seed.
+        Actions of the people in a day ("days"); None: drawn from the seed.
 
     Raises
     ------
     InputError
-        An unknown world, or a length or a number of heliostats that cannot be simulated.
+        If a world is unknown, or a length or a number of heliostats cannot be simulated.
     """
 
     seed: int
@@ -184,12 +184,12 @@ class RunPlan:
 
     @property
     def size(self) -> int:
-        """Number of heliostats: enough for a joint visit, where there are joint visits."""
+        """Number of heliostats: enough for a joint visit, if there are joint visits."""
         return max(self.heliostats, PARTY) if joint_visits(self.worlds) else self.heliostats
 
     @property
     def clusters(self) -> int:
-        """Number of clusters: two with every third seed."""
+        """Number of clusters: two for every third seed."""
         return 2 if self.seed % 3 == 2 and self.size > 1 else 1
 
     @property
@@ -220,17 +220,17 @@ class RunResult:
     plan
         Definition of the run.
     violation
-        The first broken invariant, or None.
+        The first violated invariant, or None.
     problem
-        An exception of the code under test; empty without one.
+        An exception from the code under test; empty if there was none.
     checks
         Number of checks of each invariant.
     faults
         Number of faults of each kind.
     counts
-        Numbers of actions by persons and of messages to the plant.
+        Number of actions by people, and of messages to the plant.
     states
-        How often each state was entered.
+        Number of times each state was entered.
     seconds
         Simulated time.
     """
@@ -246,7 +246,7 @@ class RunResult:
 
     @property
     def good(self) -> bool:
-        """Whether nothing broke."""
+        """Whether no invariant was violated and nothing failed."""
         return self.violation is None and not self.problem
 
     @property
@@ -285,11 +285,11 @@ class Simulation:
     boards, pods
         All heliostats, and the clusters that they belong to.
     plant
-        The plant's program; None while it does not run.
+        The plant program; None while it is not running.
     disk
-        Holds the plant's records.
+        Store of the plant's records.
     operator
-        The persons at the plant.
+        The people at the plant.
     faults
         Number of faults of each kind so far.
     """
@@ -476,7 +476,7 @@ class Simulation:
         return pods
 
     def sun(self, now: float) -> FloatArray:
-        """Return the true direction to the sun at a time of the loop, (3,)."""
+        """Return the true direction to the sun at a given loop time, (3,)."""
         place, part = divmod(now - self.begin, _SUN_EVERY)
         first, second = self._sun_at(int(place)), self._sun_at(int(place) + 1)
         mixed = first + (second - first) * (part / _SUN_EVERY)
@@ -495,7 +495,7 @@ class Simulation:
         return float(np.mean([board.miss(sun, RECEIVER) <= OFF for board in self.boards]))
 
     def pod_of(self, fault: Fault) -> Pod:
-        """Return the cluster that a fault happens to."""
+        """Return the cluster that a fault affects."""
         board = self.boards[fault.target]
         return next(pod for pod in self.pods if board in pod.boards)
 
@@ -508,7 +508,7 @@ class Simulation:
     # -- the plant -------------------------------------------------------------------------
 
     def start_plant(self, group: asyncio.TaskGroup) -> None:
-        """Start the plant's program; only the disk and the wanted parameters are carried over."""
+        """Start the plant program; only the disk and the wanted parameters are carried over."""
         links = {}
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
@@ -594,7 +594,8 @@ class Simulation:
     def edit_plant_file(self, fault: Fault) -> None:
         """Write another stow position of a heliostat into the plant file: near, or on the receiver.
 
-        The plant must not write the latter: the beam of a mirror at stow would be on the receiver.
+        The plant must not send the latter, because the beam of the stowed heliostat would be on the
+        receiver.
         """
         fit = self._fits[fault.target]
         steps = np.array([2000, -2000]) if fault.size < 0.5 else np.array([-1500, 1000])
@@ -613,7 +614,7 @@ class Simulation:
         self._stows = {}
 
     def restore_store(self) -> None:
-        """Put a backup in the place of the plant's store."""
+        """Replace the plant's store with a backup."""
         if self._store is not None:
             self._store.restore()
             self._assigned, self._emergency = self._store.points, self._store.keeper
@@ -646,7 +647,7 @@ class Simulation:
             each.on_alarm(alarm, self._clock.monotonic())
 
     def crash_plant(self, now: float) -> None:
-        """Kill the plant's program wherever it is; the network tells the clusters."""
+        """Kill the plant program wherever it is; the clusters see their connections close."""
         for pod in self.pods:
             if pod.ear is not None:
                 pod.ear.end()
@@ -672,9 +673,10 @@ class Simulation:
             pod.observer.disturbed(now, crashed=True)
 
     def hang_plant(self, now: float, *, silent: bool, frozen: bool) -> None:
-        """Silence the plant's program, or freeze it, or let it go on.
+        """Silence the plant program, freeze it, or let it continue.
 
-        A silent one goes on without its lines; of a frozen one nothing runs, and persons wait.
+        A silenced program continues without its lines; in a frozen one nothing runs, and people
+        wait.
         """
         runs = self.plant is not None
         self.observer.hangs(now, on=(silent or frozen) and runs, stands=frozen and runs)
@@ -695,7 +697,7 @@ class Simulation:
         Raises
         ------
         InvariantError
-            Within an exception group, if an invariant is broken.
+            Within an exception group, if an invariant is violated.
         """
         damage = Damage(self, self.plan.drawn)
         async with contextlib.AsyncExitStack() as stack:
@@ -845,7 +847,7 @@ def _leaves(error: BaseException) -> Iterator[BaseException]:
 
 
 def shrink(outcome: RunResult, most: int = 60) -> RunResult:
-    """Return a failed run with fewer faults that breaks the same invariant.
+    """Return a failed run with fewer faults that violates the same invariant.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Many runs: over several processes, within a time limit, resumed where an earlier soak stopped."""
+"""Many runs: over several processes, within a time limit, resumed where the last one stopped."""
 
 import json
 from collections import Counter
@@ -26,7 +26,7 @@ class SoakResult:
     checks, faults, counts, states
         Sums over all runs; see `twin.world.simulation.RunResult`.
     broken
-        One line for each failed run: what broke, and the command that replays it.
+        One line for each failed run: what failed, and the command that replays it.
     """
 
     runs: int = 0
@@ -38,7 +38,7 @@ class SoakResult:
     broken: list[str] = field(default_factory=list)
 
     def add(self, line: dict[str, Any]) -> None:
-        """Add one run, as `summary` gives it."""
+        """Add one run, as returned by `summary`."""
         self.runs += 1
         self.seconds += line["seconds"]
         self.checks.update({int(k): v for k, v in line["checks"].items()})
@@ -75,7 +75,7 @@ def run_many(
     tell: Callable[[SoakResult], None] = lambda _: None,
     clock: Clock | None = None,
 ) -> SoakResult:
-    """Run plans until all are done or the time is up.
+    """Run plans until all are done or the time has expired.
 
     Parameters
     ----------
@@ -84,20 +84,20 @@ def run_many(
     processes
         Number of processes.
     budget
-        Wall time after which no further run begins, s.
+        Wall time after which no further run is started, s.
     progress
-        File with one line for each run; a run that is in it is skipped.
+        File with one line per run; runs already in the file are skipped.
     tell
         Called after each run.
     clock
-        Clock of the budget; None: the system's.
+        Clock of the time limit; None: the system's.
 
     Raises
     ------
     InputError
-        Fewer than one process.
+        If there is less than one process.
     FormatError
-        A progress file with other contents.
+        If a progress file has other contents.
     """
     if processes < 1:
         raise InputError(f"soak with {processes} processes; give 1 or more")

@@ -1,4 +1,4 @@
-"""The plant's store in the world "repairs": a real one, of which backups are made and restored."""
+"""The plant's store in the environment "repairs": a real store, backed up and restored."""
 
 import contextlib
 import tempfile

@@ -1,10 +1,10 @@
-"""The world "tour": nothing fails, and an engineer leads each heliostat through all commands.
+"""The environment "tour": nothing fails, and an engineer takes each heliostat through all commands.
 
 An observer of faults finds nothing in a field that does nothing. Here each command must be carried
-out: it is accepted, ends as done in time, the board is in the state that it asks for, and the plant
-shows it; no alarm is raised. A state is a name, so the true mirror is checked too: its beam is on
-the point that the engineer gave (12), and its motors have turned as the command says. At the end
-the whole field is defocused by an emergency, which is proven, and comes back.
+out: it is accepted and done in time, the board is in the requested state, the plant shows it, and
+no alarm is raised. A state is only a name, so the true heliostat is checked too: its beam is on the
+specified point (12), and its motors have moved as commanded. At the end a field-wide emergency
+defocuses the field, is confirmed, and the field comes back.
 """
 
 import asyncio

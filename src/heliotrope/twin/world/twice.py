@@ -1,7 +1,7 @@
-"""A second plant with the same keys: a backup that somebody starts while the first plant runs.
+"""A second plant with the same keys: a backup that is started while the first plant runs.
 
-It has the records, points and parameters of the moment at which it is started, people of its own,
-and the same lines, which it and the first plant take from each other.
+It has the records, points and parameters of the time at which it is started, its own operators, and
+the same lines, for which the two plants compete.
 """
 
 import asyncio

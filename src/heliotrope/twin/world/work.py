@@ -1,7 +1,7 @@
-"""Automatic control in a run: raising, visits to targets, and the memory of both.
+"""Automatic control in a run: raising, visits to targets, and the records of both.
 
-The worlds "visits", "lights", "day", "parties" and "days" run the whole plant, not its controller
-alone: `Operations` with automatic control and calibration visits. The store outlives the plant's
+The environments "visits", "lights", "day", "parties" and "days" run the whole plant, not only its
+controller: `Operations` with automatic control and calibration visits. The store outlives the plant
 program, as a disk does.
 """
 

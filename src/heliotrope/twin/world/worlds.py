@@ -1,4 +1,4 @@
-"""Worlds: what a run may add to the usual one, by name, and what is wrong from the start."""
+"""Environments (worlds): additions to the usual one, by name, and initial errors."""
 
 import random
 from collections.abc import Mapping, Sequence

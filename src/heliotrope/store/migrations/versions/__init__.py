@@ -1,1 +1,1 @@
-"""One module for each revision; none is changed once it was released."""
+"""One module per revision; a released revision is never changed."""

@@ -1,6 +1,6 @@
 """The first tables.
 
-A copy of what `store.tables` was then: a step never changes with the program.
+A copy of `store.tables` at that time, because a migration must not change with the program.
 """
 
 from alembic import op

@@ -1,4 +1,4 @@
-"""Hash chains over events and audit; the records that are there are linked as they are."""
+"""Hash chains over events and audit; existing records are chained as they are."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Passwords that somebody else has given, and that must be changed at first use."""
+"""Passwords set by someone else, which must be changed at first use."""
 
 from alembic import op
 from sqlalchemy import Column, ForeignKey, Text

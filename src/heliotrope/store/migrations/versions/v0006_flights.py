@@ -1,4 +1,4 @@
-"""Flights of a drone that the plant has taken."""
+"""Drone flights that the plant has imported."""
 
 from alembic import op
 from sqlalchemy import Column, Double, Text

@@ -1,4 +1,4 @@
-"""The learned hyperparameters of each group of mirrors."""
+"""The learnt hyperparameters of each heliostat group."""
 
 from alembic import op
 from sqlalchemy import Column, Double, Integer, Text

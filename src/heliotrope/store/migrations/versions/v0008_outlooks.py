@@ -1,4 +1,4 @@
-"""Predictions of the field's errors that the plant has made."""
+"""The plant's predictions of the field errors."""
 
 from alembic import op
 from sqlalchemy import Column, Double, Text

@@ -1,6 +1,7 @@
-"""The sightings behind versions, from one version until another.
+"""The sightings behind calibration versions, from one version to another.
 
-Every version named all its sightings, though each rests on those of the one before.
+Until then every version listed all its sightings, although each builds on those of the previous
+version.
 """
 
 from alembic import op

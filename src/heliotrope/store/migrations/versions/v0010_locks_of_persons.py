@@ -1,4 +1,4 @@
-"""Locks of persons: one for each person, and on targets, receivers and the tower too."""
+"""Personal locks: one per operator, also on targets, receivers and the tower."""
 
 import sqlalchemy as sa
 from alembic import op

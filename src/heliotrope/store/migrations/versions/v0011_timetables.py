@@ -1,4 +1,4 @@
-"""Timetables of calibrations that persons have put in force."""
+"""Calibration timetables activated by operators."""
 
 from alembic import op
 from sqlalchemy import Column, Double, Text

@@ -1,4 +1,4 @@
-"""A hash chain over accounts and tokens; those that are there are linked as they are."""
+"""A hash chain over accounts and tokens; existing entries are chained as they are."""
 
 import hashlib
 import json

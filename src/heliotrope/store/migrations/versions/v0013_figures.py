@@ -1,4 +1,4 @@
-"""Figures of the whole plant over time: power, readings, states, errors."""
+"""Plant-wide time series: power, readings, states, errors."""
 
 from alembic import op
 from sqlalchemy import JSON, Column, Double
