@@ -327,13 +327,18 @@ def field_flux(
         If there is no receiver or option of that name.
     """
     optics = (light or FieldOptics()).changed(changes)
-    direction = _one_sun(plant, time, sun)
+    direction = one_sun(plant, time, sun)
     scene = optics.scene(plant, direction, aim, _names(receiver))
     if scene.dark is not None and scene.dark.all():
         raise InputError(f"flux: none of the {len(plant)} heliostats can reach its aim at this sun")
     if rays:
         return _traced(plant, scene, optics, rays, seed, progress)
     engine = FieldFlux(scene, sun=optics.shape, air=optics.air, gaussians=optics.gaussians)
+    return result_of(plant, scene, engine)
+
+
+def result_of(plant: Plant, scene: Scene, engine: FieldFlux) -> PlantFlux:
+    """Return what an engine computed of a plant's scene."""
     intercepts = [power / max(float(engine.leaving.sum()), 1e-300) for power in engine.powers]
     lit = int((engine.leaving > 0.0).sum())
     maps = [
@@ -347,7 +352,14 @@ def _names(receiver: str | tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in ([receiver] if isinstance(receiver, str) else receiver) if name)
 
 
-def _one_sun(plant: Plant, time: Times | None, sun: npt.ArrayLike | None) -> FloatArray:
+def one_sun(plant: Plant, time: Times | None, sun: npt.ArrayLike | None) -> FloatArray:
+    """Return the unit vector to the sun, (3,), from one time or the sun itself.
+
+    Raises
+    ------
+    InputError
+        If there is not one of them, or the sun is below the horizon.
+    """
     if sun is not None and time is None:
         light = normalize(as_vectors(sun, "sun"))
     elif time is not None and sun is None:
