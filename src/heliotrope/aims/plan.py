@@ -1,5 +1,6 @@
 """Aims of a plant's heliostats under a flux limit, and strategies beside them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -202,7 +203,7 @@ def plan_aims(
     return AimPlan(strategy, result, found.defocused & ~off, off, found.field.middle_power, found)
 
 
-def compare_aims(plans: dict[str, AimPlan]) -> list[dict[str, Any]]:
+def compare_aims(plans: Mapping[Any, AimPlan]) -> list[dict[str, Any]]:
     """Return one row for each plan: power, peak, quantile over limit, defocused, gap."""
     return [
         {

@@ -11,11 +11,11 @@ from heliotrope.optics.scene import Scene
 from heliotrope.optics.shading import IntArray
 from heliotrope.optics.surfaces import Plate
 
-#: Names, in the order of a comparison.
-STRATEGIES = ("middle", "spread", "image-size", "optimal")
 #: Beams of "spread" and "image-size" keep so many standard deviations within the edge.
 INSIDE = 2.0
 Strategy = Literal["middle", "spread", "image-size", "optimal"]
+#: Names, in the order of a comparison.
+STRATEGIES: tuple[Strategy, ...] = ("middle", "spread", "image-size", "optimal")
 
 
 def choose(field: Candidates, scene: Scene, strategy: Strategy) -> IntArray:

@@ -1,5 +1,6 @@
 """``heliotrope aim``: aims that keep the flux on a receiver under a limit, although mirrors err."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -41,6 +42,7 @@ from heliotrope.errors import InputError, shown
 
 if TYPE_CHECKING:
     from heliotrope.aims import AimPlan, FluxLimit
+    from heliotrope.aims.strategies import Strategy
 
 #: Heliostats and cells that are named on the screen.
 NAMED = 5
@@ -111,7 +113,7 @@ def aim(
         "probability": probability, "keep": keep_all,
         "shared": SharedErrors(1e-3 * drift_mrad, clock_s, 1e-3 * cluster_mrad),
     }  # fmt: skip
-    names = STRATEGIES if strategy == "all" else (strategy,)
+    names: tuple[Strategy, ...] = STRATEGIES if strategy == "all" else (strategy,)
     with progress("choosing aims", as_json) as step:
         plans = {
             name: plan_aims(plant, when, receiver, strategy=name, progress=step, **options)
@@ -154,7 +156,7 @@ def _limit(text: str, margin: float) -> "FluxLimit":
     return FluxLimit(1e3 * parse_numbers(text, refusal, least=1e-3, most=6.4e4)[0], margin)
 
 
-def _document(plans: "dict[str, AimPlan]", chosen: "AimPlan") -> dict[str, Any]:
+def _document(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> dict[str, Any]:
     from heliotrope.aims import compare_aims
 
     power = chosen.light.heliostat_power
@@ -179,7 +181,7 @@ def _document(plans: "dict[str, AimPlan]", chosen: "AimPlan") -> dict[str, Any]:
     }
 
 
-def _print(plans: "dict[str, AimPlan]", chosen: "AimPlan") -> None:
+def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
     import numpy as np
 
     from heliotrope.aims import compare_aims

@@ -156,37 +156,15 @@ def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts,
         used += box[1] * box[3]
 
 
-@njit(**INNER)
-def _whole(images, count, out):
-    """Write power, mean and covariance of all images of a mirror together."""
-    for e in range(IMAGE):
-        out[e] = 0.0
-    for k in range(count):
-        p, u, v = images[k, 0], images[k, 1], images[k, 2]
-        out[0] += p
-        out[1] += p * u
-        out[2] += p * v
-        out[3] += p * (images[k, 3] + u * u)
-        out[4] += p * (images[k, 4] + u * v)
-        out[5] += p * (images[k, 5] + v * v)
-    if out[0] > 0.0:
-        for e in range(1, IMAGE):
-            out[e] /= out[0]
-        out[3] -= out[1] * out[1]
-        out[4] -= out[1] * out[2]
-        out[5] -= out[2] * out[2]
-
-
 @njit(**OPTIONS)
 def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, surfaces, moments,
            shape, columns, grid, scatter, modes, worth, own, shared, value):  # fmt: skip
     """Add what errors of the beams of mirrors ``rows[first:last]`` do to each cell.
 
-    A mirror's parts count by their common mean and covariance. ``scatter`` (H, 3): Cholesky factor
-    (uu, uv, vv) of the covariance of each beam's own error, rad. ``modes`` (H, M, 2): displacement
-    of each beam by M shared errors, rad. ``own`` (rows, columns) gets variances, (W/m²)²;
-    ``shared`` (M, rows, columns) changes of flux, W/m²; ``value`` (H,) the sum over cells of each
-    mirror's own variance times ``worth`` (rows, columns).
+    ``scatter`` (H, 3): Cholesky factor (uu, uv, vv) of the covariance of each beam's own error,
+    rad. ``modes`` (H, M, 2): displacement of each beam by M shared errors, rad. ``own`` (rows,
+    columns) gets variances, (W/m²)²; ``shared`` (M, rows, columns) changes of flux, W/m²;
+    ``value`` (H,) the sum over cells of each mirror's own variance times ``worth`` (rows, columns).
     """
     weights, variances = sums
     low, step, number, _ = grid
@@ -202,7 +180,7 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
     gradient = np.zeros((2, number, wide))
     for i in rows[first:last]:
         most = max(most, parts[3][i + 1] - parts[3][i])
-    images, image = np.empty((most, IMAGE + 2)), np.empty(IMAGE)
+    images = np.empty((most, IMAGE + 2))
     for i in rows[first:last]:
         row = mirrors[i]
         cosine = _ray(row, sun, ray, axes)
@@ -214,12 +192,12 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
         count, _ = _images(
             i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work
         )
-        _whole(images, count, image)
         visible = _columns(row, ray, axes, t, shape, columns, seen)
-        if not visible or image[0] <= 0.0:
+        if not visible:
             continue
         first_row, last_row = number, -1
-        for g in range(len(weights)):
+        for n in range(count * len(weights)):
+            image, g = images[n // len(weights)], n % len(weights)
             su = image[3] + t * t * (uu + variances[g])
             sv, suv = image[5] + t * t * (vv + variances[g]), image[4] + t * t * uv
             begin, end = _gauss(

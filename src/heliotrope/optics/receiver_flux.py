@@ -255,7 +255,7 @@ class FieldFlux:
 
         Notes
         -----
-        To first order; of each mirror's parts only their common mean and covariance count.
+        To first order in the errors.
         """
         plan, errors = self._in_columns(), (as_float(scatter), as_input(modes), as_input(worth))
         return plan.spread(self._field(), errors, groups)
