@@ -25,9 +25,11 @@ from heliotrope.optics.scene import Scene
 from heliotrope.optics.shading import IntArray
 
 #: Choices at most; the limit is approached from this share below it.
-ROUNDS, BELOW = 10, 5e-4
+ROUNDS, BELOW = 16, 5e-4
 #: Rounds after which no cell gets room back, and no mirror moves that need not.
 FREE = 3
+#: What is missing then is taken from the limit so many times over.
+BEYOND = 1.5
 #: What errors leave of the limit at least, for the next choice; excess that counts as none.
 LEAST, HOLDS = 0.02, 1e-3
 #: Sweeps of all choices but the first.
@@ -201,7 +203,7 @@ def _held(
             break
         new = found.quantile - choice.flux.T
         # From then on no cell gets room back, so that the rounds end.
-        more = new if k < FREE else np.maximum(more, new)
+        more = new if k < FREE else more + BEYOND * np.maximum(new - more, 0.0)
     assert best is not None
     if best.excess > HOLDS:
         _refuse(scene, best, demand)
