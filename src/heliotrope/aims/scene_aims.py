@@ -197,9 +197,10 @@ def _held(
             progress=_part(progress, k), **({} if first else {"sweeps": AGAIN if k < FREE else 0}),
         )  # fmt: skip
         found = _evaluated(scene, field, choice, demand, limit, light)
-        if best is None or found.excess < best.excess or found.excess <= 0.0:
+        if best is None or _rank(found) > _rank(best):
             best = found
-        if best.excess <= 0.0:
+        # Early rounds may leave room, taken for errors of a choice that stood higher.
+        if best.excess <= 0.0 and (k + 1 >= FREE or best.excess > -BINDS):
             break
         new = found.quantile - choice.flux.T
         # From then on no cell gets room back, so that the rounds end.
@@ -208,6 +209,12 @@ def _held(
     if best.excess > HOLDS:
         _refuse(scene, best, demand)
     return best
+
+
+def _rank(found: SceneAims) -> tuple[bool, float]:
+    """Return what orders aims: those that hold the limit by power, the others by excess."""
+    holds = found.excess <= 0.0
+    return holds, found.engine.powers[0] if holds else -found.excess
 
 
 def _part(progress: Step | None, done: int) -> Step | None:
