@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = "docs/reference/library"
 #: Packages in the order of the reference: from what a researcher needs to the programs of a plant.
 ORDER = (
-    "", "sun", "geometry", "mechanism", "field", "optics", "plot", "calibration", "imaging",
+    "", "sun", "geometry", "mechanism", "field", "optics", "aims", "plot", "calibration", "imaging",
     "airborne", "files", "errors", "links", "safety", "cluster", "plant", "store", "console", "lcu",
     "twin",
 )  # fmt: skip

@@ -105,6 +105,11 @@ COLUMNS = {
         "field", "mirrors", "figure", "sun_deg", "cold_ms", "limit_ms", "moved_ms",
         "moved_limit_ms", "cold_processor_ms", "grown_mb",
     },
+    "aiming": {
+        "field", "mirrors", "limit_of_peak", "cold_s", "cold_processor_s", "gap_percent",
+        "excess_percent", "warm_s", "warm_processor_s", "warm_gap_percent", "power_mw",
+        "image_size_mw", "image_size_peak_of_limit",
+    },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 #: A browser with fifty viewers, plants, days and many pictures take their time.

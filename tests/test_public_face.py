@@ -43,6 +43,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         "field",
         "files",
         "mechanism",
+        "aims",
         "optics",
         "plot",
         "sun",

@@ -16,11 +16,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from heliotrope import aims as aims
     from heliotrope import geometry as geometry
     from heliotrope import imaging as imaging
     from heliotrope import optics as optics
     from heliotrope import plot as plot
     from heliotrope import sun as sun
+    from heliotrope.aims import FluxLimit, SharedErrors
+    from heliotrope.aims import plan_aims as aim
     from heliotrope.calibration import (
         Learned,
         Sightings,
@@ -81,6 +84,7 @@ __version__ = "0.1.0"
 
 #: The module of each name.
 _HOMES = {
+    "FluxLimit": "heliotrope.aims",
     "Forecast": "heliotrope.calibration.learn",
     "Heliostat": "heliotrope.field",
     "Heliostats": "heliotrope.field",
@@ -88,10 +92,12 @@ _HOMES = {
     "Mechanism": "heliotrope.mechanism",
     "Plant": "heliotrope.field",
     "Receiver": "heliotrope.field",
+    "SharedErrors": "heliotrope.aims",
     "Sightings": "heliotrope.calibration",
     "Site": "heliotrope.sun",
     "Target": "heliotrope.field",
     "Tracking": "heliotrope.mechanism",
+    "aim": "heliotrope.aims",
     "beam_errors": "heliotrope.calibration",
     "calibrate": "heliotrope.calibration",
     "camera_target": "heliotrope.calibration",
@@ -132,9 +138,15 @@ _HOMES = {
     "write_sightings": "heliotrope.calibration",
 }
 #: Names that are shorter here than in their modules.
-_SHORT = {"compare": "compare_models", "flux": "field_flux", "open": "open_plant"}
+_SHORT = {
+    "aim": "plan_aims",
+    "compare": "compare_models",
+    "flux": "field_flux",
+    "open": "open_plant",
+}
 #: Modules that are used as such.
 _MODULES = {
+    "aims": "heliotrope.aims",
     "geometry": "heliotrope.geometry",
     "imaging": "heliotrope.imaging",
     "kinds": "heliotrope.mechanism.kinds",
@@ -144,6 +156,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "FluxLimit",
     "Forecast",
     "Heliostat",
     "Heliostats",
@@ -151,11 +164,14 @@ __all__ = [
     "Mechanism",
     "Plant",
     "Receiver",
+    "SharedErrors",
     "Sightings",
     "Site",
     "Target",
     "Tracking",
     "__version__",
+    "aim",
+    "aims",
     "beam_errors",
     "calibrate",
     "camera_target",

@@ -1,6 +1,5 @@
 """The vectorised field beside firmware-true boards: the same steps, from stow to stow."""
 
-import copy
 import functools
 from datetime import timedelta
 from typing import Any
@@ -29,6 +28,7 @@ from heliotrope.twin.boards.outfit import (
 )
 from heliotrope.twin.field.field import Field
 from heliotrope.twin.wind import Wind
+from support.copies import copied
 from support.midsummer import SITE, START
 
 TOKEN, COUNT = 0xF1E1D, 3
@@ -174,7 +174,7 @@ def _raised(count: int) -> Both:
 
 def standing_by(count: int = COUNT) -> Both:
     """Boards and a field of their own, of which all have gone up to standby."""
-    return copy.deepcopy(_raised(count))
+    return copied(_raised(count))
 
 
 def test_boards_that_go_on_from_a_copy_do_as_those_that_were_copied() -> None:

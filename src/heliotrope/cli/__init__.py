@@ -16,6 +16,7 @@ from heliotrope.cli._field_layout import layout
 from heliotrope.cli._keys import app as keys_app
 from heliotrope.cli._store import app as store_app
 from heliotrope.cli._usage import refusal
+from heliotrope.cli.aim import aim
 from heliotrope.cli.calibrate import calibrate
 from heliotrope.cli.camera import app as camera_app
 from heliotrope.cli.cluster import cluster
@@ -72,6 +73,7 @@ app.command()(parameters)
 app.add_typer(field_app, name="field")
 app.add_typer(camera_app, name="camera")
 app.command()(flux)
+app.command()(aim)
 app.command()(image)
 app.command()(calibrate)
 app.command()(plan)

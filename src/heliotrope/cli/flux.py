@@ -1,6 +1,5 @@
 """``heliotrope flux``: what each heliostat puts on the receiver, and what is lost where."""
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -9,9 +8,7 @@ import typer
 
 from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import (
-    day_of,
     open_plant,
-    parse_numbers,
     parse_point,
     parse_site,
     parse_time,
@@ -19,12 +16,32 @@ from heliotrope.cli._common import (
     print_table,
     sunlit,
 )
-from heliotrope.errors import InputError, shown
+from heliotrope.cli._light import (
+    Air,
+    CantingOption,
+    CellOption,
+    Clean,
+    Dni,
+    Error,
+    FacetOption,
+    Field,
+    Focus,
+    Reflectivity,
+    Shape,
+    SiteOption,
+    Slope,
+    Sun,
+    Time,
+    Towers,
+    canting_of,
+    light_of,
+    noon,
+)
+from heliotrope.errors import InputError
 
 if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
     from heliotrope.optics import FieldOptics, FluxTable, PlantFlux
-    from heliotrope.optics.scene import Tower
 
 #: Suns of a table that are shown on the screen.
 SHOWN = 12
@@ -42,13 +59,9 @@ _WORDS = {
 
 
 def flux(
-    field: Annotated[Path, typer.Argument(help="Plant file, or a field in another format.")],
-    time: Annotated[
-        str | None, typer.Option(help="ISO 8601 with a time zone, or now. Default: noon today.")
-    ] = None,
-    sun: Annotated[
-        str | None, typer.Option(help="Sun vector east,north,up instead of a time.")
-    ] = None,
+    field: Field,
+    time: Time = None,
+    sun: Sun = None,
     every: Annotated[
         str | None,
         typer.Option(help="Write a table of the whole day with this step, such as 30min."),
@@ -65,58 +78,19 @@ def flux(
             help="Aim point east,north,up, m. Default: each heliostat's own aim, or the receiver."
         ),
     ] = None,
-    site: Annotated[
-        str | None, typer.Option(help="LATITUDE,LONGITUDE,HEIGHT of a field without a location.")
-    ] = None,
-    dni: Annotated[
-        float, typer.Option(min=0, max=2000, help="Direct normal irradiance, W/m².")
-    ] = 900.0,
-    shape: Annotated[
-        str,
-        typer.Option(
-            "--sun-shape",
-            help="Sun shape: limb, quartic, pillbox, buie:RATIO or gaussian:SIGMA in rad.",
-        ),
-    ] = "limb",
-    air: Annotated[
-        str,
-        typer.Option(
-            help="Atmosphere: clear, hazy, mirval, ballestrin-clear, ballestrin-hazy, "
-            "none, or the visibility in km."
-        ),
-    ] = "clear",
-    slope_mrad: Annotated[
-        float, typer.Option(min=0, max=50, help="Slope error of the surface per axis, mrad.")
-    ] = 1.0,
-    error_mrad: Annotated[
-        float, typer.Option(min=0, max=100, help="Expected error of the mirror normals, mrad RMS.")
-    ] = 1.0,
-    reflectivity: Annotated[
-        float, typer.Option(min=0, max=1, help="Reflectivity of a clean mirror.")
-    ] = 0.9,
-    clean: Annotated[
-        float, typer.Option(min=0, max=1, help="Fraction of the reflectivity that soiling leaves.")
-    ] = 1.0,
-    focus: Annotated[
-        str, typer.Option(help="Focus: slant, flat, or the focal length of all mirrors, m.")
-    ] = "slant",
-    facets: Annotated[
-        str | None, typer.Option(help="Columns and rows of equal facets, such as 5x7.")
-    ] = None,
-    canting: Annotated[
-        str,
-        typer.Option(
-            help="Canting of these facets: slant, a focal length in m, or the time for "
-            "which they are canted off-axis."
-        ),
-    ] = "slant",
-    cells: Annotated[
-        str | None, typer.Option(help="Rows and columns of each receiver, such as 20x56.")
-    ] = None,
-    tower: Annotated[
-        list[str] | None,
-        typer.Option(help="Obstacle: EAST,NORTH,RADIUS,TOP in m; may be repeated."),
-    ] = None,
+    site: SiteOption = None,
+    dni: Dni = 900.0,
+    shape: Shape = "limb",
+    air: Air = "clear",
+    slope_mrad: Slope = 1.0,
+    error_mrad: Error = 1.0,
+    reflectivity: Reflectivity = 0.9,
+    clean: Clean = 1.0,
+    focus: Focus = "slant",
+    facets: FacetOption = None,
+    canting: CantingOption = "slant",
+    cells: CellOption = None,
+    tower: Towers = None,
     rays: Annotated[
         float, typer.Option(min=0, max=1e9, help="Trace this many rays as an independent check.")
     ] = 0.0,
@@ -145,20 +119,8 @@ def flux(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Show the flux on the receivers and the efficiencies of the field and of each heliostat."""
-    from heliotrope.optics import FieldOptics
-
-    light = FieldOptics(
-        dni=dni,
-        shape=shape,
-        air=air,
-        slope=1e-3 * slope_mrad,
-        error=1e-3 * error_mrad,
-        reflectivity=reflectivity,
-        clean=clean,
-        focus=_focus(focus),
-        facets=None if facets is None else _facets(facets),
-        cells=_cells(cells),
-        towers=tuple(_tower(text) for text in tower or ()),
+    light = light_of(
+        dni, shape, air, slope_mrad, error_mrad, reflectivity, clean, focus, facets, cells, tower
     )
     files = {
         "csv": csv, "map": cells_csv, "netcdf": netcdf, "sam": sam, "solartherm": solartherm,
@@ -173,7 +135,7 @@ def flux(
     )
     order.check(field, table=every is not None or year, year=year)
     plant = open_plant(field, None if site is None else parse_site(site))
-    order = replace(order, light=replace(light, canting=_canting(canting, plant)))
+    order = replace(order, light=replace(light, canting=canting_of(canting, plant)))
     if year:
         _year(plant, order, any_of={"--time": time, "--sun": sun, "--every": every}, rays=rays)
     elif every is not None:
@@ -218,65 +180,12 @@ class _Order:
             print(f"{name}: {path}")
 
 
-def _focus(text: str) -> Literal["slant", "flat"] | float:
-    if text in ("slant", "flat"):
-        return "slant" if text == "slant" else "flat"
-    refusal = f"--focus {shown(text)}: give slant, flat, or a focal length from 0.1 to 1e5 m"
-    (length,) = parse_numbers(text, refusal, least=0.1, most=1e5)
-    return length
-
-
-def _facets(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", text, re.ASCII)
-    if match is None:
-        raise InputError(f"--facets {shown(text)}: give columns and rows such as 5x7")
-    return int(match[1]), int(match[2])
-
-
-def _canting(text: str, plant: "Plant") -> Any:
-    from heliotrope.sun import vector
-
-    if text == "slant":
-        return text
-    if re.fullmatch(r"[\d.]+", text, re.ASCII):
-        refusal = f"--canting {shown(text)}: give slant, 0.1 to 1e5 m, or a time"
-        return parse_numbers(text, refusal, least=0.1, most=1e5)[0]
-    return vector(parse_time(text), plant.site)
-
-
-def _cells(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text, re.ASCII)
-    size = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not (min(size) >= 1 and size[0] * size[1] <= 1_000_000):
-        raise InputError(
-            f"--cells {shown(text)}: give rows and columns such as 20x56, at most a million cells"
-        )
-    return size
-
-
-def _tower(text: str) -> "Tower":
-    from heliotrope.optics.scene import Tower
-
-    refusal = f"--tower {shown(text)}: give four numbers in m, east,north,radius,top"
-    east, north, radius, top = parse_numbers(text, refusal, count=4)
-    # Its foot lies below the ground of any field.
-    return Tower(east, north, radius, min(top - 1.0, -1e4), top)
-
-
 def _refuse(what: str, any_of: dict[str, str | None], rays: float) -> None:
     for name, value in any_of.items():
         if value is not None:
             raise InputError(f"{name}: {what} takes no {name}; leave it out")
     if rays:
         raise InputError(f"--rays: {what} is not traced; give one time")
-
-
-def _noon(plant: "Plant") -> Any:
-    from heliotrope.sun import events
-
-    return events(day_of(parse_time("now"), plant.site), plant.site).culmination
 
 
 def _moment(
@@ -292,7 +201,7 @@ def _moment(
 
     if time is not None and sun is not None:
         raise InputError("give --time or --sun, not both")
-    when = None if sun is not None else _noon(plant) if time is None else parse_time(time)
+    when = None if sun is not None else noon(plant) if time is None else parse_time(time)
     options = {**order.options, "sun": None if sun is None else parse_point(sun, "sun")}
     with progress("casting beams", order.as_json) as step:
         step(0, 1)

@@ -331,7 +331,7 @@ def field_flux(
         If there is no receiver or option of that name.
     """
     optics = (light or FieldOptics()).changed(changes)
-    direction = _one_sun(plant, time, sun)
+    direction = one_sun(plant, time, sun)
     scene = optics.scene(plant, direction, aim, _names(receiver))
     if scene.dark is not None and scene.dark.all():
         raise InputError(f"flux: none of the {len(plant)} heliostats can reach its aim at this sun")
@@ -339,6 +339,11 @@ def field_flux(
         return _traced(plant, scene, optics, rays, seed, progress)
     engine = optics.engine(scene)
     engine.check_met()
+    return result_of(plant, scene, engine)
+
+
+def result_of(plant: Plant, scene: Scene, engine: FieldFlux) -> PlantFlux:
+    """Return what an engine computed of a plant's scene."""
     return _result(plant, scene, engine.efficiencies, _views(engine))
 
 
@@ -368,7 +373,14 @@ def _names(receiver: str | tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in ([receiver] if isinstance(receiver, str) else receiver) if name)
 
 
-def _one_sun(plant: Plant, time: Times | None, sun: npt.ArrayLike | None) -> FloatArray:
+def one_sun(plant: Plant, time: Times | None, sun: npt.ArrayLike | None) -> FloatArray:
+    """Return the unit vector to the sun, (3,), from one time or the sun itself.
+
+    Raises
+    ------
+    InputError
+        If there is not one of them, or the sun is below the horizon.
+    """
     if sun is not None and time is None:
         light = normalize(as_vectors(sun, "sun"))
     elif time is not None and sun is None:

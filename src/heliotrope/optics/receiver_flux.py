@@ -23,10 +23,11 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, reflect
 from heliotrope.jit import as_input
 from heliotrope.optics import _image_kernels as kernels
+from heliotrope.optics import _look_kernels as look_kernels
 from heliotrope.optics.attenuation import air_model
 from heliotrope.optics.beam import SUN_SIGMA
 from heliotrope.optics.scene import Mirrors, Scene
-from heliotrope.optics.shading import IntArray, Lit, Shading, parts_of
+from heliotrope.optics.shading import IntArray, Lit, Shading, parts_of, table_of
 from heliotrope.optics.sun_shape import SunShape
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 from heliotrope.parallel import run_blocks
@@ -37,6 +38,8 @@ PART = 2.0
 _MOST = 64
 #: Blocks of mirrors whose flux is summed apart, whatever the number of threads.
 _BLOCKS = 8
+#: Cells of a single image below this share of its peak are left out at its edges.
+LEAST = 5e-4
 #: Mirrors whose directions differ by less than this see the same cells of a mesh, rad.
 _ALIKE = np.radians(5.0)
 
@@ -69,6 +72,35 @@ class Efficiencies:
     air: FloatArray
     intercept: FloatArray
     total: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Flux of each of H mirrors by itself at K aims, on a surface in columns.
+
+    Attributes
+    ----------
+    values
+        W/m², one image after the other, each column after column, from below.
+    begin
+        Where each image begins, (H · K,), the aims of a mirror in a row.
+    box
+        First column, columns, first row and rows of each image, (H · K, 4). Columns go on
+        at 0 after the last; rows may lie below and above the surface.
+    looks
+        K.
+    shape
+        Rows and columns of the surface.
+    area
+        Of a cell, m².
+    """
+
+    values: npt.NDArray[np.float32]
+    begin: IntArray
+    box: IntArray
+    looks: int
+    shape: tuple[int, int]
+    area: float
 
 
 class FieldFlux:
@@ -105,7 +137,7 @@ class FieldFlux:
         air: str | float = "clear",
         gaussians: int = 3,
     ) -> None:
-        shape = SunShape.of(sun)
+        shape = self._shape = SunShape.of(sun)
         weights, variances = shape.gaussians(gaussians)
         self.scene, self._air = scene, air_model(air)
         self._sums = (as_input(weights), as_input(variances))
@@ -132,14 +164,18 @@ class FieldFlux:
 
     def _cast(self, rows: IntArray, sign: float) -> None:
         """Add (1) or take away (−1) the images of the mirrors in ``rows``."""
-        mirrors, shading = self.scene.mirrors, self._shading
         edges = [len(rows) * k // _BLOCKS for k in range(_BLOCKS + 1)]
-        field = (
-            self._table, as_input(self.scene.sun), self._light, as_input(mirrors.slope),
-            as_input(mirrors.pointing), self._sums, shading.parts, self._figure, self._moments,
-        )  # fmt: skip
         for plan, flux, power in zip(self._plans, self._flux, self._power, strict=True):
-            plan(rows, edges, field, sign, flux, power)
+            plan(rows, edges, self._field(), sign, flux, power)
+
+    def _field(self) -> tuple[Any, ...]:
+        """Return what the kernels are told of the mirrors and of the light."""
+        mirrors = self.scene.mirrors
+        return (
+            self._table, as_input(self.scene.sun), self._light, as_input(mirrors.slope),
+            as_input(mirrors.pointing), self._sums, self._shading.parts, self._figure,
+            self._moments,
+        )  # fmt: skip
 
     def move(self, rows: IntArray, mirrors: Mirrors) -> IntArray:
         """Move mirrors, and return the rows of all whose light has changed.
@@ -164,6 +200,74 @@ class FieldFlux:
         self._light[rows] = _light(self.scene, self._transmitted)[rows]
         self._cast(changed, 1.0)
         return changed
+
+    def images(self, aims: FloatArray, reach: IntArray, gaussians: int | None = None) -> Images:
+        """Return the image of each mirror by itself at several aims, on the first surface.
+
+        Parameters
+        ----------
+        aims
+            ENU m, (H, K, 3). Shading, blocking and air stay those of the present aims, and each
+            mirror keeps its focal length.
+        reach
+            Rows below and above the surface that each image has too, so that it may be moved, (H,).
+        gaussians
+            Number of the sun's Gaussians, if another than the flux has.
+
+        Raises
+        ------
+        InputError
+            If the surface is a mesh or a cavity.
+        """
+        mirrors, looks = self.scene.mirrors, aims.shape[1]
+        tables = [table_of(mirrors.toward(self.scene.sun, aims[:, k])) for k in range(looks)]
+        table = np.stack(tables, axis=1).reshape(len(mirrors) * looks, -1)
+        sums = self._sums
+        if gaussians is not None:
+            weights, variances = self._shape.gaussians(gaussians)
+            sums = (as_input(weights), as_input(variances))
+        field = self._field()
+        return self._in_columns().images(looks, (table, *field[1:5], sums, *field[6:]), reach)
+
+    def spread(
+        self, scatter: FloatArray, modes: FloatArray, groups: IntArray, worth: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what small errors of the beams do to the flux of the first surface.
+
+        Parameters
+        ----------
+        scatter
+            Covariance of each beam's own error, right and up as seen from the mirror, rad²,
+            (H, 2, 2).
+        modes
+            Displacement of each beam by one standard deviation of M shared errors, rad, (H, M, 2).
+        groups
+            Number of each mirror's group, 0 to G − 1, (H,).
+        worth
+            Price of variance, (rows, columns), in any unit per (W/m²)².
+
+        Returns
+        -------
+        tuple
+            Variance by own errors, (W/m²)², (rows, columns); change of the flux by the shared
+            errors of the mirrors of each group, W/m², (G, M, rows, columns); and the worth of each
+            mirror's own variance, (H,).
+
+        Notes
+        -----
+        To first order in the errors.
+        """
+        plan, errors = self._in_columns(), (as_float(scatter), as_input(modes), as_input(worth))
+        return plan.spread(self._field(), errors, groups)
+
+    def _in_columns(self) -> "_Grid":
+        plan = self._plans[0]
+        if not isinstance(plan, _Grid):
+            raise InputError(
+                f"receiver {self.scene.surfaces[0].name}: single images are computed on plates and "
+                "cylinders, not in cavities"
+            )
+        return plan
 
     @property
     def lit(self) -> Lit:
@@ -260,6 +364,53 @@ class _Grid:
 
         run_blocks(block, _BLOCKS, 2)
         flux += sums.sum(axis=0)
+
+    def images(self, looks: int, field: Any, reach: IntArray) -> Images:
+        """Return single images; ``field`` has a row of mirrors for each."""
+        low, step, rows, area = self._grid
+        most, count = int(reach.max(initial=0)), len(field[0])
+        tall = (low - most * step, step, rows + 2 * most, area)
+        wide = len(self._columns[0])
+        # Half of a full cylinder is seen at once. Memory that is not written costs nothing.
+        turn = abs(self._columns[4][-1] - self._columns[4][0])
+        full = turn > 2.0 * np.pi - 1e-6
+        seen = wide // 2 + 2 if full else wide
+        begins = np.arange(count) * (min(seen, wide) * tall[2])
+        values = np.empty(count * min(seen, wide) * tall[2], dtype=np.float32)
+        boxes = np.zeros((count, 4), dtype=np.int64)
+
+        def block(first: int, last: int) -> None:
+            look_kernels.look(
+                first, last, looks, *field, self._shape, self._columns, tall, LEAST, reach, values,
+                boxes, begins,
+            )  # fmt: skip
+
+        run_blocks(block, count, 2)
+        boxes[:, 2] -= most
+        return Images(values, begins, boxes, looks, (rows, wide), area)
+
+    def spread(
+        self, field: Any, errors: tuple[FloatArray, ...], groups: IntArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return variances, changes of the flux and worths; see `FieldFlux.spread`."""
+        scatter, modes, worth = errors
+        rows, wide = self._grid[2], len(self._columns[0])
+        count, order = int(groups.max(initial=0)) + 1, np.argsort(groups, kind="stable")
+        edges = np.searchsorted(groups[order], np.arange(count + 1))
+        root = np.linalg.cholesky(scatter + 1e-30 * np.eye(2))
+        factor = as_input(np.stack([root[:, 0, 0], root[:, 1, 0], root[:, 1, 1]], axis=-1))
+        own, value = np.zeros((count, rows, wide)), np.zeros(len(groups))
+        shared = np.zeros((count, modes.shape[1], rows, wide))
+
+        def block(first: int, last: int) -> None:
+            for k in range(first, last):
+                look_kernels.spread(
+                    edges[k], edges[k + 1], order, *field, self._shape, self._columns, self._grid,
+                    factor, modes, worth, own[k], shared[k], value,
+                )  # fmt: skip
+
+        run_blocks(block, count, 2)
+        return as_float(own.sum(axis=0)), shared, value
 
 
 class _Cells:

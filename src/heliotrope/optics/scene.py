@@ -173,6 +173,23 @@ class Mirrors:
         """Distance to the aim, m, (H,)."""
         return as_float(np.linalg.norm(self.aim - self.center, axis=-1))
 
+    def toward(self, sun: FloatArray, aim: npt.ArrayLike) -> "Mirrors":
+        """Return the mirrors turned about their centres so that they send the sun to other aims.
+
+        Parameters
+        ----------
+        sun
+            Unit vector, (3,).
+        aim
+            ENU m, (3,) or (H, 3). Focal lengths stay as they are.
+        """
+        ends = _vectors(as_vectors(aim, "mirrors: aim"), len(self), "aim")
+        normal = normalize(normalize(ends - self.center) + sun)
+        right = self.right - np.sum(self.right * normal, axis=-1, keepdims=True) * normal
+        right = normalize(right)
+        up = as_float(np.cross(normal, right))
+        return replace(self, normal=normal, right=right, up=up, aim=ends)
+
     def with_facets(
         self, facets: FacetTable, kind: npt.NDArray[np.int64] | None = None
     ) -> "Mirrors":

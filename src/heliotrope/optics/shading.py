@@ -199,14 +199,18 @@ def _rows(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the kernels' table, the central rays and how far they are looked at."""
     center, normal = mirrors.center[rows], mirrors.normal[rows]
-    half = 0.5 * np.stack([mirrors.width[rows], mirrors.height[rows]], axis=-1)
-    curve = 0.5 / mirrors.focal[rows]
-    radius = np.linalg.norm(half, axis=-1)
-    axes = (mirrors.right[rows], mirrors.up[rows])
-    table = np.column_stack([center, *axes, normal, half, curve, radius])
+    table = table_of(mirrors, rows)
     ways = reflect(np.broadcast_to(sun, normal.shape), normal)
     reaches = (1.0 - _BEFORE) * np.linalg.norm(mirrors.aim[rows] - center, axis=-1)
     return table, np.ascontiguousarray(ways), as_float(reaches)
+
+
+def table_of(mirrors: Mirrors, rows: IntArray | slice = slice(None)) -> FloatArray:
+    """Return the kernels' table of mirrors: poses, half sizes, curvature and radius."""
+    half = 0.5 * np.stack([mirrors.width[rows], mirrors.height[rows]], axis=-1)
+    curve, radius = 0.5 / mirrors.focal[rows], np.linalg.norm(half, axis=-1)
+    axes = (mirrors.right[rows], mirrors.up[rows], mirrors.normal[rows])
+    return np.column_stack([mirrors.center[rows], *axes, half, curve, radius])
 
 
 def _parts(mirrors: Mirrors, split: IntArray) -> Any:

@@ -16,12 +16,13 @@ from heliotrope.plot.charts import (
     residuals,
     year_map,
 )
-from heliotrope.plot.light import efficiency_map, flux_3d, flux_figure, receiver_map
+from heliotrope.plot.light import aim_figure, efficiency_map, flux_3d, flux_figure, receiver_map
 from heliotrope.plot.scene import mechanism_3d
 
 __all__ = [
     "COLOURS",
     "Group",
+    "aim_figure",
     "day",
     "drift",
     "efficiency_map",

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from heliotrope.aims.plan import AimPlan
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.optics.flux import FluxView
 from heliotrope.optics.plant_flux import EFFICIENCIES, PlantFlux
@@ -138,6 +139,35 @@ def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
     flux_3d(found, by, ax=space)
     if len(found.maps[0].up) > 1:
         receiver_map(found.maps[0], ax=figure.add_subplot(grid[0, 1]))
+    return figure
+
+
+def aim_figure(plan: AimPlan) -> "Figure":
+    """Return one picture of a plan's flux, its quantile over the limit, and where it binds.
+
+    Parameters
+    ----------
+    plan
+        Result of `heliotrope.aim`.
+    """
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(13.0, 5.0), layout="constrained")
+    view = plan.light.maps[0]
+    receiver_map(view, ax=left)
+    share = 100.0 * plan.quantile / plan.limit
+    mesh = right.pcolormesh(
+        view.right, view.up, share, cmap=_SHARE, vmin=0.0, vmax=100.0, rasterized=True
+    )
+    figure.colorbar(mesh, ax=right, label="quantile of the flux over the limit, %")
+    if plan.scene.binding.any():
+        binding = plan.scene.binding.astype(float)
+        right.contour(view.right, view.up, binding, levels=[0.5], colors="white")
+    right.set_aspect("equal", adjustable="box")
+    right.set_title(
+        f"{plan.strategy}: {100.0 * plan.excess:+.2f} % over the limit at most", fontsize=10
+    )
+    right.set_xlabel("right, m")
     return figure
 
 

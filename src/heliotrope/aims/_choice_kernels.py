@@ -1,0 +1,248 @@
+# mypy: disable-error-code="no-untyped-call, untyped-decorator"
+# mypy: allow-untyped-defs
+"""Compiled: prices of images, and sweeps in which each mirror takes the aim that pays best.
+
+Candidate a of mirror i is image ``a // S`` of the mirror, moved up by ``shifts[i, a % S]`` rows;
+−1 is none: the mirror is defocused. Maps are (columns, rows), so that a column lies in a row.
+"""
+
+import numpy as np
+from numba import njit
+
+from heliotrope.jit import INNER, OPTIONS
+
+_SUMS = {**OPTIONS, "fastmath": {"reassoc", "contract", "nsz", "nnan"}}
+_INNER_SUMS = {**INNER, "fastmath": {"reassoc", "contract", "nsz", "nnan"}}
+
+
+@njit(**_INNER_SUMS)
+def _dot(values, at, line, start, count):
+    a, b = values[at : at + count], line[start : start + count]
+    total = np.float32(0.0)
+    for r in range(count):
+        total += a[r] * b[r]
+    return total
+
+
+@njit(**_INNER_SUMS)
+def _worth(i, images, shifts, price, spans, out):
+    """Write the sums of price times flux of all candidates of mirror i."""
+    values, begin, box, looks, weight = images
+    count, wide = shifts.shape[1], len(price)
+    for k in range(looks):
+        j = i * looks + k
+        first, columns, bottom, rows = box[j, 0], box[j, 1], box[j, 2], box[j, 3]
+        for s in range(count):
+            out[k * count + s] = 0.0
+        at, c = begin[j], first
+        for _ in range(columns):
+            if spans[c, 1] > spans[c, 0]:
+                line = price[c]
+                for s in range(count):
+                    row = bottom + shifts[i, s]
+                    low, high = max(row, spans[c, 0]), min(row + rows, spans[c, 1])
+                    if high > low:
+                        out[k * count + s] += _dot(values, at + low - row, line, low, high - low)
+            at += rows
+            c += 1
+            if c == wide:
+                c = 0
+        for s in range(count):
+            out[k * count + s] *= weight[i]
+
+
+@njit(**_SUMS)
+def worths(first, last, mirrors, images, shifts, price, spans, out):
+    """Write the sum over cells of price times flux, of each candidate of ``mirrors[first:last]``.
+
+    ``price`` (columns, rows) in 32 bits; ``spans`` (columns, 2): rows where it is not zero; ``out``
+    (H, A).
+    """
+    for n in range(first, last):
+        _worth(mirrors[n], images, shifts, price, spans, out[mirrors[n]])
+
+
+@njit(**_INNER_SUMS)
+def _rectangle(i, a, images, shifts, number):
+    """First column, columns, first row, end row, and place and height of a candidate's cells."""
+    _, begin, box, looks, _ = images
+    count = shifts.shape[1]
+    j = i * looks + a // count
+    row = box[j, 2] + shifts[i, a % count]
+    low, high = max(row, 0), min(row + box[j, 3], number)
+    return box[j, 0], box[j, 1], low, high, begin[j] + low - row, box[j, 3]
+
+
+@njit(**_INNER_SUMS)
+def _add(i, a, sign, images, shifts, flux):
+    """Add a candidate's image to the flux."""
+    values, weight = images[0], images[4]
+    wide, number = flux.shape
+    c, columns, low, high, at, rows = _rectangle(i, a, images, shifts, number)
+    scale = sign * weight[i]
+    for _ in range(columns):
+        line = flux[c]
+        for r in range(low, high):
+            line[r] += scale * values[at + r - low]
+        at += rows
+        c += 1
+        if c == wide:
+            c = 0
+
+
+@njit(**_SUMS)
+def flux_of(mirrors, choice, images, shifts, flux):
+    """Add the chosen images of some mirrors to the flux (columns, rows)."""
+    for i in mirrors:
+        if choice[i] >= 0:
+            _add(i, choice[i], 1.0, images, shifts, flux)
+
+
+@njit(**_INNER_SUMS)
+def _reprice(i, a, images, shifts, flux, cap, toll, steep, price, spans):
+    """Bring the prices of the cells of a candidate up to date."""
+    wide, number = flux.shape
+    c, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
+    for _ in range(columns):
+        top, bottom = spans[c, 1], spans[c, 0]
+        for r in range(low, high):
+            value = toll[c, r] + steep[c, r] * (flux[c, r] - cap[c, r])
+            value = max(value, 0.0)
+            price[c, r] = value
+        for r in range(low, min(bottom, high)):
+            if price[c, r] > 0.0:
+                spans[c, 0] = r
+                break
+        for r in range(high - 1, max(top, low) - 1, -1):
+            if price[c, r] > 0.0:
+                spans[c, 1] = r + 1
+                break
+        c += 1
+        if c == wide:
+            c = 0
+
+
+@njit(**_SUMS)
+def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, price, spans):
+    """Let each mirror in turn take the candidate that pays best; returns how many changed.
+
+    A cell asks ``max(0, toll + steep (flux − cap))`` for the flux, W per W/m², as an augmented
+    Lagrangian does. ``power`` (H, A) in W; ``idle``: what no light is worth, W. ``choice`` (H,),
+    ``flux``, ``price`` and ``spans`` are kept up to date.
+    """
+    worth = np.empty(power.shape[1])
+    changed = 0
+    for i in order:
+        before = choice[i]
+        if before >= 0:
+            _add(i, before, -1.0, images, shifts, flux)
+            _reprice(i, before, images, shifts, flux, cap, toll, steep, price, spans)
+        _worth(i, images, shifts, price, spans, worth)
+        best, gain = -1, idle
+        for a in range(len(worth)):
+            value = power[i, a] - worth[a]
+            if value > gain:
+                best, gain = a, value
+        choice[i] = best
+        if best >= 0:
+            _add(i, best, 1.0, images, shifts, flux)
+            _reprice(i, best, images, shifts, flux, cap, toll, steep, price, spans)
+        changed += best != before
+    return changed
+
+
+@njit(**_INNER_SUMS)
+def _excess(i, a, images, shifts, flux, cap, most):
+    """Excess over the cap with a candidate, summed over its cells; no further than ``most``."""
+    values, weight = images[0], images[4]
+    wide, number = flux.shape
+    c, columns, low, high, at, rows = _rectangle(i, a, images, shifts, number)
+    total = 0.0
+    for _ in range(columns):
+        for r in range(low, high):
+            total += max(0.0, flux[c, r] + weight[i] * values[at + r - low] - cap[c, r])
+        if total > most:
+            return total
+        at += rows
+        c += 1
+        if c == wide:
+            c = 0
+    return total
+
+
+@njit(**_INNER_SUMS)
+def _above(i, a, images, shifts, flux, cap):
+    """The present excess in the cells of a candidate, without it."""
+    wide, number = flux.shape
+    c, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
+    total = 0.0
+    for _ in range(columns):
+        for r in range(low, high):
+            total += max(0.0, flux[c, r] - cap[c, r])
+        c += 1
+        if c == wide:
+            c = 0
+    return total
+
+
+@njit(**_SUMS)
+def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
+    """Let each mirror in turn take the candidate of most power less a fine; returns the changes.
+
+    ``fine``: for the excess that it adds, W per W/m². ``idle``: what no light is worth, W. Without
+    ``fill`` only mirrors that add to an excess change.
+    """
+    changed = 0
+    net = np.empty(power.shape[1])
+    for i in order:
+        before = choice[i]
+        top = 0.0
+        for a in range(len(net)):
+            net[a] = power[i, a]
+            top = max(top, net[a])
+        if before >= 0:
+            free = _above(i, before, images, shifts, flux, cap) <= 0.0
+            if free and (not fill or net[before] >= top):
+                continue
+            _add(i, before, -1.0, images, shifts, flux)
+        elif not fill:
+            continue
+        best, gain = -1, idle
+        while True:
+            a = 0
+            for b in range(1, len(net)):
+                if net[b] > net[a]:
+                    a = b
+            # The others have less power, so that none is better.
+            if net[a] <= gain:
+                break
+            present = _above(i, a, images, shifts, flux, cap)
+            most = present + (net[a] - max(gain, -1e15)) / fine
+            more = _excess(i, a, images, shifts, flux, cap, most) - present
+            value = net[a] - fine * max(more, 0.0)
+            if value > gain:
+                best, gain = a, value
+            net[a] = -1e300
+        choice[i] = best
+        if best >= 0:
+            _add(i, best, 1.0, images, shifts, flux)
+        changed += best != before
+    return changed
+
+
+@njit(**_SUMS)
+def place(order, images, shifts, cells, choice, flux):
+    """Let each mirror in turn aim where there is least flux.
+
+    ``cells`` (H, A, 2): column and row of each candidate, −1 of one that is not to be taken.
+    """
+    for i in order:
+        best, least = -1, 1e300
+        for a in range(cells.shape[1]):
+            if cells[i, a, 0] < 0:
+                continue
+            value = flux[cells[i, a, 0], cells[i, a, 1]]
+            if value < least:
+                best, least = a, value
+        choice[i] = best
+        _add(i, best, 1.0, images, shifts, flux)

@@ -1,0 +1,174 @@
+"""The aims among which each mirror chooses, and its image at each."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from heliotrope.aims import _choice_kernels as kernels
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.optics.beam import SUN_SIGMA
+from heliotrope.optics.receiver_flux import FieldFlux, Images
+from heliotrope.optics.scene import Scene
+from heliotrope.optics.shading import IntArray
+from heliotrope.optics.surfaces import Cylinder, Plate
+from heliotrope.parallel import run_blocks
+
+#: Heights of the candidates of a mirror, and places across a cylinder and across a plate.
+HEIGHTS, AROUND, ACROSS = 9, 3, 5
+#: The outermost aim lies this many standard deviations of the beam within the edge.
+WITHIN = 0.5
+#: Outermost aim on a cylinder, across the beam, over its radius.
+ASIDE = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Aims of H mirrors: K places across the receiver at S heights each.
+
+    Attributes
+    ----------
+    images
+        At the K places, at half height.
+    weight
+        Light of each mirror over that of its images, (H,).
+    shifts
+        Rows by which the images are moved, (H, S).
+    aims
+        ENU m, (H, K · S, 3).
+    power
+        W, (H, K · S).
+    width
+        Standard deviation of each beam at the receiver, m, (H,).
+    """
+
+    images: Images
+    weight: FloatArray
+    shifts: IntArray
+    aims: FloatArray
+    power: FloatArray
+    width: FloatArray
+
+    @property
+    def table(self) -> tuple[Any, ...]:
+        """What kernels take as images."""
+        i = self.images
+        return i.values, i.begin, i.box, i.looks, self.weight
+
+    @property
+    def middle_power(self) -> float:
+        """Power with every mirror at half height and in the middle, W."""
+        middle = self.shifts.shape[1] * (self.images.looks // 2) + self.shifts.shape[1] // 2
+        return float(self.power[:, middle].sum())
+
+    def worth(self, price: FloatArray, mirrors: IntArray | None = None) -> FloatArray:
+        """Return the sum of price (columns, rows) times flux of each candidate, (H, K · S)."""
+        chosen = np.arange(len(self.weight)) if mirrors is None else mirrors
+        out = np.zeros(self.aims.shape[:2])
+        price32, spans = price.astype(np.float32), spans_of(price)
+
+        def block(first: int, last: int) -> None:
+            kernels.worths(first, last, chosen, self.table, self.shifts, price32, spans, out)
+
+        run_blocks(block, len(chosen))
+        return out
+
+    def flux(self, choice: IntArray, mirrors: IntArray | None = None) -> FloatArray:
+        """Return the flux of chosen candidates (−1: none), W/m², (columns, rows)."""
+        chosen = np.arange(len(choice)) if mirrors is None else mirrors
+        flux = np.zeros(self.images.shape[::-1])
+        kernels.flux_of(chosen, choice, self.table, self.shifts, flux)
+        return flux
+
+    def relit(self, weight: FloatArray) -> "Candidates":
+        """Return the candidates with other light on the mirrors, (H,)."""
+        ratio = weight / np.where(self.weight > 0.0, self.weight, 1.0)
+        return replace(self, weight=weight, power=as_float(self.power * ratio[:, None]))
+
+
+def spans_of(price: FloatArray) -> IntArray:
+    """Return the rows where a column's prices are not 0, first and end, (columns, 2)."""
+    some = (price > 0.0).astype(np.int64)
+    first = some.argmax(axis=1)
+    end = price.shape[1] - np.flip(some, axis=1).argmax(axis=1)
+    return np.asarray(np.stack([first, end], axis=-1) * some.max(axis=1, keepdims=True))
+
+
+def surface_in(scene: Scene) -> Plate | Cylinder:
+    """Return the one receiver of a scene.
+
+    Raises
+    ------
+    InputError
+        If there is more than one, or it has no rows and columns.
+    """
+    if len(scene.surfaces) != 1:
+        names = ", ".join(surface.name for surface in scene.surfaces)
+        raise InputError(f"aims: {len(scene.surfaces)} receivers, {names}; choose one")
+    surface = scene.surfaces[0]
+    if not isinstance(surface, Plate | Cylinder):
+        raise InputError(
+            f"receiver {surface.name}: aims are chosen on plates and cylinders; give one of these"
+        )
+    return surface
+
+
+def middles(scene: Scene) -> FloatArray:
+    """Return the points at half height that face each mirror, ENU m, (H, 3)."""
+    return _across(scene, np.zeros((len(scene.mirrors), 1)))[:, 0]
+
+
+def _across(scene: Scene, offset: FloatArray) -> FloatArray:
+    """Return points on the receiver, at offsets (H, K) to the right as seen, m, (H, K, 3)."""
+    surface = surface_in(scene)
+    if isinstance(surface, Plate):
+        return as_float(surface.center + offset[..., None] * surface.right)
+    away = scene.mirrors.center - surface.center
+    angle = np.arctan2(away @ surface.side, away @ surface.front)[:, None]
+    angle = angle + np.arcsin(np.clip(offset / surface.radius, -1.0, 1.0))
+    low, high = surface.span
+    if high - low < 2.0 * np.pi - 1e-6:
+        angle = np.clip(angle, 0.9 * low + 0.1 * high, 0.1 * low + 0.9 * high)
+    return as_float(surface.center + surface.radius * surface.outward(angle))
+
+
+def candidates(engine: FieldFlux) -> Candidates:
+    """Return the candidates of the mirrors of a scene with one receiver.
+
+    Parameters
+    ----------
+    engine
+        Its flux, with aims on the receiver; see `FieldFlux.images` for what stays as it is.
+
+    Raises
+    ------
+    InputError
+        If there is more than one receiver, or no mirror reaches any cell.
+    """
+    scene = engine.scene
+    surface, mirrors = surface_in(scene), scene.mirrors
+    angle = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
+    angle = angle + 0.5 * np.trace(mirrors.pointing, axis1=1, axis2=2)
+    width = mirrors.slant * np.sqrt(angle)
+    rows, step = surface.shape[0], surface.height / surface.shape[0]
+    room = np.maximum(0.5 * surface.height - WITHIN * width, 0.0)
+    shifts = np.round(np.linspace(-1.0, 1.0, HEIGHTS) * room[:, None] / step).astype(np.int64)
+    if isinstance(surface, Plate):
+        far, count = np.maximum(0.5 * surface.width - WITHIN * width, 0.0), ACROSS
+    else:
+        far, count = np.full(len(mirrors), ASIDE * surface.radius), AROUND
+    looks = _across(scene, np.linspace(-1.0, 1.0, count) * far[:, None])
+    images = engine.images(looks, np.abs(shifts).max(axis=1))
+    axis = surface.up if isinstance(surface, Plate) else surface.axis
+    aims = looks[:, :, None, :] + (step * shifts)[:, None, :, None] * axis
+    aims = as_float(aims.reshape(len(mirrors), -1, 3))
+    empty = np.zeros(aims.shape[:2])
+    found = Candidates(images, np.ones(len(mirrors)), shifts, aims, empty, width)
+    power = found.worth(np.full((surface.shape[1], rows), images.area))
+    if not power.any():
+        raise InputError(
+            f"receiver {surface.name}: none of the {len(mirrors)} mirrors sends light to any of "
+            "its cells; turn it to the field, or choose another sun"
+        )
+    return replace(found, power=power)

@@ -1,0 +1,26 @@
+"""Files of aims, for people and for control systems."""
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from heliotrope.aims.plan import AimPlan
+from heliotrope.files import write_text
+
+
+def write_aims(path: str | Path, plan: AimPlan) -> None:
+    """Write a table (CSV) of aims, a line for each heliostat; those defocused have no aim."""
+    text = io.StringIO(newline="")
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(
+        ("heliostat", "east_m", "north_m", "up_m", "state", "power_kw", "calibration_gain_kw")
+    )
+    power, gain = 1e-3 * plan.light.heliostat_power, 1e-3 * plan.gain
+    for k, name in enumerate(plan.names):
+        state = "out of reach" if plan.out_of_reach[k] else "aim"
+        state = "defocus" if plan.defocused[k] else state
+        aim = ["" if np.isnan(x) else f"{x:.4f}" for x in plan.aim[k]]
+        rows.writerow((name, *aim, state, f"{power[k]:.4f}", f"{gain[k]:.6f}"))
+    write_text(path, text.getvalue())

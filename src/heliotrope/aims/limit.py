@@ -1,0 +1,113 @@
+"""How much flux a receiver may get: a number, or a map on any grid of cells."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import FormatError, InputError
+from heliotrope.files.text import read_text
+from heliotrope.geometry import FloatArray, as_float
+
+#: Most flux that a limit may name, W/m²; the sun's own surface has 6.3e7.
+_MOST = 6.4e7
+
+
+@dataclass(frozen=True, eq=False)
+class FluxLimit:
+    """The flux that a receiver may get.
+
+    Attributes
+    ----------
+    flux
+        W/m²: a number, or a map over the receiver, (rows, columns), lowest row first and columns
+        as those of its cells; any number of either.
+    margin
+        Share of it that is kept for the model's own error, 0 to 0.5.
+    """
+
+    flux: float | FloatArray
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        flux = as_float(self.flux)
+        if flux.ndim not in (0, 2) or flux.size == 0:
+            raise InputError(
+                f"flux limit: a map of shape {flux.shape}; give a number, or rows and columns"
+            )
+        wrong = ~((flux > 0.0) & (flux <= _MOST))
+        if wrong.any():
+            place = "" if flux.ndim == 0 else " in row {}, column {}".format(*np.argwhere(wrong)[0])
+            raise InputError(
+                f"flux limit: {flux[wrong].flat[0]:g} W/m²{place} must be above 0 and at most "
+                f"{_MOST:g} W/m²"
+            )
+        if not 0.0 <= self.margin <= 0.5:
+            raise InputError(f"flux limit: a margin of {self.margin:g} must be from 0 to 0.5")
+
+    @classmethod
+    def of(cls, limit: "FluxLimit | npt.ArrayLike") -> "FluxLimit":
+        """Return a limit from a number or a map, W/m²."""
+        return limit if isinstance(limit, FluxLimit) else cls(as_float(limit))
+
+    def on(self, rows: int, columns: int) -> FloatArray:
+        """Return what each of a receiver's cells may get, less the margin, W/m², (rows, columns).
+
+        A cell gets the least of the map's cells that it overlaps, so that a finer grid never
+        allows more.
+        """
+        flux = as_float(self.flux)
+        if flux.ndim == 0:
+            return np.full((rows, columns), (1.0 - self.margin) * float(flux))
+        for axis, count in enumerate((rows, columns)):
+            flux = _least(flux, axis, count)
+        return as_float((1.0 - self.margin) * flux)
+
+
+def _least(flux: FloatArray, axis: int, count: int) -> FloatArray:
+    """Return the least over what each of ``count`` equal parts of an axis overlaps."""
+    given = flux.shape[axis]
+    parts = np.arange(count)
+    first = parts * given // count
+    last = -(-(parts + 1) * given // count)
+    lines = [
+        flux.take(range(a, b), axis=axis).min(axis=axis) for a, b in zip(first, last, strict=True)
+    ]
+    return np.stack(lines, axis=axis)
+
+
+def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
+    """Return the limit of a file of numbers (CSV), W/m², a line for each row of cells.
+
+    Parameters
+    ----------
+    path
+        File without a header, highest row of cells first, as one looks at the receiver. The columns
+        go as those of the receiver: to the right, or clockwise around a cylinder from the north.
+    margin
+        As of `FluxLimit`.
+
+    Raises
+    ------
+    FormatError
+        If it is no table of numbers, or its lines differ in length.
+    """
+    rows: list[list[float]] = []
+    for number, line in enumerate(read_text(path, "a flux limit").splitlines(), start=1):
+        cells = [cell for cell in line.strip().rstrip(",").split(",") if cell]
+        if not cells:
+            continue
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError:
+            raise FormatError(
+                path, "a flux limit is a table of numbers in W/m², without a header",
+                where=f"line {number}",
+            ) from None  # fmt: skip
+        if len(rows[-1]) != len(rows[0]):
+            raise FormatError(
+                path, f"{len(cells)} numbers, but {len(rows[0])} before; make them equal",
+                where=f"line {number}",
+            )  # fmt: skip
+    return FluxLimit(np.array(rows[::-1]), margin)

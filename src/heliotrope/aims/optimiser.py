@@ -1,0 +1,187 @@
+r"""The aims of most power under a flux limit, by Lagrangian decomposition.
+
+With $x_{ia}$ = 1 if mirror i takes candidate a, of power $p_{ia}$ and flux $f_{iac}$ in cell c:
+
+$$\max \sum p_{ia} x_{ia}, \qquad \sum f_{iac} x_{ia} \le L_c, \qquad \sum_a x_{ia} \le 1.$$
+
+Prices $λ_c \ge 0$ of the cells decouple the mirrors, and for any prices
+
+$$D(λ) = \sum_c λ_c L_c + \sum_i \max(0, \max_a (p_{ia} - \sum_c λ_c f_{iac}))$$
+
+is at least the optimum. The prices come from an augmented Lagrangian: mirror after mirror takes its
+best candidate at prices $\max(0, λ_c + ρ_c (F_c - L_c))$, and after each sweep these become the
+multipliers (Hestenes and Powell, 1969). They are first found on one mirror in ten. What is left
+above the limit is taken back mirror by mirror, and what is left below it is filled.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from heliotrope.aims import _choice_kernels as kernels
+from heliotrope.aims.candidates import Candidates, spans_of
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.optics.shading import IntArray
+
+#: Change of a cell's price over its area for a flux twice the limit.
+STEEP = 10.0
+#: Fields of more mirrors are first solved for one in SAMPLE, with so many sweeps.
+LARGE, SAMPLE, COARSE = 2_000, 10, 20
+#: Sweeps over all mirrors at most, and the gap at which they end.
+SWEEPS, GAP = 8, 1e-3
+#: Sweeps between two looks at the gap.
+BETWEEN = 2
+#: Fines for what is above the limit, over the area of a cell, one after the other.
+FINES = (3.0, 30.0, 300.0, 1e4, 1e6, 1e9)
+
+Step = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Which candidate each mirror takes.
+
+    Attributes
+    ----------
+    choice
+        Candidate of each mirror, −1: none, (H,).
+    prices
+        Multipliers of the cells, W per W/m², (columns, rows).
+    flux
+        W/m², (columns, rows), as the candidates' images have it.
+    power
+        W.
+    bound
+        No choice of candidates under this limit has more power, W.
+    """
+
+    choice: IntArray
+    prices: FloatArray
+    flux: FloatArray
+    power: float
+    bound: float
+
+    @property
+    def gap(self) -> float:
+        """Share of its power that a better choice could add at most."""
+        return self.bound / self.power - 1.0 if self.power > 0.0 else np.inf
+
+
+def bound(
+    field: Candidates, cap: FloatArray, prices: FloatArray, idle: float = 0.0
+) -> tuple[float, IntArray]:
+    """Return the dual D(λ) in W and each mirror's best candidate at these prices, (H,)."""
+    net = field.power - field.worth(prices)
+    best = net.argmax(axis=1)
+    value = net[np.arange(len(net)), best]
+    used = value > idle
+    total = float((prices * cap).sum() + np.where(used, value, max(idle, 0.0)).sum())
+    return total, np.where(used, best, -1)
+
+
+def optimise(
+    field: Candidates,
+    cap: FloatArray,
+    start: Choice | None = None,
+    *,
+    keep: bool = False,
+    sweeps: int = SWEEPS,
+    gap: float = GAP,
+    progress: Step | None = None,
+) -> Choice:
+    """Return the choice of most power whose flux is nowhere above a cap.
+
+    Parameters
+    ----------
+    field
+        Candidates of H mirrors.
+    cap
+        W/m², above 0, (columns, rows).
+    start
+        Begin with the prices and the choice of an earlier one.
+    keep
+        Whether every mirror must send its light to the receiver; then the cap may be passed.
+    sweeps
+        Over all mirrors, at most; with 0 the start's choice is only brought under the cap.
+    gap
+        At which the sweeps end.
+    progress
+        Called with the sweeps done and those of all.
+    """
+    rng, everyone = np.random.default_rng(0), np.arange(len(field.weight))
+    idle = -1e300 if keep else 0.0
+    if start is None:
+        prices, choice = np.zeros_like(cap), np.full(len(everyone), -1)
+        if len(everyone) > LARGE:
+            few = np.sort(rng.permutation(everyone)[::SAMPLE])
+            best = field.power.max(axis=1)
+            small = cap * (best[few].sum() / best.sum())
+            for _ in range(COARSE):
+                prices = _sweep(field, small, prices, choice, rng.permutation(few), idle)
+            choice = bound(field, cap, prices, idle)[1]
+    else:
+        prices, choice = start.prices.copy(), start.choice.copy()
+    found: Choice | None = None
+    least = np.inf
+    for k in range(sweeps):
+        prices = _sweep(field, cap, prices, choice, rng.permutation(everyone), idle)
+        if progress is not None:
+            progress(k + 1, sweeps)
+        if (k + 1) % BETWEEN and k + 1 < sweeps:
+            continue
+        least = min(least, bound(field, cap, prices, idle)[0])
+        now = _settled(field, cap, prices, choice, least, idle)
+        if found is None or now.power > found.power:
+            found = now
+        if found.bound - found.power <= gap * found.power:
+            break
+    if found is None:
+        least = bound(field, cap, prices, idle)[0]
+        found = _settled(field, cap, prices, choice, least, idle)
+    return replace(found, bound=least)
+
+
+def _sweep(
+    field: Candidates,
+    cap: FloatArray,
+    prices: FloatArray,
+    choice: IntArray,
+    order: IntArray,
+    idle: float,
+) -> FloatArray:
+    """Let mirrors choose in an order, and return the new prices."""
+    flux = field.flux(choice, order)
+    steep = STEEP * field.images.area / cap
+    now = np.maximum(prices + steep * (flux - cap), 0.0)
+    kernels.sweep(
+        order, field.table, field.shifts, field.power, idle, cap, prices, steep, choice, flux,
+        now.astype(np.float32), spans_of(now),
+    )  # fmt: skip
+    return as_float(np.maximum(prices + steep * (flux - cap), 0.0))
+
+
+def _settled(
+    field: Candidates,
+    cap: FloatArray,
+    prices: FloatArray,
+    choice: IntArray,
+    least: float,
+    idle: float,
+) -> Choice:
+    """Return a choice that keeps the cap."""
+    mine, flux = choice.copy(), field.flux(choice)
+    # Those that give least for their prices leave first.
+    rows = np.arange(len(mine))
+    paid = np.where(mine >= 0, field.power[rows, np.maximum(mine, 0)], 0.0)
+    order = np.argsort(paid, kind="stable")
+    for k, fine in enumerate(FINES):
+        kernels.settle(
+            order, field.table, field.shifts, field.power, idle, cap, mine, flux,
+            fine * field.images.area, k == 0,
+        )  # fmt: skip
+        if not (flux > cap * (1.0 + 1e-9)).any():
+            break
+    flux = field.flux(mine)
+    power = field.power[rows, np.maximum(mine, 0)][mine >= 0].sum()
+    return Choice(mine, prices, flux, float(power), least)

@@ -1,0 +1,219 @@
+"""Aims of a plant's heliostats under a flux limit, and strategies beside them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.aims.errors import SharedErrors
+from heliotrope.aims.limit import FluxLimit
+from heliotrope.aims.optimiser import Step
+from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene
+from heliotrope.aims.strategies import STRATEGIES, Strategy
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.plant import Plant
+from heliotrope.frames import ENU, Framed, Labelled, Variable
+from heliotrope.geometry import FloatArray
+from heliotrope.optics.plant_flux import FieldOptics, PlantFlux, one_sun, result_of
+from heliotrope.sun import Times
+from heliotrope.values import Card, Value, amount
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AimPlan(Value, Framed):
+    """Aims of N heliostats, and the flux that they bring.
+
+    Attributes
+    ----------
+    strategy
+        One of `STRATEGIES`.
+    light
+        Flux and efficiencies at these aims; its ``aim`` holds them. Defocused heliostats have no
+        light.
+    defocused
+        Heliostats that are defocused, (N,).
+    out_of_reach
+        Heliostats that cannot reach the receiver, (N,).
+    unlimited
+        Power with every heliostat at the receiver's middle, W.
+    scene
+        All that was computed, for a `start`.
+    """
+
+    strategy: Strategy
+    light: PlantFlux
+    defocused: npt.NDArray[np.bool_]
+    out_of_reach: npt.NDArray[np.bool_]
+    unlimited: float
+    scene: SceneAims
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the heliostats."""
+        return self.light.names
+
+    @property
+    def aim(self) -> FloatArray:
+        """ENU m, (N, 3); NaN of defocused heliostats."""
+        off = self.defocused | self.out_of_reach
+        return np.where(off[:, None], np.nan, self.light.aim)
+
+    @property
+    def power(self) -> float:
+        """Expected, W."""
+        return self.light.power
+
+    @property
+    def lost(self) -> float:
+        """Power that the limit costs, or the strategy, W."""
+        return self.unlimited - self.power
+
+    @property
+    def gap(self) -> float:
+        """Share of power that better aims could add at most; NaN of strategies without a bound."""
+        return self.scene.choice.gap
+
+    @property
+    def excess(self) -> float:
+        """Greatest of the flux' quantile over the limit, less 1; 0 or less: the limit holds."""
+        return self.scene.excess
+
+    @property
+    def quantile(self) -> FloatArray:
+        """Flux that is passed nowhere with the chosen probability, W/m², (rows, columns)."""
+        return self.scene.quantile
+
+    @property
+    def limit(self) -> FloatArray:
+        """What each cell may get, less the margin, W/m², (rows, columns)."""
+        return self.scene.limit
+
+    @property
+    def gain(self) -> FloatArray:
+        """Power that a perfect calibration of each heliostat would add, W, (N,)."""
+        return self.scene.gain
+
+    def _card(self) -> Card:
+        line = f"{self.strategy} aims of {amount(len(self.names), 'heliostat')} of "
+        line += f"{self.light.plant}, {1e-3 * self.power:.5g} kW, "
+        line += f"peak {1e-3 * self.light.peak:.4g} kW/m², "
+        if np.isfinite(self.gap):
+            line += f"within {100 * self.gap:.2g} % of the best, "
+        return Card(f"{line}{int(self.defocused.sum())} defocused")
+
+    def _labelled(self) -> Labelled:
+        row, cells = ("heliostat",), ("up", "right")
+        variables = {
+            "aim": Variable((*row, "axis"), self.aim, "m"),
+            "defocused": Variable(row, self.defocused),
+            "power": Variable(row, self.light.heliostat_power, "W"),
+            "gain": Variable(row, self.gain, "W"),
+            "flux": Variable(cells, self.light.flux, "W/m²"),
+            "quantile": Variable(cells, self.quantile, "W/m²"),
+            "limit": Variable(cells, self.limit, "W/m²"),
+        }
+        labels: dict[str, npt.ArrayLike] = {
+            "heliostat": self.names, "axis": ENU, "up": self.light.up, "right": self.light.right,
+        }  # fmt: skip
+        maps = frozenset({"flux", "quantile", "limit"})
+        notes = {"plant": self.light.plant, "strategy": self.strategy}
+        return Labelled(row, labels, variables, maps, notes=notes)
+
+
+def plan_aims(
+    plant: Plant,
+    time: Times | None = None,
+    receiver: str = "",
+    *,
+    limit: "FluxLimit | npt.ArrayLike",
+    sun: npt.ArrayLike | None = None,
+    strategy: Strategy = "optimal",
+    probability: float = 0.99,
+    shared: SharedErrors | None = None,
+    keep: bool = False,
+    start: AimPlan | None = None,
+    progress: Step | None = None,
+    light: FieldOptics | None = None,
+    **changes: Any,
+) -> AimPlan:
+    """Return aims of most expected power that keep the flux under a limit.
+
+    Parameters
+    ----------
+    plant
+        As calibrated.
+    time, sun
+        One of them, as for `heliotrope.optics.field_flux`.
+    receiver
+        Name; "": the plant's first.
+    limit
+        W/m²: a number, a map, or a `FluxLimit`.
+    strategy
+        "optimal"; or "middle", "spread" or "image-size" to compare with, which take no heed of the
+        limit.
+    probability
+        That the limit holds in all cells at once, 0.5 to 0.9999.
+    shared
+        Errors that mirrors have in common; None: none. Each mirror's own are ``error`` of the
+        light.
+    keep
+        Whether no heliostat may be defocused.
+    start
+        A plan of the same plant and receiver at another sun, irradiance or limit, which is where
+        the search begins.
+    progress
+        Called with the work done and all of it.
+    light, **changes
+        As for `heliotrope.optics.field_flux`.
+
+    Raises
+    ------
+    InputError
+        As `field_flux`, or if no aims hold the limit.
+    UnknownNameError
+        If there is no receiver, option or strategy of that name.
+    """
+    if strategy not in STRATEGIES:
+        raise UnknownNameError("strategy", strategy, STRATEGIES)
+    optics = (light or FieldOptics()).changed(changes)
+    if not plant.receivers:
+        raise InputError(f"aims: plant {plant.name} has no receiver; add one to the plant file")
+    chosen = receiver or plant.receivers[0].name
+    middle = plant.receiver(chosen).center
+    scene = optics.scene(plant, one_sun(plant, time, sun), middle, (chosen,))
+    if scene.dark is not None and scene.dark.all():
+        raise InputError(f"aims: none of the {len(plant)} heliostats can reach the receiver")
+    clusters = [name for group in plant.groups.values() for name in group.cluster]
+    latitude = np.radians(plant.site.latitude_deg)
+    demand = Demand(
+        FluxLimit.of(limit),
+        probability,
+        shared or SharedErrors(),
+        np.unique(clusters, return_inverse=True)[1],
+        np.array([0.0, np.cos(latitude), np.sin(latitude)]),
+        keep,
+    )
+    options = {"sun": optics.shape, "air": optics.air, "gaussians": optics.gaussians}
+    begin = None if start is None else start.scene
+    found = aim_scene(scene, demand, strategy=strategy, start=begin, progress=progress, **options)
+    off = np.zeros(len(plant), dtype=np.bool_) if scene.dark is None else scene.dark
+    result = result_of(plant, found.engine.scene, found.engine)
+    return AimPlan(strategy, result, found.defocused & ~off, off, found.field.middle_power, found)
+
+
+def compare_aims(plans: Mapping[Any, AimPlan]) -> list[dict[str, Any]]:
+    """Return one row for each plan: power, peak, quantile over limit, defocused, gap."""
+    return [
+        {
+            "strategy": name,
+            "power_w": plan.power,
+            "lost_w": plan.lost,
+            "peak_w_m2": plan.light.peak,
+            "excess": plan.excess,
+            "defocused": int(plan.defocused.sum()),
+            "gap": plan.gap,
+        }
+        for name, plan in plans.items()
+    ]

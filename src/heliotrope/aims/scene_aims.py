@@ -1,0 +1,288 @@
+"""Aims of a scene under a flux limit: choice, true flux, error of the choice's images, again.
+
+The optimiser adds images that were computed once, at a few places, and are moved by rows. The
+engine then computes the flux at the aims that were chosen, and the errors' quantile there; what
+this differs by is taken from the limit, and the choice is made again, until the engine's own flux
+with its quantile keeps the limit.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.aims.candidates import Candidates, candidates, middles, surface_in
+from heliotrope.aims.errors import Risk, SharedErrors, assess, gains
+from heliotrope.aims.limit import FluxLimit
+from heliotrope.aims.optimiser import Choice, Step, optimise
+from heliotrope.aims.strategies import Strategy, choose
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.optics.receiver_flux import FieldFlux
+from heliotrope.optics.scene import Scene
+from heliotrope.optics.shading import IntArray
+
+#: Choices at most; the limit is approached from this share below it.
+ROUNDS, BELOW = 16, 5e-4
+#: Rounds after which no cell gets room back, and no mirror moves that need not.
+FREE = 3
+#: What is missing then is taken from the limit so many times over.
+BEYOND = 1.5
+#: What errors leave of the limit at least, for the next choice; excess that counts as none.
+LEAST, HOLDS = 0.02, 1e-3
+#: Sweeps of all choices but the first.
+AGAIN = 2
+#: A cell binds if its quantile is within this share of the limit.
+BINDS = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Demand:
+    """What the aims of a scene must keep.
+
+    Attributes
+    ----------
+    limit
+        Flux limit.
+    probability
+        That it holds in all cells at once.
+    shared
+        Errors that mirrors share; each mirror's own are its ``pointing``.
+    groups
+        Cluster of each mirror, 0 to G − 1, (H,); None: one cluster.
+    pole
+        Unit vector along the Earth's axis, northwards, (3,).
+    keep
+        Whether no mirror may be defocused.
+    """
+
+    limit: FluxLimit
+    probability: float = 0.99
+    shared: SharedErrors = field(default_factory=SharedErrors)
+    groups: IntArray | None = None
+    pole: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    keep: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.5 <= self.probability <= 0.9999:
+            raise InputError(
+                f"aims: a probability of {self.probability:g} must be from 0.5 to 0.9999"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class SceneAims:
+    """Aims of the H mirrors of a scene.
+
+    Attributes
+    ----------
+    engine
+        Flux at these aims; defocused mirrors are dark.
+    field, choice
+        The candidates, and which each mirror takes.
+    aims
+        ENU m, (H, 3); those of defocused mirrors are at half height.
+    defocused
+        (H,).
+    limit
+        What each cell may get, less the margin, W/m², (rows, columns).
+    risk
+        How far the flux may be off.
+    light
+        Arguments of `FieldFlux` beside the scene.
+    """
+
+    engine: FieldFlux
+    field: Candidates
+    choice: Choice
+    aims: FloatArray
+    defocused: npt.NDArray[np.bool_]
+    limit: FloatArray
+    risk: Risk
+    light: dict[str, Any]
+
+    @property
+    def quantile(self) -> FloatArray:
+        """Flux that is passed nowhere with the chosen probability, W/m², (rows, columns)."""
+        return as_float(self.engine.maps[0] + self.risk.above)
+
+    @property
+    def excess(self) -> float:
+        """Greatest of the quantile over the limit, less 1; 0 or less: the limit holds."""
+        return float((self.quantile / self.limit).max()) - 1.0
+
+    @cached_property
+    def gain(self) -> FloatArray:
+        """What a perfect calibration of each mirror would add to the power, W, (H,)."""
+        return gains(self.engine, self.risk, self.choice.prices.T)
+
+    @property
+    def binding(self) -> npt.NDArray[np.bool_]:
+        """Cells that the limit binds, (rows, columns)."""
+        return np.asarray(self.quantile > (1.0 - BINDS) * self.limit)
+
+
+def aim_scene(
+    scene: Scene,
+    demand: Demand,
+    *,
+    strategy: Strategy = "optimal",
+    start: SceneAims | None = None,
+    progress: Step | None = None,
+    **light: Any,
+) -> SceneAims:
+    """Return aims of most power under a flux limit, or those of another strategy.
+
+    Parameters
+    ----------
+    scene
+        With one receiver; its aims do not count.
+    demand
+        The limit, and with which certainty it must hold.
+    strategy
+        One of `heliotrope.aims.STRATEGIES`; all but "optimal" take no heed of the limit.
+    start
+        Aims of the same mirrors and receiver at another sun, irradiance or limit, or with other
+        mirrors in ``dark``: their images are used again, which takes a fraction of the time.
+    progress
+        Called with the work done and all of it.
+    **light
+        Arguments of `FieldFlux`.
+
+    Raises
+    ------
+    InputError
+        If there is no single receiver, no mirror reaches it, a limit leaves no room for the
+        errors, or no aims hold it with every mirror kept.
+    """
+    rows, columns = surface_in(scene).shape
+    limit = demand.limit.on(rows, columns)
+    if start is None:
+        base = FieldFlux(_posed(scene, middles(scene), None), **light)
+        base.check_met()
+        field = candidates(base)
+    else:
+        base = FieldFlux(_posed(scene, start.aims, start.defocused), **light)
+        field = _relit(start, base, scene)
+    if strategy != "optimal":
+        chosen = choose(field, base.scene, strategy)
+        power = float(field.power[np.arange(len(chosen)), chosen].sum())
+        choice = Choice(chosen, np.zeros((columns, rows)), field.flux(chosen), power, np.nan)
+        return _evaluated(scene, field, choice, demand, limit, light)
+    return _held(scene, field, demand, limit, start, progress, light)
+
+
+def _held(
+    scene: Scene,
+    field: Candidates,
+    demand: Demand,
+    limit: FloatArray,
+    start: SceneAims | None,
+    progress: Step | None,
+    light: dict[str, Any],
+) -> SceneAims:
+    aimed_at = (1.0 - BELOW) * limit
+    # What the engine with its quantile has more than the images' sum.
+    more = np.zeros_like(limit)
+    choice = None if start is None else start.choice
+    if start is not None:
+        more = start.quantile - start.choice.flux.T
+    best: SceneAims | None = None
+    for k in range(ROUNDS):
+        cap = np.maximum(aimed_at - more, LEAST * limit)
+        first = choice is None
+        choice = optimise(
+            field, np.ascontiguousarray(cap.T), choice, keep=demand.keep,
+            progress=_part(progress, k), **({} if first else {"sweeps": AGAIN if k < FREE else 0}),
+        )  # fmt: skip
+        found = _evaluated(scene, field, choice, demand, limit, light)
+        if best is None or _rank(found) > _rank(best):
+            best = found
+        # Early rounds may leave room, taken for errors of a choice that stood higher.
+        if best.excess <= 0.0 and (k + 1 >= FREE or best.excess > -BINDS):
+            break
+        new = found.quantile - choice.flux.T
+        # From then on no cell gets room back, so that the rounds end.
+        more = new if k < FREE else more + BEYOND * np.maximum(new - more, 0.0)
+    assert best is not None
+    if best.excess > HOLDS:
+        _refuse(scene, best, demand)
+    return best
+
+
+def _rank(found: SceneAims) -> tuple[bool, float]:
+    """Return what orders aims: those that hold the limit by power, the others by excess."""
+    holds = found.excess <= 0.0
+    return holds, found.engine.powers[0] if holds else -found.excess
+
+
+def _part(progress: Step | None, done: int) -> Step | None:
+    if progress is None:
+        return None
+    return lambda k, n: progress(min(n * done + k, n * ROUNDS - 1), n * ROUNDS)
+
+
+def _posed(scene: Scene, aims: FloatArray, off: npt.NDArray[np.bool_] | None) -> Scene:
+    """Return the scene with other aims, and more mirrors dark."""
+    dark = scene.dark
+    if off is not None:
+        dark = off if dark is None else dark | off
+    return replace(scene, mirrors=scene.mirrors.toward(scene.sun, aims), dark=dark)
+
+
+def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
+    """Return earlier candidates in the present light."""
+    if len(scene.mirrors) != len(start.aims):
+        raise InputError(
+            f"aims: the start has {len(start.aims)} mirrors, the scene {len(scene.mirrors)}; begin "
+            "without it"
+        )
+    before, now = start.engine.leaving, base.leaving
+    # A defocused mirror sends nothing now or then; the field's light stands for its own.
+    usual = now.sum() / max(float(before[now > 0.0].sum()), 1e-300)
+    ratio = np.where(before > 0.0, now / np.where(before > 0.0, before, 1.0), usual)
+    if scene.dark is not None:
+        ratio = np.where(scene.dark, 0.0, ratio)
+    return start.field.relit(as_float(start.field.weight * ratio))
+
+
+def _evaluated(
+    scene: Scene,
+    field: Candidates,
+    choice: Choice,
+    demand: Demand,
+    limit: FloatArray,
+    light: dict[str, Any],
+) -> SceneAims:
+    """Return what the engine says of a choice."""
+    rows = np.arange(len(choice.choice))
+    off = choice.choice < 0
+    aims = np.where(off[:, None], middles(scene), field.aims[rows, np.maximum(choice.choice, 0)])
+    engine = FieldFlux(_posed(scene, aims, off), **light)
+    mirrors = engine.scene.mirrors
+    risk = Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
+    if mirrors.pointing.any() or demand.shared.any:
+        groups = np.zeros(len(rows), dtype=np.int64) if demand.groups is None else demand.groups
+        modes = demand.shared.modes(mirrors, scene.sun, demand.pole)
+        width = float(np.median(field.width)) / np.sqrt(field.images.area)
+        risk = assess(engine, modes, groups, demand.probability, limit, width)
+    return SceneAims(engine, field, choice, aims, off, limit, risk, light)
+
+
+def _place(scene: Scene, cell: tuple[int, ...]) -> str:
+    east, north, up = surface_in(scene).cells.center.reshape(*surface_in(scene).shape, 3)[cell]
+    return f"row {cell[0]}, column {cell[1]} ({east:.1f}, {north:.1f}, {up:.1f} m)"
+
+
+def _refuse(scene: Scene, found: SceneAims, demand: Demand) -> None:
+    over = found.quantile / found.limit
+    cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
+    advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
+    raise InputError(
+        f"receiver {surface_in(scene).name}: no aims were found that hold the flux limit; "
+        f"{_place(scene, cell)} gets {1e-3 * found.quantile[cell]:.4g} kW/m², of which errors are "
+        f"{1e-3 * found.risk.above[cell]:.4g}, {100 * found.excess:.2g} % above its "
+        f"{1e-3 * found.limit[cell]:.4g}; raise the limit by that, or {advice}"
+    )

@@ -1,0 +1,218 @@
+"""``heliotrope aim``: aims that keep the flux on a receiver under a limit, although mirrors err."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from heliotrope.cli._calibration import progress
+from heliotrope.cli._common import (
+    open_plant,
+    parse_numbers,
+    parse_point,
+    parse_site,
+    parse_time,
+    print_json,
+    print_table,
+)
+from heliotrope.cli._light import (
+    Air,
+    CantingOption,
+    CellOption,
+    Clean,
+    Dni,
+    Error,
+    FacetOption,
+    Field,
+    Focus,
+    Reflectivity,
+    Shape,
+    SiteOption,
+    Slope,
+    Sun,
+    Time,
+    Towers,
+    canting_of,
+    light_of,
+    noon,
+)
+from heliotrope.errors import InputError, shown
+
+if TYPE_CHECKING:
+    from heliotrope.aims import AimPlan, FluxLimit
+    from heliotrope.aims.strategies import Strategy
+
+#: Heliostats and cells that are named on the screen.
+NAMED = 5
+
+
+def aim(
+    field: Field,
+    limit: Annotated[
+        str, typer.Option(help="Allowable flux: kW/m², or a file of the cells' (CSV, W/m²).")
+    ],
+    margin: Annotated[
+        float, typer.Option(min=0, max=0.5, help="Share of it kept for the model's own error.")
+    ] = 0.01,
+    probability: Annotated[
+        float, typer.Option(min=0.5, max=0.9999, help="That the limit holds in all cells.")
+    ] = 0.99,
+    strategy: Annotated[
+        Literal["optimal", "middle", "spread", "image-size", "all"],
+        typer.Option(help="The others are for comparison, and take no heed of the limit."),
+    ] = "optimal",
+    keep_all: Annotated[
+        bool, typer.Option("--keep-all", help="Defocus no heliostat, or refuse.")
+    ] = False,
+    drift_mrad: Annotated[
+        float, typer.Option(min=0, max=50, help="Turn that all normals share, mrad per axis.")
+    ] = 0.0,
+    cluster_mrad: Annotated[
+        float, typer.Option(min=0, max=50, help="The same of each cluster, mrad per axis.")
+    ] = 0.0,
+    clock_s: Annotated[
+        float, typer.Option(min=0, max=600, help="Error of the field's clock, s.")
+    ] = 0.0,
+    time: Time = None,
+    sun: Sun = None,
+    receiver: Annotated[str, typer.Option(help="Name. Default: the first.")] = "",
+    site: SiteOption = None,
+    dni: Dni = 900.0,
+    shape: Shape = "limb",
+    air: Air = "clear",
+    slope_mrad: Slope = 1.0,
+    error_mrad: Error = 1.0,
+    reflectivity: Reflectivity = 0.9,
+    clean: Clean = 1.0,
+    focus: Focus = "slant",
+    facets: FacetOption = None,
+    canting: CantingOption = "slant",
+    cells: CellOption = None,
+    tower: Towers = None,
+    csv: Annotated[Path | None, typer.Option("--csv", help="File for the aims.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Choose aims of most power that keep the flux under a limit with a chosen probability."""
+    from heliotrope.aims import STRATEGIES, SharedErrors, plan_aims
+
+    light = light_of(
+        dni, shape, air, slope_mrad, error_mrad, reflectivity, clean, focus, facets, cells, tower
+    )
+    _check(field, csv, picture)
+    allowed = _limit(limit, margin)
+    if time is not None and sun is not None:
+        raise InputError("give --time or --sun, not both")
+    plant = open_plant(field, None if site is None else parse_site(site))
+    light = replace(light, canting=canting_of(canting, plant))
+    when = None if sun is not None else noon(plant) if time is None else parse_time(time)
+    options: dict[str, Any] = {
+        "sun": None if sun is None else parse_point(sun, "sun"), "light": light, "limit": allowed,
+        "probability": probability, "keep": keep_all,
+        "shared": SharedErrors(1e-3 * drift_mrad, clock_s, 1e-3 * cluster_mrad),
+    }  # fmt: skip
+    names: tuple[Strategy, ...] = STRATEGIES if strategy == "all" else (strategy,)
+    with progress("choosing aims", as_json) as step:
+        plans = {
+            name: plan_aims(plant, when, receiver, strategy=name, progress=step, **options)
+            for name in names
+        }
+    chosen = plans[names[-1]]
+    if csv is not None:
+        from heliotrope.aims import write_aims
+
+        write_aims(csv, chosen)
+    if picture is not None:
+        from heliotrope.calibration.plan.report import write_picture
+        from heliotrope.plot import aim_figure
+
+        write_picture(picture, aim_figure(chosen))
+    if as_json:
+        print_json(_document(plans, chosen))
+        return
+    _print(plans, chosen)
+    for name, path in (("csv", csv), ("picture", picture)):
+        if path is not None:
+            print(f"{name}: {path}")
+
+
+def _check(field: Path, csv: Path | None, picture: Path | None) -> None:
+    from heliotrope.calibration.plan.report import check_picture
+    from heliotrope.cli.plan import check_outputs
+
+    if picture is not None:
+        check_picture(picture)
+    check_outputs(tuple(path for path in (csv, picture) if path is not None), field, None)
+
+
+def _limit(text: str, margin: float) -> "FluxLimit":
+    from heliotrope.aims import FluxLimit, read_limit
+
+    if Path(text).suffix.lower() == ".csv":
+        return read_limit(text, margin)
+    refusal = f"--limit {shown(text)}: give kW/m² from 0.001 to 64000, or a file .csv in W/m²"
+    return FluxLimit(1e3 * parse_numbers(text, refusal, least=1e-3, most=6.4e4)[0], margin)
+
+
+def _document(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> dict[str, Any]:
+    from heliotrope.aims import compare_aims
+
+    power = chosen.light.heliostat_power
+    return {
+        "plant": chosen.light.plant,
+        "receiver": chosen.light.maps[0].receiver,
+        "strategies": compare_aims(plans),
+        "flux_w_m2": chosen.light.flux,
+        "quantile_w_m2": chosen.quantile,
+        "limit_w_m2": chosen.limit,
+        "binding": chosen.scene.binding,
+        "heliostats": [
+            {
+                "name": name,
+                "aim_m": chosen.aim[k],
+                "defocused": bool(chosen.defocused[k]),
+                "power_w": power[k],
+                "calibration_gain_w": chosen.gain[k],
+            }
+            for k, name in enumerate(chosen.names)
+        ],
+    }
+
+
+def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
+    import numpy as np
+
+    from heliotrope.aims import compare_aims
+
+    header = [
+        "strategy",
+        "MW",
+        "lost",
+        "peak, kW/m²",
+        "over the limit",
+        "defocused",
+        "best at most",
+    ]
+    rows = []
+    for row in compare_aims(plans):
+        share = row["lost_w"] / max(row["power_w"] + row["lost_w"], 1e-300)
+        over = f"{100 * row['excess']:+.2f} %"
+        gap = f"+{100 * row['gap']:.2f} %" if np.isfinite(row["gap"]) else ""
+        peak = f"{1e-3 * row['peak_w_m2']:.5g}"
+        rows.append(
+            [row["strategy"], f"{1e-6 * row['power_w']:.5g}", f"{100 * share:.2f} %", peak, over,
+             str(row["defocused"]), gap]
+        )  # fmt: skip
+    print_table(
+        header, rows, title=f"{chosen.light.plant}: aims on {chosen.light.maps[0].receiver}"
+    )
+    binding = int(chosen.scene.binding.sum())
+    print(f"{binding:,} of {chosen.limit.size:,} cells bind")
+    best = np.argsort(-chosen.gain)[:NAMED]
+    words = [
+        f"{chosen.names[k]} {1e-3 * chosen.gain[k]:.3g} kW" for k in best if chosen.gain[k] > 0
+    ]
+    if words:
+        print(f"calibration gains most at {', '.join(words)}")

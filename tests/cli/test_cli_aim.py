@@ -1,0 +1,72 @@
+"""``heliotrope aim``: what it prints, what it writes, and what it refuses."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import heliotrope as ht
+from heliotrope.cli import main
+
+WORDS = ("--sun=0.1,0.6,0.8", "--cells=10x12")
+
+
+@pytest.fixture
+def aim(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run the command on the example plant in its folder."""
+    monkeypatch.chdir(tmp_path)
+    ht.write_plant(ht.example_plant(), "plant.toml")
+
+    def run(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["heliotrope", "aim", "plant.toml", *WORDS, *words])
+        with pytest.raises(SystemExit) as leaving:
+            main()
+        said = capsys.readouterr()
+        return int(leaving.value.code or 0), said.out, said.err
+
+    return run
+
+
+def test_strategies_stand_in_one_table_and_files_are_written(aim: Any) -> None:
+    code, out, err = aim("--limit=120", "--strategy=all", "--csv=a.csv", "--picture=a.png")
+    assert code == 0, err
+    for name in ("middle", "spread", "image-size", "optimal", "csv: a.csv", "picture: a.png"):
+        assert name in out
+    with Path("a.csv").open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    assert {row["state"] for row in rows} <= {"aim", "defocus"}
+    assert sum(float(row["power_kw"]) for row in rows) > 10.0
+
+
+def test_json_keeps_the_limit_of_a_file(aim: Any) -> None:
+    Path("limit.csv").write_text("90000,90000\n140000,140000\n", encoding="utf-8")
+    code, out, err = aim("--limit=limit.csv", "--margin=0", "--json")
+    assert code == 0, err
+    got = json.loads(out)
+    limit, flux = np.array(got["limit_w_m2"]), np.array(got["quantile_w_m2"])
+    assert limit[0].max() == 140000.0
+    assert limit[-1].max() == 90000.0
+    assert (flux <= limit).all()
+    assert got["strategies"][0]["excess"] <= 0.0
+    assert len(got["heliostats"]) == 18
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("--limit=5", "--keep-all"), "no aims were found that hold the flux limit"),
+        (("--limit=much",), "--limit 'much': give kW/m²"),
+        (("--limit=none.csv",), "none.csv"),
+        (("--limit=100", "--time=now"), "--time or --sun"),
+        (("--limit=100", "--receiver=other"), "other"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(aim: Any, words: tuple[str, ...], line: str) -> None:
+    code, _, err = aim(*words)
+    assert code == 2
+    assert line in err
+    assert err.count("\n") == 1
