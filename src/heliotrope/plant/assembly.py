@@ -33,7 +33,7 @@ from heliotrope.plant.operations.calibrating import Scheduling, Visits
 from heliotrope.plant.operations.foresight import Prospect
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking
-from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.operations import Operations, Photography
 from heliotrope.plant.operations.pictures import KeptCamera
 from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.plant.orders.authority import Person, Role
@@ -176,11 +176,13 @@ class PlantAssembly:
             self.plant,
             self.logbook,
             automatic,
-            cameras={} if cameras is None else dict.fromkeys(self._seen(cameras), cameras),
+            photography=Photography(
+                {} if cameras is None else dict.fromkeys(self._seen(cameras), cameras),
+                ports.pictures,
+                None if cameras is None else self._marking(cameras),
+            ),
             records=ports.records,
             extra=ports.facts,
-            pictures=ports.pictures,
-            marking=None if cameras is None else self._marking(cameras),
             worker=ports.worker,
         )
         #: When each heliostat last moved, or was ordered to, on its way to stow at the end.

@@ -14,6 +14,7 @@ heliostat that an operator has raised and that was lost is left to the operators
 import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -86,6 +87,25 @@ class Photographer(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Photography:
+    """What a plant does with photographs.
+
+    Attributes
+    ----------
+    cameras
+        Photographs of the targets for display, by target name.
+    pictures
+        Stores photographs with their results; None: they are not stored.
+    marking
+        Takes views that users mark; None: there is no camera.
+    """
+
+    cameras: Mapping[str, Photographer] = field(default_factory=dict)
+    pictures: Pictures | None = None
+    marking: Marking | None = None
+
+
 class Operations:
     """A running plant.
 
@@ -98,16 +118,12 @@ class Operations:
         Alarms, events and packets.
     automatic
         Automatic control of the plant.
-    cameras
-        Photographs of the targets for display, by target name.
+    photography
+        Cameras, stored photographs, and the marking of views.
     records
         Store of everything that survives a restart; None: nothing is stored.
     extra
         Function that returns additional rows for the summary, such as the speed of a twin.
-    pictures
-        Stores photographs with their results; None: they are not stored.
-    marking
-        Takes views that users mark; None: there is no camera.
     worker
         Where computations run; see `Worker`.
 
@@ -127,15 +143,14 @@ class Operations:
         logbook: Logbook,
         automatic: AutomaticControl,
         *,
-        cameras: Mapping[str, Photographer] | None = None,
+        photography: Photography = Photography(),
         records: Records | None = None,
         extra: Callable[[], Mapping[str, Any]] | None = None,
-        pictures: Pictures | None = None,
-        marking: Marking | None = None,
         worker: Worker = at_once,
     ) -> None:
-        self.plant, self.logbook, self.pictures, self.marking = plant, logbook, pictures, marking
-        self.automatic, self._cameras, self._extra = automatic, dict(cameras or {}), extra
+        self.plant, self.logbook, self.automatic, self._extra = plant, logbook, automatic, extra
+        self.pictures, self.marking = photography.pictures, photography.marking
+        self._cameras = photography.cameras
         self.errands = Errands(plant.clock)
         self.security = SecurityLog(logbook, plant.clock)
         self.viewer = Viewer(plant, self.automatic)
