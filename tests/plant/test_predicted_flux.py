@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import heliotrope as ht
+from heliotrope.errors import InputError
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import normalize
 from heliotrope.optics import FieldOptics, plant_flux
@@ -36,6 +37,22 @@ def test_it_is_what_the_library_says_of_the_same_mirrors() -> None:
         assert away < 0.05 * whole.peak, "the sun has moved on by some seconds at most"
 
     live(scene, AutomaticSettings(wanted=True))
+
+
+def test_a_plant_goes_on_when_the_process_that_computes_it_has_ended() -> None:
+    async def ended(*_: object) -> None:
+        raise InputError("the process that computes beside the plant has ended")
+
+    async def scene(made: LivePlant) -> None:
+        operations = made.operations
+        operations._flux._worker = ended  # type: ignore[assignment]
+        with pytest.raises(InputError):
+            await operations.receiver_flux()
+        taken = await operations._figures()
+        assert "available" in taken
+        assert "power.receiver" not in taken
+
+    live(scene, AutomaticSettings())
 
 
 @pytest.mark.parametrize("front", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (-0.6, -0.8, 0.0)])

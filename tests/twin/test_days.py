@@ -14,6 +14,7 @@ from heliotrope.calibration.record import CalibrationOutcome
 from heliotrope.lcu import states
 from heliotrope.links.messages import Command, Stage
 from heliotrope.plant.operations.automatic import AUTOMATIC
+from heliotrope.plant.operations.views import Running
 from heliotrope.plant.orders.audit import Record
 from heliotrope.plant.orders.authority import Person
 from heliotrope.safety import Act, Alarm, Severity
@@ -156,7 +157,7 @@ def watched(stage: str, *, rough: int = 0, gone: bool = False, touched: bool = F
     """Observe a visit of a mirror that is on its target, after a person has taken command."""
     target, one = TARGETS[0], board(states.TRACKING)
     one.node = SimpleNamespace(controller=SimpleNamespace(motion=SimpleNamespace(rough=rough)))
-    run = SimpleNamespace(target=target.name, heliostats=("H1",), heliostat="H1", stage=stage)
+    run = Running("H1", target.name, stage, 0.0)
     seen = SimpleNamespace(running=(run,), results=())
     operations = plant(view=lambda: seen)
     observer = ProgressObserver(0.0, [one], (target,), together=True, across=False)

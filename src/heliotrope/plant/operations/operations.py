@@ -22,7 +22,7 @@ from typing import Any, Protocol, TypeVar
 import numpy.typing as npt
 
 from heliotrope import sun
-from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
@@ -334,7 +334,10 @@ class Operations:
         return await asyncio.to_thread(read, self._records)
 
     async def _figures(self) -> dict[str, float]:
-        power = {name: view.power for name, view in (await self._flux.everywhere()).items()}
+        try:
+            power = {name: view.power for name, view in (await self._flux.everywhere()).items()}
+        except HeliotropeError:
+            power = {}  # the process that computes has ended, and another begins
         return figures(self.viewer.frame(), self.summary(), self.sun(), power)
 
     # -- light -----------------------------------------------------------------------------
