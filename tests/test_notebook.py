@@ -85,7 +85,6 @@ def test_the_first_hour(tmp_path: Path) -> None:
     assert (found.charts, found.scenes) == (5, 1)
 
 
-@pytest.mark.slow
 def test_juelich(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HELIOTROPE_DATA", str(juelich()))
     found = Executed(EXAMPLES / "notebooks" / "juelich.ipynb", tmp_path)
@@ -114,7 +113,6 @@ def test_an_own_mechanism(tmp_path: Path) -> None:
     assert (found.charts, found.scenes) == (3, 1)
 
 
-@pytest.mark.slow
 def test_an_own_centroid(tmp_path: Path) -> None:
     found = Executed(EXAMPLES / "notebooks" / "own_centroid.ipynb", tmp_path)
     for name in ("everything", "upper half", "program"):
@@ -129,7 +127,6 @@ def test_an_own_centroid(tmp_path: Path) -> None:
     assert found.charts == 3
 
 
-@pytest.mark.slow
 def test_a_campaign(tmp_path: Path) -> None:
     found = Executed(EXAMPLES / "notebooks" / "campaign.ipynb", tmp_path)
     (planned,) = found.numbers(r"planned, best first: ([\d.]+) mrad")
@@ -142,7 +139,6 @@ def test_a_campaign(tmp_path: Path) -> None:
     assert found.charts == 5
 
 
-@pytest.mark.slow
 def test_the_flux_of_a_field(tmp_path: Path) -> None:
     pytest.importorskip("embreex")
     found = Executed(EXAMPLES / "notebooks" / "flux.ipynb", tmp_path)
