@@ -34,7 +34,7 @@ class Candidates:
     weight
         Light of each mirror over that of its images, (H,).
     shifts
-        Rows by which the images are moved, (H, S).
+        Displacements of the images in rows, (H, S).
     aims
         ENU m, (H, K · S, 3).
     power
@@ -164,11 +164,11 @@ def candidates(engine: FieldFlux) -> Candidates:
     aims = looks[:, :, None, :] + (step * shifts)[:, None, :, None] * axis
     aims = as_float(aims.reshape(len(mirrors), -1, 3))
     empty = np.zeros(aims.shape[:2])
-    found = Candidates(images, np.ones(len(mirrors)), shifts, aims, empty, width)
-    power = found.worth(np.full((surface.shape[1], rows), images.area))
+    built = Candidates(images, np.ones(len(mirrors)), shifts, aims, empty, width)
+    power = built.worth(np.full((surface.shape[1], rows), images.area))
     if not power.any():
         raise InputError(
             f"receiver {surface.name}: none of the {len(mirrors)} mirrors sends light to any of "
             "its cells; turn it to the field, or choose another sun"
         )
-    return replace(found, power=power)
+    return replace(built, power=power)

@@ -52,7 +52,7 @@ class FluxLimit:
         return limit if isinstance(limit, FluxLimit) else cls(as_float(limit))
 
     def on(self, rows: int, columns: int) -> FloatArray:
-        """Return what each of a receiver's cells may get, less the margin, W/m², (rows, columns).
+        """Return the allowable flux of each cell, less the margin, W/m², (rows, columns).
 
         A cell gets the least of the map's cells that it overlaps, so that a finer grid never
         allows more.

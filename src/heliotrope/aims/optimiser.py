@@ -122,7 +122,7 @@ def optimise(
             choice = bound(field, cap, prices, idle)[1]
     else:
         prices, choice = start.prices.copy(), start.choice.copy()
-    found: Choice | None = None
+    reached: Choice | None = None
     least = np.inf
     for k in range(sweeps):
         prices = _sweep(field, cap, prices, choice, rng.permutation(everyone), idle)
@@ -132,14 +132,14 @@ def optimise(
             continue
         least = min(least, bound(field, cap, prices, idle)[0])
         now = _settled(field, cap, prices, choice, least, idle)
-        if found is None or now.power > found.power:
-            found = now
-        if found.bound - found.power <= gap * found.power:
+        if reached is None or now.power > reached.power:
+            reached = now
+        if reached.bound - reached.power <= gap * reached.power:
             break
-    if found is None:
+    if reached is None:
         least = bound(field, cap, prices, idle)[0]
-        found = _settled(field, cap, prices, choice, least, idle)
-    return replace(found, bound=least)
+        reached = _settled(field, cap, prices, choice, least, idle)
+    return replace(reached, bound=least)
 
 
 def _sweep(

@@ -197,10 +197,10 @@ def plan_aims(
     )
     options = {"sun": optics.shape, "air": optics.air, "gaussians": optics.gaussians}
     begin = None if start is None else start.scene
-    found = aim_scene(scene, demand, strategy=strategy, start=begin, progress=progress, **options)
+    aimed = aim_scene(scene, demand, strategy=strategy, start=begin, progress=progress, **options)
     off = np.zeros(len(plant), dtype=np.bool_) if scene.dark is None else scene.dark
-    result = result_of(plant, found.engine.scene, found.engine)
-    return AimPlan(strategy, result, found.defocused & ~off, off, found.field.middle_power, found)
+    result = result_of(plant, aimed.engine.scene, aimed.engine)
+    return AimPlan(strategy, result, aimed.defocused & ~off, off, aimed.field.middle_power, aimed)
 
 
 def compare_aims(plans: Mapping[Any, AimPlan]) -> list[dict[str, Any]]:

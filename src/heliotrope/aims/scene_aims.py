@@ -197,13 +197,13 @@ def _held(
             field, np.ascontiguousarray(cap.T), choice, keep=demand.keep,
             progress=_part(progress, k), **({} if first else {"sweeps": AGAIN if k < FREE else 0}),
         )  # fmt: skip
-        found = _evaluated(scene, field, choice, demand, limit, light)
-        if best is None or _rank(found) > _rank(best):
-            best = found
+        trial = _evaluated(scene, field, choice, demand, limit, light)
+        if best is None or _rank(trial) > _rank(best):
+            best = trial
         # Early rounds may leave room, taken for errors of a choice that stood higher.
         if best.excess <= 0.0 and (k + 1 >= FREE or best.excess > -BINDS):
             break
-        new = found.quantile - choice.flux.T
+        new = trial.quantile - choice.flux.T
         # From then on no cell gets room back, so that the rounds end.
         more = new if k < FREE else more + BEYOND * np.maximum(new - more, 0.0)
     assert best is not None
@@ -212,10 +212,10 @@ def _held(
     return best
 
 
-def _rank(found: SceneAims) -> tuple[bool, float]:
-    """Return what orders aims: those that hold the limit by power, the others by excess."""
-    holds = found.excess <= 0.0
-    return holds, found.engine.powers[0] if holds else -found.excess
+def _rank(trial: SceneAims) -> tuple[bool, float]:
+    """Return the sort key of aims: power where they hold the limit, else the excess."""
+    holds = trial.excess <= 0.0
+    return holds, trial.engine.powers[0] if holds else -trial.excess
 
 
 def _part(progress: Step | None, done: int) -> Step | None:
@@ -256,7 +256,7 @@ def _evaluated(
     limit: FloatArray,
     light: dict[str, Any],
 ) -> SceneAims:
-    """Return what the engine says of a choice."""
+    """Return the engine's evaluation of a choice."""
     rows = np.arange(len(choice.choice))
     off = choice.choice < 0
     aims = np.where(off[:, None], middles(scene), field.aims[rows, np.maximum(choice.choice, 0)])
@@ -276,13 +276,13 @@ def _place(scene: Scene, cell: tuple[int, ...]) -> str:
     return f"row {cell[0]}, column {cell[1]} ({east:.1f}, {north:.1f}, {up:.1f} m)"
 
 
-def _refuse(scene: Scene, found: SceneAims, demand: Demand) -> None:
-    over = found.quantile / found.limit
+def _refuse(scene: Scene, trial: SceneAims, demand: Demand) -> None:
+    over = trial.quantile / trial.limit
     cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
     advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
     raise InputError(
         f"receiver {surface_in(scene).name}: no aims were found that hold the flux limit; "
-        f"{_place(scene, cell)} gets {1e-3 * found.quantile[cell]:.4g} kW/m², of which errors are "
-        f"{1e-3 * found.risk.above[cell]:.4g}, {100 * found.excess:.2g} % above its "
-        f"{1e-3 * found.limit[cell]:.4g}; raise the limit by that, or {advice}"
+        f"{_place(scene, cell)} gets {1e-3 * trial.quantile[cell]:.4g} kW/m², of which errors are "
+        f"{1e-3 * trial.risk.above[cell]:.4g}, {100 * trial.excess:.2g} % above its "
+        f"{1e-3 * trial.limit[cell]:.4g}; raise the limit by that, or {advice}"
     )

@@ -344,16 +344,18 @@ def events(
     """Print the last events since the start of the plant, the latest first."""
     with _client(context) as client:
         found = client.get(f"events?limit={limit}")
-        for one in found if all_names else ():
-            if one["heliostats"]:
-                one["names"] = client.get(f"events/{one['number']}/heliostats")
+        for event in found if all_names else ():
+            if event["heliostats"]:
+                event["names"] = client.get(f"events/{event['number']}/heliostats")
     if as_json:
         print_json(found)
         return
-    for one in found:
-        print("  ".join(filter(None, (_utc(one["at"]), one["kind"], one["who"], one["text"]))))
-        if "names" in one:
-            print(f"    {', '.join(one['names'])}")
+    for event in found:
+        print(
+            "  ".join(filter(None, (_utc(event["at"]), event["kind"], event["who"], event["text"])))
+        )
+        if "names" in event:
+            print(f"    {', '.join(event['names'])}")
 
 
 @app.command()
@@ -387,7 +389,7 @@ def journal(
             query[name] = f"{parse_time(moment).timestamp():.3f}"
     with _client(context) as client:
         found = client.get(f"journal?{urlencode(query)}")
-    rows = [(_utc(one["at"]), one["kind"], one["what"], one["text"]) for one in found]
+    rows = [(_utc(entry["at"]), entry["kind"], entry["what"], entry["text"]) for entry in found]
     if as_csv:
         csv.writer(sys.stdout).writerows((("time", "kind", "what", "text"), *rows))
         return
@@ -755,7 +757,7 @@ def approvals(
             client.ask("POST", f"{path}/refuse", {"reason": reason})
             print(f"change {number} refused")
         elif client.get("authority")["holder"] in [
-            one["author"] for one in waiting if one["number"] == number
+            change["author"] for change in waiting if change["number"] == number
         ]:
             _follow(client, client.ask("POST", f"{path}/approve"), wait, keeping=False)
         else:
@@ -767,23 +769,23 @@ def _show_waiting(waiting: list[dict[str, Any]], as_json: bool = False) -> None:
     if as_json:
         print_json(waiting)
         return
-    for one in waiting:
+    for change in waiting:
         print(
-            f"change {one['number']} of {one['heliostat']}, asked for by {one['author']} at "
-            f"{_utc(one['at'])}: {one['reason']}; it ends at {_utc(one['until'])}"
+            f"change {change['number']} of {change['heliostat']}, asked for by {change['author']} "
+            f"at {_utc(change['at'])}: {change['reason']}; it ends at {_utc(change['until'])}"
         )
-        if one["version"]:
-            print(f"version {one['version']} again")
+        if change["version"]:
+            print(f"version {change['version']} again")
         rows = []
-        for parameter in one["parameters"]:
+        for parameter in change["parameters"]:
             unit, size = _SHOWN[parameter["unit"]]
             shown = (f"{parameter[key] / size:.3f}" for key in ("now", "asked"))
             rows.append((parameter["name"], *shown, unit))
         print_table(("parameter", "in use", "asked for", "unit"), rows)
-        if one["beam_rms"] is not None:
+        if change["beam_rms"] is not None:
             print(
-                f"the beam moves by {1e3 * one['beam_rms']:.1f} mm RMS at its aim, at most "
-                f"{1e3 * one['beam_most']:.1f} mm"
+                f"the beam moves by {1e3 * change['beam_rms']:.1f} mm RMS at its aim, at most "
+                f"{1e3 * change['beam_most']:.1f} mm"
             )
     if not waiting:
         print("no change waits for approval")
@@ -934,18 +936,20 @@ def _save_calibration(
     if not results:
         raise InputError(f"{heliostat}: it has no result of a calibration yet")
     *_, before, last = [{"at": 0.0}, *sorted(results, key=lambda result: result["at"])]
-    mine = [one for one in kept if before["at"] < one["at"] <= last["at"] + 1.0]
-    mine.sort(key=lambda one: one["at"])
+    mine = [picture for picture in kept if before["at"] < picture["at"] <= last["at"] + 1.0]
+    mine.sort(key=lambda picture: picture["at"])
     if not mine:
         raise InputError(f"{heliostat}: no photograph of its last calibration is kept")
     print(f"{last['outcome']}, {_utc(last['at'])}, {last['target']}: {last['text']}")
     name = re.sub(r"[^\w.-]", "_", heliostat)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for which, one in zip(("first", "last"), (mine[0], mine[-1])[: len(mine)], strict=False):
-            at = datetime.fromtimestamp(one["at"], UTC)
+        for which, picture in zip(
+            ("first", "last"), (mine[0], mine[-1])[: len(mine)], strict=False
+        ):
+            at = datetime.fromtimestamp(picture["at"], UTC)
             path = folder / f"{name}-{at:%Y%m%dT%H%M%SZ}-{which}.jpg"
-            path.write_bytes(client.picture(f"photographs/{one['identity']}"))
+            path.write_bytes(client.picture(f"photographs/{picture['identity']}"))
             print(path)
     except OSError as error:
         raise InputError(f"ctl photographs: {error.filename}: {error.strerror}") from None

@@ -266,7 +266,7 @@ def _document(result: "PlantFlux", when: Any) -> dict[str, Any]:
 
 
 def _second(result: "PlantFlux", second: "PlantFlux") -> dict[str, Any]:
-    """Return what rays say, beside the engine's result."""
+    """Return the result of the rays beside that of the engine."""
     import numpy as np
 
     apart = [a.flux - b.flux for a, b in zip(result.maps, second.maps, strict=True)]

@@ -33,7 +33,7 @@ _LEAST_RUN = 4
 
 
 def weakness(password: str, name: str = "") -> str | None:
-    """Return why a password is guessed early, None if it is not known to be.
+    """Return the reason why a password is guessed early, None if none is known.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Marks on a target, by which a camera locates the target."""
+"""Marks on a target that let a camera locate the target."""
 
 from dataclasses import dataclass
 

@@ -32,7 +32,7 @@ class Target(Value):
     markers
         Additional known points by name, ENU metres.
     marks
-        Marks painted on the target, by which cameras locate it.
+        Marks painted on the target that let cameras locate it.
     """
 
     name: str

@@ -169,7 +169,7 @@ class Papers:
         return changes
 
     def renewed(self) -> list[str]:
-        """Return what was taken again since the last call; its first taking is not counted."""
+        """Return the files taken again since the last call; the first taking does not count."""
         before, self._counts = self._counts, {n: r.count for n, r in self._renewals.items()}
         return [n for n, count in self._counts.items() if count > max(1, before.get(n, 0))]
 

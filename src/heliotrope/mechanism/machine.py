@@ -61,7 +61,7 @@ class AxisLimits:
 
     @property
     def lead(self) -> int:
-        """Steps by which a goal that moves down with the sun is set ahead, as in `lcu.stepper`."""
+        """Lead of a goal that moves down with the sun, steps, as in `lcu.stepper`."""
         return math.ceil(self.backlash / 8)
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class Machine:
     stow
         Position of both axes at stow, steps.
     defocus
-        Angles by which both axes turn away from the receiver, rad.
+        Angles of both axes for turning away from the receiver, rad.
     standby
         Standby point, ENU, m; None: the local controller keeps its stored point.
     azimuth_axis

@@ -25,10 +25,10 @@ from heliotrope.optics._image_kernels import (
 
 
 @njit(**INNER)
-def _seen_from(seen, count):
+def _seen_from(facing, count):
     """Visible column after which the others follow without a gap."""
     for k in range(1, count):
-        if int(seen[0, k]) != int(seen[0, k - 1]) + 1:
+        if int(facing[0, k]) != int(facing[0, k - 1]) + 1:
             return k
     return 0
 
@@ -45,14 +45,14 @@ def _bounds(local, count, start, begin, end, least, tops, box):
     peak = 0.0
     for k in range(count):
         peak = max(peak, tops[k])
-    left, right = count, -1
+    west, right = count, -1
     for m in range(count):
         if tops[(start + m) % count] > peak * least:
-            left, right = min(left, m), m
+            west, right = min(west, m), m
     bottom, top = _edge(local, count, begin, end, peak * least), end
     while top > bottom and _highest(local[top], count) <= peak * least:
         top -= 1
-    box[0], box[1], box[2], box[3] = left, right - left + 1, bottom, top - bottom + 1
+    box[0], box[1], box[2], box[3] = west, right - west + 1, bottom, top - bottom + 1
     return peak > 0.0
 
 
@@ -103,7 +103,7 @@ def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts,
     weights, variances = sums
     low, step, number, _ = grid
     wide = len(columns[0])
-    seen, local = np.empty((8, wide)), np.zeros((number, wide))
+    facing, local = np.empty((8, wide)), np.zeros((number, wide))
     room = (
         np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide),
         np.empty(wide),
@@ -130,7 +130,7 @@ def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts,
         count, _ = _images(
             i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work
         )
-        visible = _columns(row, ray, axes, t, shape, columns, seen)
+        visible = _columns(row, ray, axes, t, shape, columns, facing)
         if not visible:
             continue
         begin, end = number, -1
@@ -142,13 +142,13 @@ def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts,
                     weights[g] * image[0] * light[i], image[1], image[2],
                     image[3] + t * t * (uu + more), image[4] + t * t * uv,
                     image[5] + t * t * (vv + more),
-                    seen, visible, low, step, number, local, room,
+                    facing, visible, low, step, number, local, room,
                 )  # fmt: skip
                 begin, end = min(begin, a), max(end, b)
-        start = _seen_from(seen, visible)
+        start = _seen_from(facing, visible)
         begin, end = max(begin, tall - reach[i]), min(end, number - 1 - tall + reach[i])
         if _bounds(local, visible, start, begin, end, least, room[0], box):
-            boxes[j, 0] = int(seen[0, (start + box[0]) % visible])
+            boxes[j, 0] = int(facing[0, (start + box[0]) % visible])
             boxes[j, 1], boxes[j, 2], boxes[j, 3] = box[1], box[2], box[3]
         else:
             box[1] = box[3] = 0
@@ -169,7 +169,7 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
     weights, variances = sums
     low, step, number, _ = grid
     wide = len(columns[0])
-    seen, local = np.empty((8, wide)), np.zeros((number, wide))
+    facing, local = np.empty((8, wide)), np.zeros((number, wide))
     room = (
         np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide), np.empty(wide),
         np.empty(wide),
@@ -192,7 +192,7 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
         count, _ = _images(
             i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work
         )
-        visible = _columns(row, ray, axes, t, shape, columns, seen)
+        visible = _columns(row, ray, axes, t, shape, columns, facing)
         if not visible:
             continue
         first_row, last_row = number, -1
@@ -202,33 +202,33 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
             sv, suv = image[5] + t * t * (vv + variances[g]), image[4] + t * t * uv
             begin, end = _gauss(
                 weights[g] * image[0] * light[i], image[1], image[2], su, suv, sv,
-                seen, visible, low, step, number, local, room,
+                facing, visible, low, step, number, local, room,
             )  # fmt: skip
             first_row, last_row = min(first_row, begin), max(last_row, end)
             for r in range(begin, end + 1):
                 z = low + r * step
                 for k in range(visible):
-                    du, dv, wu, wv = seen[3, k], seen[4, k], seen[5, k], seen[6, k]
+                    du, dv, wu, wv = facing[3, k], facing[4, k], facing[5, k], facing[6, k]
                     a = su + box * du * du + wu * wu
                     b = suv + box * du * dv + wu * wv
                     c = sv + box * dv * dv + wv * wv
                     scale = t * local[r, k] / (a * c - b * b)
-                    pu, pv = seen[1, k] - image[1] + z * du, seen[2, k] - image[2] + z * dv
+                    pu, pv = facing[1, k] - image[1] + z * du, facing[2, k] - image[2] + z * dv
                     gradient[0, r, k] += scale * (c * pu - b * pv)
                     gradient[1, r, k] += scale * (a * pv - b * pu)
                     local[r, k] = 0.0
         _take(
-            gradient, first_row, last_row, seen, visible, scatter[i], modes[i], worth, own, shared,
-            i, value,
+            gradient, first_row, last_row, facing, visible, scatter[i], modes[i], worth, own,
+            shared, i, value,
         )  # fmt: skip
 
 
 @njit(**_FAST)
-def _take(gradient, begin, end, seen, visible, scatter, modes, worth, own, shared, i, value):
+def _take(gradient, begin, end, facing, visible, scatter, modes, worth, own, shared, i, value):
     """Add squares and sums of a mirror's derivatives, and clear these."""
     for r in range(begin, end + 1):
         for k in range(visible):
-            gu, gv, column = gradient[0, r, k], gradient[1, r, k], int(seen[0, k])
+            gu, gv, column = gradient[0, r, k], gradient[1, r, k], int(facing[0, k])
             gradient[0, r, k] = gradient[1, r, k] = 0.0
             one, two = scatter[0] * gu + scatter[1] * gv, scatter[2] * gv
             square = one * one + two * two

@@ -343,7 +343,7 @@ def field_flux(
 
 
 def result_of(plant: Plant, scene: Scene, engine: FieldFlux) -> PlantFlux:
-    """Return what an engine computed of a plant's scene."""
+    """Return the results of an engine for a plant's scene."""
     return _result(plant, scene, engine.efficiencies, _views(engine))
 
 

@@ -169,7 +169,7 @@ class FieldFlux:
             plan(rows, edges, self._field(), sign, flux, power)
 
     def _field(self) -> tuple[Any, ...]:
-        """Return what the kernels are told of the mirrors and of the light."""
+        """Return the inputs of the kernels: mirrors and light."""
         mirrors = self.scene.mirrors
         return (
             self._table, as_input(self.scene.sun), self._light, as_input(mirrors.slope),
@@ -232,7 +232,7 @@ class FieldFlux:
     def spread(
         self, scatter: FloatArray, modes: FloatArray, groups: IntArray, worth: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what small errors of the beams do to the flux of the first surface.
+        """Return the effect of small beam errors on the flux of the first surface.
 
         Parameters
         ----------
@@ -456,7 +456,7 @@ class _Cells:
 def _hidden(
     scene: Scene, mesh: Mesh, cells: FloatArray
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Return which cells others hide from each of D directions, (D, C), and each mirror's, (H,)."""
+    """Return the cells hidden from D directions, (D, C), and each mirror's direction, (H,)."""
     count = len(scene.mirrors)
     away = np.einsum("vk,ck->cv", mesh.vertices, mesh.cells.normal)
     away -= np.sum(mesh.cells.center * mesh.cells.normal, axis=-1)[:, None]

@@ -262,7 +262,7 @@ class Scene:
     surfaces
         Receivers and targets; a beam is caught by the first that it meets.
     towers
-        Obstacles. What stands in the light of a surface itself is up to the surface.
+        Obstacles, except those that belong to a surface.
     dark
         Mirrors whose beams do not count, (H,).
     """

@@ -556,7 +556,7 @@ class PlantController:
         return self._safe(who, Act.STOW, heliostats)
 
     def locked_for(self, heliostat: str) -> str:
-        """Return why a heliostat is LOCKED, since when and until when, in words."""
+        """Return a text that explains a LOCKED state: reason, beginning and end."""
         mandate = self.authority.visited().get(heliostat)
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
         held = self.guards.reasons(Asked("UNLOCK", (heliostat,)), NOT_NOW)
@@ -854,7 +854,7 @@ class PlantController:
             yield
 
     def misled(self, heliostat: str, point: FloatArray) -> str | None:
-        """Return why unverified parameters block a path to a point (3,), if they do."""
+        """Return the reason if unverified parameters block a path to a point (3,)."""
         return self._proofs.misled(heliostat, point)
 
     def _unwritable(self, heliostat: str) -> str | None:

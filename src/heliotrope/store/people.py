@@ -498,7 +498,7 @@ class People:
 
 
 def _likeness(name: str) -> str:
-    """Return what two names share that people would take for one another."""
+    """Return the form shared by two names that people could confuse."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().translate(_ALIKE).split())
 
 

@@ -392,7 +392,7 @@ def _warnings(plant: Plant) -> list[str]:
 
 
 def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
-    """Return what is unusual about a surface's position and orientation."""
+    """Return the unusual features of a surface's position and orientation."""
     what = f"{'target' if isinstance(surface, Target) else 'receiver'} {surface.name}"
     texts, lines = [], plant.position - surface.center
     behind = lines @ surface.normal <= 0.0

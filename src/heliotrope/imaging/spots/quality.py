@@ -50,7 +50,7 @@ class Limits:
     power
         Smallest power relative to the expected power.
     surprise
-        Number of standard deviations by which a beam may exceed its expected power, length or
+        Number of standard deviations that a beam may exceed its expected power, length or
         width.
     skewness
         Largest skewness; two overlapping beams are more skewed than the beam of one heliostat (98 %

@@ -93,7 +93,7 @@ class EmergencyOrder:
     def take_back(
         self, names: tuple[str, ...], rows: npt.NDArray[Any], heard: npt.NDArray[np.float64]
     ) -> tuple[str, ...]:
-        """Return which of K heliostats carried out the order but have moved back since.
+        """Return those of K heliostats that carried out the order but have moved back since.
 
         They no longer count as done. A row (`NODE`) from before the order is ignored.
         """
@@ -114,7 +114,7 @@ class EmergencyOrder:
         return report.with_evidence(self.proof.done, shown)
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
-        """Return which of some heliostats have not acknowledged the order."""
+        """Return those of some heliostats that have not acknowledged the order."""
         return tuple(name for name in heliostats if not self.is_acknowledged(name))
 
     def take_stage(self, heliostats: tuple[str, ...], stage: Stage, now: float) -> None:

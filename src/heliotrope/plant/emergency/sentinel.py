@@ -478,7 +478,7 @@ class Sentinel(Part):
         return text + f"{now - field.posed_at[row]:.0f} s ago it was {states.STATES[state]}{beam}"
 
     def refusal(self, clusters: Iterable[str]) -> str | None:
-        """Return why no new motion may begin in some clusters, None if it may."""
+        """Return the reason that forbids new motion in some clusters, None if it is allowed."""
         if self.on and self.order is not None:
             return f"an emergency holds ({self.order.act.name}; {_said(self.causes())})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))

@@ -308,7 +308,7 @@ class TableWatch:
         )
 
     def night(self) -> str | None:
-        """Return why the field rests at stow although nothing is wrong, None by day."""
+        """Return the reason for resting at stow although nothing is wrong, None by day."""
         return next((a.text for a in self.actions if a.condition == NIGHT), None)
 
     def off(self) -> dict[str, tuple[Act, str]]:

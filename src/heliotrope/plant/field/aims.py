@@ -194,7 +194,7 @@ class BeamCheck:
         )
 
     def stop(self, row: int, aim: FloatArray, sun: FloatArray, counts: FloatArray) -> str:
-        """Return which stop keeps a heliostat from an aim (3,), and the remedy.
+        """Return the stop that keeps a heliostat from an aim (3,), and the remedy.
 
         The sun vector is (3,), and the pose is the one nearest to counts (2,).
         """

@@ -589,7 +589,7 @@ def put_timetable(
 
 @_call("GET retries", "calibration")
 def retries(desk: Desk) -> tuple[Retry, ...]:
-    """Return what automatic control is retrying or has given up.
+    """Return the tasks that automatic control retries or has given up.
 
     Each record states the work, its subject, the number of failures, the last reason, seconds until
     the next attempt (null: no automatic attempt), and what follows.
@@ -671,7 +671,7 @@ def withdraw_change(desk: Desk, who: Person, order: orders.OneChange) -> None:
 
 @_call("GET targets/{name}", "calibration")
 def target(desk: Desk, order: orders.Named) -> CameraReading:
-    """Return what the software found in the latest photograph of a target."""
+    """Return the software's findings in the latest photograph of a target."""
     return CameraReading.of(desk.operations.camera(order.name))
 
 

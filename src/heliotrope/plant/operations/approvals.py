@@ -81,7 +81,7 @@ class WaitingChange:
     @property
     def text(self) -> str:
         """What it changes, and why, in words."""
-        what = ", ".join(f"{one.name} {one.asked:g}" for one in self.parameters)
+        what = ", ".join(f"{parameter.name} {parameter.asked:g}" for parameter in self.parameters)
         again = f"version {self.version} again: " if self.version else ""
         return f"PARAMETERS {self.heliostat}: {again}{what} ({self.reason})"
 
@@ -154,7 +154,7 @@ class Approvals:
             return
         try:
             document = self._records.waiting_changes()
-            kept = [_read(one) for one in json.loads(document or "[]")]
+            kept = [_read(item) for item in json.loads(document or "[]")]
         except StoreError as error:
             self._log.take_alarm(alarms.RECORDS.raised(problem=error))
             return
@@ -201,10 +201,10 @@ class Approvals:
         """
         person.must_be(Role.ENGINEER, "parameters")
         prepared = await self._prepared(heliostat, values, version, reason)
-        for one in self.waiting:
-            if one.heliostat == heliostat:
+        for change in self.waiting:
+            if change.heliostat == heliostat:
                 raise refusals.CHANGE_WAITS.error(
-                    heliostat=heliostat, number=one.number, author=one.author
+                    heliostat=heliostat, number=change.number, author=change.author
                 )
         change = self._new(person, heliostat, version, prepared)
         course = self._courses[change.number] = _Course(change)
@@ -231,7 +231,7 @@ class Approvals:
             If no such change waits.
         """
         change = self._others(person, number)
-        typed = {} if change.version else {one.name: one.asked for one in change.parameters}
+        typed = {} if change.version else {p.name: p.asked for p in change.parameters}
         prepared = await self._prepared(change.heliostat, typed, change.version, change.reason)
         change = self._others(person, number)  # it may have ended meanwhile
         grant = self._grant(change, person)
@@ -335,7 +335,7 @@ class Approvals:
         return self._courses[number].change
 
     def _over(self, change: WaitingChange) -> str:
-        """Return why a change cannot wait on; "" if it can."""
+        """Return the reason why a change can wait no longer, or an empty text."""
         if self._now() >= change.until:
             return f"nobody approved it until {_utc(change.until)}"
         if (version := self._version(change.heliostat)) != change.based_on:
@@ -386,10 +386,10 @@ class Approvals:
         return self._plant.clock.utc().timestamp()
 
 
-def _read(one: dict[str, Any]) -> WaitingChange:
+def _read(document: dict[str, Any]) -> WaitingChange:
     """Return a change from its document."""
-    rows = tuple(AskedParameter(**row) for row in one["parameters"])
-    return WaitingChange(**{**one, "parameters": rows})
+    rows = tuple(AskedParameter(**row) for row in document["parameters"])
+    return WaitingChange(**{**document, "parameters": rows})
 
 
 def _utc(at: float) -> str:

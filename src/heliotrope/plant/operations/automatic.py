@@ -101,7 +101,7 @@ class AutomaticSettings:
     patience
         Minimum time before the same command is repeated, s.
     margin
-        Number of standard deviations by which an uncalibrated beam must clear the targets.
+        Clearance of an uncalibrated beam from the targets, standard deviations.
     losses
         Number of heliostats that may be lost within 30 s; after more, it waits for an operator's
         Resume.

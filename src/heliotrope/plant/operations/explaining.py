@@ -101,7 +101,7 @@ def _case(
 def _automatic_case(
     plant: PlantController, automatic: AutomaticControl, name: str, *, tracks: bool
 ) -> _Case:
-    """Return why automatic control does not bring a heliostat to the receiver, or what is next."""
+    """Return the reason why a heliostat is not on the receiver, or its next step."""
     planned = next((visit for visit in automatic.plan(50) if visit.heliostat == name), None)
     follows = ""
     if planned is not None:

@@ -327,7 +327,7 @@ class Operations:
         self._tell(person, text.strip(), NOTE)
 
     async def _read(self, what: str, read: Callable[[Records], T]) -> T:
-        """Return what a thread reads from the store, with the latest records in it."""
+        """Return data that a thread reads from the store, including the latest records."""
         if self._records is None:
             raise InputError(f"{what}: this plant keeps no records; run it with a data folder")
         await self._records.confirm()

@@ -112,7 +112,7 @@ class ShiftReport:
 
 
 def period(since: float, until: float, now: float) -> tuple[float, float]:
-    """Return the time of a report, POSIX s; 0 stands for now, and for a shift before the end.
+    """Return the time of a report, POSIX s; 0 means now, or one shift before the end.
 
     Raises
     ------

@@ -105,7 +105,7 @@ class Ticket:
             self.advance((name,), Stage.REFUSED, text)
 
     def expect(self, heliostats: Iterable[str], until: float) -> None:
-        """Set the time (monotonic s) by which heliostats must have acknowledged."""
+        """Set the deadline (monotonic s) for heliostats to acknowledge."""
         rows = [self._row[name] for name in heliostats if name in self._row]
         self._until[np.array(rows, dtype=np.intp)] = until
 
@@ -122,7 +122,7 @@ class Ticket:
             self.advance([self.heliostats[i]], Stage.FAILED, text)
 
     def waiting(self, heliostats: Iterable[str]) -> tuple[str, ...]:
-        """Return which of some heliostats have not ended."""
+        """Return those of some heliostats that have not ended."""
         return tuple(name for name in heliostats if self._stage[self._row[name]] < FINAL)
 
     def unacknowledged(self) -> tuple[str, ...]:

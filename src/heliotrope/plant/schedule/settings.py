@@ -101,7 +101,7 @@ class Settings:
         return self.settle + self.shots * self.interval
 
     def closed(self, sun: FloatArray, weather: Weather) -> str | None:
-        """Return why a sun vector (3,) and weather allow no photograph, None if they do."""
+        """Return why a photograph is impossible at a sun vector (3,) and weather, else None."""
         elevation = float(np.arcsin(np.clip(sun[2], -1.0, 1.0)))
         if elevation < self.limits.min_elevation:
             lowest = np.degrees(self.limits.min_elevation)

@@ -119,7 +119,7 @@ class JointCycle(CodedCycle):
         return bool(self.settings.first) and not all(e <= self.settings.known for e in errors)
 
     def having_place(self, heliostats: Sequence[str], target: str) -> tuple[str, ...]:
-        """Return which of some heliostats have a place in a visit now."""
+        """Return those of some heliostats that have a place in a visit now."""
         return self._arranged(self.face(target), tuple(heliostats)).names
 
     # -- a visit ---------------------------------------------------------------------------

@@ -132,7 +132,7 @@ class Verification:
     ) -> str | None:
         """Return the reason why the new parameters are not confirmed, None if they are.
 
-        The heliostat stores them already. It stands at standby before and after.
+        The heliostat stores them already. It is at standby before and after.
 
         Parameters
         ----------

@@ -106,7 +106,7 @@ class TwinServer:
 
 
 def _asked(loop: asyncio.AbstractEventLoop, function: Callable[[], bytes]) -> bytes:
-    """Return what a function returns that is called in the loop."""
+    """Return the result of a function called in the loop."""
 
     async def call() -> bytes:
         return function()
