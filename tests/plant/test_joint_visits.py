@@ -630,7 +630,7 @@ def test_what_a_joint_visit_disproves_is_an_alarm_when_it_ends() -> None:
     made.cycle.run = run  # type: ignore[method-assign]
     done = list[str]()
     errors = iter((np.arange(6.0), np.arange(6.0, 12.0)))
-    calibrating = calibrating_of(made, lambda *_: None, done, lambda: next(errors))
+    calibrating = calibrating_of(made, lambda *_, **__: None, done, lambda: next(errors))
     calibrating.ask_together(("A", "B", "C"), "left")
     assert asyncio.run(calibrating.visit("left", ready, ENGINEER, 1)) == ("A", "B", "C")
     assert list(errors) == [], "the whole field, once before the visit and once after it"
@@ -654,7 +654,7 @@ def test_a_joint_visit_that_is_refused_is_one_event_and_not_one_of_each() -> Non
     made._plant.sentinel = SimpleNamespace(on=True)  # type: ignore[assignment]
     made._plant.authority = SimpleNamespace(grant=None)  # type: ignore[assignment]
     noted, done = list[tuple[str, ...]](), list[str]()
-    calibrating = calibrating_of(made, lambda *words: noted.append(words), done)
+    calibrating = calibrating_of(made, lambda *words, **_: noted.append(words), done)
     calibrating.ask_together(("A", "B", "C"), "left")
     assert asyncio.run(calibrating.visit("left", ready, ENGINEER, 1)) == ("A", "B", "C")
     text = (

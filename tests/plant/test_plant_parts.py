@@ -518,12 +518,13 @@ def test_standby_points_given_by_a_person_are_an_event() -> None:
     given = Ticket("t", "STANDBY", ["A", "B"], VirtualClock(lambda: 0.0, AT), 60.0)
     operations = SimpleNamespace(
         plant=SimpleNamespace(standby=lambda *_: given),
-        logbook=SimpleNamespace(event=lambda *event: told.append(event)),
+        logbook=SimpleNamespace(event=lambda *event, heliostats: told.append((*event, heliostats))),
     )
-    operations._told = functools.partial(Operations._told, operations)
+    for name in ("_told", "_tell"):
+        setattr(operations, name, functools.partial(getattr(Operations, name), operations))
     olga = Person("Olga", Role.OPERATOR)
     assert Operations.standby(operations, olga, 1, {}) is given  # type: ignore[arg-type]
-    assert told == [("command", "Olga", "STANDBY A, B")]
+    assert told == [("command", "Olga", "STANDBY A, B", given.heliostats)]
 
 
 def test_a_refused_link_is_told_with_its_count() -> None:
