@@ -171,7 +171,7 @@ def test_heliostats_in_doubt_are_visited_before_others(
             chooser = Chooser(bench, "P2A")
             book = SimpleNamespace(error=np.zeros(len(plant.field)), conclude=lambda entry: None)
             silent = SimpleNamespace(
-                event=lambda *_: None, keep=lambda *_: None, take_alarm=lambda alarm: None
+                event=lambda *_, **__: None, keep=lambda *_: None, take_alarm=lambda alarm: None
             )
             unknown = SimpleNamespace(now=lambda: np.full(len(plant.field), math.nan))
             calibrating = Calibrating(

@@ -77,7 +77,7 @@ class Scene:
         self.alarms: list[Alarm] = []
         self.visits, self.schedule = Visits(bench), InOrder(bench.plant.field.names)
         silent = SimpleNamespace(
-            event=lambda *_: None, keep=lambda *_: None, take_alarm=self.alarms.append
+            event=lambda *_, **__: None, keep=lambda *_: None, take_alarm=self.alarms.append
         )
         book: Any = SimpleNamespace(error=np.zeros(len(self.plant.field)), conclude=lambda _: None)
         unknown: Any = SimpleNamespace(now=lambda: np.full(64, np.nan))
