@@ -91,9 +91,9 @@ def told_twice(patch: pytest.MonkeyPatch) -> None:
     """An act of a person is two events."""
     tell = Operations._tell
 
-    def twice(self: Any, person: Any, text: str, kind: str = "calibration") -> None:
-        tell(self, person, text, kind)
-        tell(self, person, f"again: {text}", kind)
+    def twice(self: Any, person: Any, text: str, *more: Any) -> None:
+        tell(self, person, text, *more)
+        tell(self, person, f"again: {text}", *more)
 
     patch.setattr(Operations, "_tell", twice)
 
