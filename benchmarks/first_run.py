@@ -18,6 +18,7 @@ import time
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -238,10 +239,22 @@ class Page:
             raise BenchmarkError(f"GET {path}: {answer.status_code} {answer.text[:200]}")
         return answer.json()
 
-    def peaks(self) -> list[float]:
-        """Return the largest predicted flux on each receiver, W/m²."""
-        flux = (self.get(f"receivers/{name}/flux") for name in self.get("field")["receivers"])
-        return [float(np.max(view["flux"])) for view in flux]
+    def lit(self) -> Future[tuple[float, float]]:
+        """Return when the flux map is there, wall time in s, and its largest flux, W/m²."""
+        (name, *_), done = self.get("field")["receivers"] or [""], Future[tuple[float, float]]()
+
+        def wait() -> None:
+            while name and not done.cancelled():
+                # It is refused until the first map is computed.
+                answer = self._http.get(f"api/v1/receivers/{name}/flux")
+                if answer.is_success:
+                    peak = float(np.max(answer.json()["flux"]))
+                    done.set_result((time.monotonic(), peak))
+                    return
+                time.sleep(0.2)
+
+        threading.Thread(target=wait, daemon=True).start()
+        return done
 
     def follow(self, seen: Followed, reader: ClockReader, until: float) -> None:
         """Follow the live stream until a wall time, s."""
@@ -349,14 +362,12 @@ def limited(
 ) -> Row:
     """Return a figure beside its limit, of which there is at most one; None was not seen."""
     limit = f"≥ {least:g}" if least is not None else f"≤ {most:g}" if most is not None else ""
-    kept = value is not None and np.isfinite(value)
-    kept = kept and (least is None or value >= least) and (most is None or value <= most)
-    return {
-        "figure": figure,
-        "value": value if value is not None and np.isfinite(value) else None,
-        "limit": limit,
-        "kept": bool(kept) if limit else None,
-    }
+    if value is not None and not np.isfinite(value):
+        value = None
+    kept = (
+        value is not None and (least is None or value >= least) and (most is None or value <= most)
+    )
+    return {"figure": figure, "value": value, "limit": limit, "kept": kept if limit else None}
 
 
 @dataclass(frozen=True)
@@ -369,6 +380,7 @@ class Measured:
     heliostats: int
     page: float
     tracking: int
+    lit: float | None
     flux: float
     seen: Followed
     minutes: float
@@ -392,7 +404,8 @@ class Measured:
                 self.tracking / self.heliostats,
                 least=TRACKING if raised else None,
             ),
-            limited("largest flux then, kW/m²", self.flux, least=1.0 if raised else None),
+            limited("flux map after the command, s", self.lit, most=PAGE_S if raised else None),
+            limited("its largest flux, kW/m²", self.flux, least=1.0 if raised else None),
             limited("first new calibration after the page, s", first, most=FIRST_S),
         ]
         rows += [
@@ -426,7 +439,7 @@ def measure(options: list[str], minutes: float, *, raised: bool) -> Measured:
     with _program(*options) as program:
         page = Page(program.link())
         answered = time.monotonic()
-        summary, peaks = page.get("summary"), page.peaks()
+        summary, lit = page.get("summary"), page.lit()
         program.work.begin()
         others = Neighbours()
         links = tomllib.loads((program.work.folder() / "links.toml").read_text(encoding="utf-8"))
@@ -435,7 +448,9 @@ def measure(options: list[str], minutes: float, *, raised: bool) -> Measured:
             page.follow(seen, reader, answered + 60.0 * minutes)
             pace = (reader.state.now - first.now) / (reader.state.wall - first.wall)
         cores, busy = program.work.cores(), others.cores()
+        at, peak = lit.result(0.0) if lit.done() else (None, 0.0)
         load, quality = os.getloadavg()[0], page.get("calibration")["quality"]
+        receivers = page.get("field")["receivers"]
         errors = [
             1e3 * quality[-1][name] if quality and quality[-1][name] is not None else None
             for name in ("median", "truth_median")
@@ -444,7 +459,8 @@ def measure(options: list[str], minutes: float, *, raised: bool) -> Measured:
             heliostats=seen.heliostats,
             page=answered - program.begun,
             tracking=summary["states"].get("TRACKING", 0),
-            flux=1e-3 * max(peaks, default=0.0),
+            lit=None if at is None else at - program.begun,
+            flux=1e-3 * peak,
             seen=seen,
             minutes=minutes,
             pace=pace,
@@ -454,7 +470,7 @@ def measure(options: list[str], minutes: float, *, raised: bool) -> Measured:
             others=max(0.0, busy - sum(cores.values())),
             load=load,
             ended=program.interrupt(),
-            raised=raised and bool(peaks),
+            raised=raised and bool(receivers),
         )
 
 

@@ -31,7 +31,7 @@ def main() -> None:
     with compiling():
         following()
         guarding()
-    for part in (searching, breaking, tracking, fitting, lighting):
+    for part in (searching, breaking, tracking, fitting, lighting, cutting):
         part()
 
 
@@ -138,7 +138,17 @@ def guarding() -> None:
 
 
 def lighting() -> None:
-    """Cast the light of three mirrors on a receiver and on a mesh, and cut one mirror."""
+    """Cast the light of three mirrors on a receiver."""
+    from heliotrope.field.layouts import malan_plant
+    from heliotrope.geometry import normalize
+    from heliotrope.optics.plant_flux import FieldOptics
+
+    light = FieldOptics()
+    light.engine(light.scene(malan_plant(3), normalize((0.0, 0.6, 0.8)), None, ()))
+
+
+def cutting() -> None:
+    """Cast the light of three mirrors on a mesh, and cut one mirror."""
     from dataclasses import replace
 
     import numpy as np
@@ -149,9 +159,8 @@ def lighting() -> None:
     from heliotrope.optics.shading import Shading
     from heliotrope.optics.surfaces import Mesh
 
-    plant, light, sun = malan_plant(3), FieldOptics(), normalize((0.0, 0.6, 0.8))
-    scene = light.scene(plant, sun, None, ())
-    light.engine(scene)
+    plant, light = malan_plant(3), FieldOptics()
+    scene = light.scene(plant, normalize((0.0, 0.6, 0.8)), None, ())
     mesh = Mesh("mesh", plant.targets[0].corners, np.array([[0, 1, 2], [0, 2, 3]]))
     light.engine(replace(scene, surfaces=(mesh,)))
     Shading(scene).pieces(0)

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, INNER, OPTIONS
+from heliotrope.jit import INLINED, INNER, OPTIONS, plain
 
 #: Numbers of a mirror's row; of a tower's (east, north, radius, bottom, top).
 SIZE, TOWER = 16, 5
@@ -113,7 +113,7 @@ def candidates(rows, mirrors, sun, rays, reaches, slack, grid, spans):
     ``spans`` (R + 1, 2) gets the begin of the shading and of the blocking ones; the last row, the
     end.
     """
-    near, count = np.empty(8 * len(rows) + 64, dtype=np.int64), 0
+    near, count = np.empty(8 * len(rows) + 64, dtype=np.int64), plain(0)
     # Shadows are no longer than the field.
     far = 1.5 * grid[1] * (grid[2][0] + grid[2][1])
     for r in range(len(rows)):
@@ -223,7 +223,7 @@ def _mirror_corners(i, j, mirrors, corners):
             corners[k, c] = (
                 mirrors[j, c] - mirrors[i, c] + s * mirrors[j, 3 + c] + t * mirrors[j, 6 + c]
             )
-    return 4
+    return plain(4)
 
 
 @njit(**INNER)
@@ -412,7 +412,7 @@ def left_of(x0, x1, y0, y1, polygons, sizes, count, state):
     points, begins, pieces, into, starts, one, two = state
     points[0, 0], points[0, 1], points[1, 0], points[1, 1] = x0, y0, x1, y0
     points[2, 0], points[2, 1], points[3, 0], points[3, 1] = x1, y1, x0, y1
-    begins[0], begins[1], pieces = 0, 4, 1
+    begins[0], begins[1], pieces = 0, 4, plain(1)
     starts[0] = 0
     speck = SPECK * (x1 - x0) * (y1 - y0)
     for k in range(count):
@@ -438,7 +438,7 @@ def left_of(x0, x1, y0, y1, polygons, sizes, count, state):
 def new_state():
     """Room for `left_of`; it grows as needed."""
     return (
-        np.empty((256, 2)), np.empty(64, dtype=np.int64), 0,
+        np.empty((256, 2)), np.empty(64, dtype=np.int64), plain(0),
         np.empty((256, 2)), np.empty(64, dtype=np.int64), np.empty((256, 2)), np.empty((256, 2)),
     )  # fmt: skip
 

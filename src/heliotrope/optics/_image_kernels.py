@@ -19,7 +19,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.jit import INLINED, INNER, OPTIONS
+from heliotrope.jit import INLINED, INNER, OPTIONS, plain
 from heliotrope.optics._clip_kernels import part_of
 
 #: Numbers of an image: power, mean (2) and covariance (uu, uv, vv).
@@ -431,7 +431,7 @@ def cast(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, 
         visible = _columns(row, ray, axes, t, shape, columns, seen)
         if not visible:
             continue
-        begin, end = number, -1
+        begin, end = number, plain(-1)
         for m in range(count):
             image = images[m]
             for g in range(len(weights)):

@@ -107,7 +107,7 @@ class Shading:
         def block(first: int, last: int) -> None:
             spans = np.empty((last - first + 1, 2), dtype=np.int64)
             near = kernels.candidates(
-                rows[first:last], self.table, self._sun, self._ways, self._reaches, SLACK,
+                rows[first:last], self.table, self._sun, as_input(self._ways), self._reaches, SLACK,
                 self._grid, spans,
             )  # fmt: skip
             found[first] = np.column_stack([spans[:-1], spans[1:, 0]]), near
@@ -123,7 +123,7 @@ class Shading:
     def _clip(self, rows: IntArray) -> None:
         def block(first: int, last: int) -> None:
             kernels.clip(
-                first, last, rows, self.table, self._towers, self._sun, self._ways,
+                first, last, rows, self.table, self._towers, self._sun, as_input(self._ways),
                 self._reaches, self._near, self._spans, self.parts,
                 (self._shares, self._moments),
             )  # fmt: skip
@@ -180,8 +180,8 @@ class Shading:
     def pieces(self, row: int) -> list[FloatArray]:
         """Return the convex polygons that make up the lit part of one mirror, m, (k, 2) each."""
         corners, begins = kernels.pieces_of(
-            row, self.table, self._towers, self._sun, self._ways, self._reaches, self._near,
-            self._spans,
+            row, self.table, self._towers, self._sun, as_input(self._ways), self._reaches,
+            self._near, self._spans,
         )  # fmt: skip
         return [corners[a:b] for a, b in pairwise(begins)]
 

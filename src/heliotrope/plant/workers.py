@@ -62,9 +62,9 @@ class WorkerProcesses:
         self._count = count
         self._pool = pool(count, _NICE)
 
-    def start(self, load: Callable[[], None]) -> None:
-        """Begin the processes, each of which loads what computations need."""
-        for _ in range(self._count):
+    def start(self, *loads: Callable[[], None]) -> None:
+        """Begin the processes, which share what computations need: what one compiles, all load."""
+        for load in loads:
             self._pool.submit(load)
 
     async def __call__(self, work: Callable[[*Given], T], *given: *Given) -> T:

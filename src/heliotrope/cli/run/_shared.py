@@ -197,7 +197,7 @@ def computing(*loads: Callable[[], None]) -> Iterator[WorkerProcesses]:
     ``loads`` load what the loop computes beside the plant itself.
     """
     with contextlib.closing(WorkerProcesses()) as worker:
-        worker.start(warm.computing)
+        worker.start(warm.computing, warm.lighting)
         for load in (warm.controlling, *loads):
             load()
         yield worker

@@ -52,7 +52,11 @@ export function plant(box) {
   const draw = () => { if (seen) drawFlux(flux, seen); };
   const off = [store.on("frame", show), store.on("theme", () => { show(); draw(); })];
   const predict = async () => {
-    seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`);
+    try { seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`); } catch (error) {
+      if (seen) throw error;
+      figures.replaceChildren(h("p", { className: "hx-hint" }, error.message));
+      return;
+    }
     const peak = Math.max(0, ...seen.flux.flat());
     figures.replaceChildren(facts([[t("Power"), `${number(seen.power / 1e6, 2)} MW`],
       [t("Intercept"), seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],

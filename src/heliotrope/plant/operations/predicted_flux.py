@@ -18,10 +18,11 @@ from heliotrope.optics.surfaces import surface_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations.viewing import Viewer
+from heliotrope.plant.refusals import RefusedError
 from heliotrope.plant.workers import Worker
 
-#: Time for which a prediction is shown, s.
-EVERY = 5.0
+#: Time for which a prediction is shown, and longest wait for the next one, s.
+EVERY, PATIENCE = 5.0, 5.0
 _LIGHT = FieldOptics()
 
 
@@ -49,21 +50,41 @@ class PredictedFlux:
         self._surfaces = tuple(surface_of(receiver) for receiver in design.receivers)
         self._views: dict[str, FluxView] = {}
         self._made_at = -np.inf
-        self._computing = asyncio.Lock()
+        self._computing: asyncio.Task[None] | None = None
 
     async def everywhere(self) -> dict[str, FluxView]:
-        """Return the flux on each receiver, by name, at most `EVERY` old."""
-        # Whoever asks while it is computed waits for that.
-        async with self._computing:
-            now, receivers = self._plant.now(), self._plant.design.receivers
-            if receivers and now - self._made_at >= EVERY:
-                on = self._viewer.frame().on
-                views = await self._worker(scene_flux, self._scene(now), _LIGHT)
-                for k, (receiver, view) in enumerate(zip(receivers, views, strict=True), 1):
-                    shown = replace(view, heliostats=int((on == k).sum()))
-                    self._views[receiver.name] = _from_outside(shown, receiver)
-                self._made_at = now
+        """Return the flux on each receiver, by name: the last one known after `PATIENCE`.
+
+        Raises
+        ------
+        RefusedError
+            If nothing has been computed yet since the start.
+        """
+        running = self._computing
+        if running is None and self._plant.now() - self._made_at >= EVERY:
+            running = self._computing = asyncio.create_task(self._compute())
+        if running is not None:
+            await asyncio.wait((running,), timeout=PATIENCE)
+            if running.done():
+                self._computing = None
+                running.result()
+        if not self._views and self._surfaces:
+            raise RefusedError(
+                "flux: the first prediction since the start is still being computed (half a "
+                "minute after an installation, otherwise seconds); ask again"
+            )
         return self._views
+
+    async def _compute(self) -> None:
+        now, receivers = self._plant.now(), self._plant.design.receivers
+        if not receivers:
+            return
+        on = self._viewer.frame().on
+        views = await self._worker(scene_flux, self._scene(now), _LIGHT)
+        for k, (receiver, view) in enumerate(zip(receivers, views, strict=True), 1):
+            shown = replace(view, heliostats=int((on == k).sum()))
+            self._views[receiver.name] = _from_outside(shown, receiver)
+        self._made_at = now
 
     def _scene(self, now: float) -> Scene:
         """Return the field as it stands: the mirrors on a receiver shine, the others cast shadows.
