@@ -192,7 +192,7 @@ def goes_on_after_a_loss(patch: pytest.MonkeyPatch) -> None:
 #: Invariants that may find it, name, defect, faults to draw from, pause between them, and the seed
 #: that found it.
 ROWS: tuple[tuple[tuple[int, ...], str, Plant, tuple[str, ...], float, int], ...] = (
-    ((10,), "joining is not bounded", join_limiter_off, ("line_drop",), 60.0, 0),
+    ((10,), "joining is not bounded", join_limiter_off, ("line_drop",), 60.0, 1),
     ((11,), "audit record doubled", record_doubled, ("line_drop",), 60.0, 0),
     ((11,), "audit record missing on a full disk", record_missing, ("audit_full",), 10.0, 0),
     ((11,), "orders to everybody are not recorded", safe_not_recorded, ("line_drop",), 60.0, 0),

@@ -157,7 +157,7 @@ ROWS: tuple[
     ((16,), "a mirror in no file raises no alarm", unlisted_unseen,
      ("cluster_file",), ("repairs",), False, 0),
     ((2,), "a cluster begins without a DEFOCUS", begins_silently,
-     EDITED, ("repairs", "calm"), False, 0),
+     EDITED, ("repairs", "calm"), False, 1),
     ((2, 4, 13, WORDS), "one unknown name spoils an order", one_unknown_name_spoils_all,
      EDITED, ("repairs",), False, 7),
     ((WORDS,), "an emergency ends with the program", emergency_forgotten,

@@ -47,8 +47,8 @@ Plant = Callable[[pytest.MonkeyPatch], None]
 class Defect:
     """A defect, the invariants by which it may be found, and where to look for it.
 
-    ``first`` is the seed that is tried first, since it found it; ``slow``: it takes longer, and
-    the normal tests have another one for its invariant.
+    ``first`` is the seed that is tried first, since it found it, and the only one that the normal
+    tests try. ``slow``: it takes longer, and the normal tests have another one for its invariant.
     """
 
     numbers: tuple[int, ...]
@@ -355,7 +355,7 @@ DEFECTS = (
            ("cluster_crash", "replay", "stranger_safe", "forgery"), 1.5),
     Defect((1,), "lease that never ends", _lease_too_long, ("cluster_crash",), 20.0,
            first=1),
-    Defect((2,), "defocus only holds", _defocus_holds, faults=STILL, seconds=180.0,
+    Defect((2,), "defocus only holds", _defocus_holds, faults=STILL, seconds=180.0, first=2,
            worlds=("calm",)),
     Defect((2,), "cluster goes on without the plant", _plant_forgotten, ("plant_silent",), 20.0),
     Defect((3,), "tracking follows approach by itself", _tracks_by_itself, ("line_drop",), 60.0,
@@ -369,7 +369,8 @@ DEFECTS = (
            first=1, slow=True),
     Defect((7,), "step counts kept at rest only", _counts_late, ("power_cut",), 8.0),
     Defect((7,), "idle after a boot", _idle_after_boot, ("power_cut",), 8.0),
-    Defect((8,), "counts slip from what is emitted", _counts_slip, ("line_drop",), 60.0),
+    Defect((8,), "counts slip from what is emitted", _counts_slip, ("line_drop",), 60.0,
+           first=1),
     Defect((9,), "a jump back extends the lease", _jump_extends_lease,
            ("tick_jump", "cluster_crash"), 3.0, first=4),
     Defect((10,), "approach with elevation first", _approach_swapped, ("line_drop",), 60.0),
@@ -392,7 +393,7 @@ DEFECTS = (
            # The plant sends off a beam that nobody sent, so it must not reach the boards.
            faults=tuple(Fault(kind, at, long, i, 0.5) for i in range(3) for kind, at, long in
                         (("power_cut", 150.0, 2.0), ("bus_unplugged", 151.0, 60.0))),
-           seconds=220.0, worlds=("calm",)),
+           seconds=220.0, first=2, worlds=("calm",)),
     Defect((13,), "a mirror without step counts stays where it was", _stays_without_counts,
            faults=tuple(Fault("power_cut", 150.0, 2.0, i, 0.5) for i in range(3)),
            seconds=220.0, slow=True, worlds=("calm",)),
@@ -438,8 +439,8 @@ DEFECTS = (
     *(Defect(numbers, name, defect, kinds_of(some), faults=faults_of(some), worlds=worlds,
              slow=slow, first=first)
       for numbers, name, defect, some, worlds, slow, first in review_defects.ROWS),
-    *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow)
-      for name, defect, worlds, slow in quiet_defects.ROWS),
+    *(Defect((16,), name, defect, faults=(), worlds=worlds, slow=slow, first=first)
+      for name, defect, worlds, slow, first in quiet_defects.ROWS),
     *(Defect((16,), name, defect, seconds=180.0, worlds=worlds, slow=slow,
              faults=(Fault("line_cut", 40.0, 9.0, 0, 0.5),))
       for name, defect, worlds, slow in quiet_defects.REJOIN_ROWS),
