@@ -27,7 +27,7 @@ from heliotrope.plant.schedule.scheduler import VISITS
 from heliotrope.plant.visits import CycleResult
 from heliotrope.safety import Act, Alarm
 from heliotrope.store.records import PlannedVisit
-from support.plant_bench import ENGINEER, OPERATOR, Bench, running
+from support.plant_bench import ENGINEER, OPERATOR, Bench, in_one_cluster, running
 
 NAME = "P1A"
 READY = 1 << meanings.FLAGS.index("READY")
@@ -102,7 +102,7 @@ class Scene:
 
 def play(folder: Path, scene: Callable[[Scene], Awaitable[None]]) -> None:
     async def main(clock: VirtualClock) -> None:
-        bench = Bench(clock, folder)
+        bench = Bench(clock, folder, design=in_one_cluster())
         async with running(bench):
             made = Scene(bench, await bench.commanded())
             await scene(made)
@@ -263,7 +263,7 @@ def test_a_flight_gives_one_that_was_given_up_new_visits(tmp_path: Path) -> None
 
 def test_a_heliostat_that_is_raised_in_vain_is_left_alone(tmp_path: Path) -> None:
     async def main(clock: VirtualClock) -> None:
-        bench = Bench(clock, tmp_path)
+        bench = Bench(clock, tmp_path, design=in_one_cluster())
         for cluster in bench.clusters.values():
             cluster.set(states.IDLE)
             cluster.rows["flags"] = READY

@@ -61,6 +61,14 @@ LEADS = {
 Rows = npt.NDArray[Any]
 
 
+def in_one_cluster() -> Plant:
+    """The example plant as one cluster, for tests of whole hours: each line costs its time."""
+    plant = example_plant()
+    azel = plant.groups["azel"]
+    one = replace(azel, cluster=("pod",) * len(azel.names))
+    return replace(plant, groups={"azel": one})
+
+
 class ScriptedCluster:
     """The cluster at the other end of a link: it obeys at once, except as the test tells it.
 
