@@ -10,6 +10,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "examples" / "notebooks" / "own_centroid.ipynb"
+#: Folders and endings of what is made beside the source.
+BUILT = {"__pycache__", ".pyc"}
 #: Executes a notebook with the environment's own kernel, in an empty folder.
 EXECUTE = """
 import sys
@@ -41,14 +43,28 @@ def _uv(*words: str, folder: Path) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-def test_a_wheel_runs_a_notebook_in_an_empty_environment(tmp_path: Path) -> None:
-    _uv("build", "--quiet", "--wheel", "--out-dir", str(tmp_path), str(ROOT), folder=tmp_path)
-    (wheel,) = tmp_path.glob("heliotrope-*.whl")
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel of this tree."""
+    folder = tmp_path_factory.mktemp("wheel")
+    _uv("build", "--quiet", "--wheel", "--out-dir", str(folder), str(ROOT), folder=folder)
+    (made,) = folder.glob("heliotrope-*.whl")
+    return made
+
+
+def test_a_wheel_holds_all_that_its_modules_read(wheel: Path) -> None:
     held = zipfile.ZipFile(wheel).namelist()
-    # What a program reads beside its modules, and nothing of the tests.
-    for part in ("console/static/console.css", "console/static/languages/de.json", "py.typed"):
-        assert f"heliotrope/{part}" in held
+    source = ROOT / "src"
+    kept = [path for path in (source / "heliotrope").rglob("*") if path.is_file()]
+    kept = [path for path in kept if not BUILT.intersection((path.parent.name, path.suffix))]
+    assert len(kept) > 300
+    assert not {path.relative_to(source).as_posix() for path in kept}.difference(held)
     assert not [name for name in held if name.startswith("tests/") or name.endswith(".nbi")]
+
+
+# A missing dependency is also found by tests/cli/test_plain_installation.py, within seconds.
+@pytest.mark.slow
+def test_a_wheel_runs_a_notebook_in_an_empty_environment(wheel: Path, tmp_path: Path) -> None:
     _uv("venv", "--quiet", "--python", sys.executable, "environment", folder=tmp_path)
     python = tmp_path / "environment" / "bin" / "python"
     constraints = str(ROOT / "constraints.txt")

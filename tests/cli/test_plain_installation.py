@@ -1,5 +1,6 @@
 """After a plain installation every command works, or says in one line which extra it needs."""
 
+import ast
 import importlib.metadata
 import json
 import re
@@ -108,6 +109,35 @@ def test_the_extra_brings_the_package(module: str, owners: Mapping[str, list[str
     brought = {re.split(r"[\[<>=]", each)[0].lower() for each in extra}
     indirect = {"starlette": "fastapi"}.get(module)
     assert indirect in brought or brought & {owner.lower() for owner in owners[module]}
+
+
+def imported() -> dict[str, Path]:
+    """Return the packages that the source imports, each with one file that does."""
+    found: dict[str, Path] = {}
+    for file in (ROOT / "src").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names = [each.name for each in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names = [node.module or ""]
+            else:
+                continue
+            found |= {name.partition(".")[0]: file for name in names}
+    return {name: file for name, file in found.items() if name not in sys.stdlib_module_names}
+
+
+def test_every_package_that_is_imported_is_a_dependency(owners: Mapping[str, list[str]]) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    base = {re.split(r"[\[<>=]", each)[0].lower() for each in project["dependencies"]}
+    # jinja2 brings markupsafe and aiomqtt brings paho; xarray comes with the notebooks' extra.
+    others = {"heliotrope", "markupsafe", "paho", "xarray"}
+    found = imported()
+    assert {"numpy", "cv2", *others} <= found.keys()
+    for name, file in found.items():
+        brought = {owner.lower().replace("_", "-") for owner in owners.get(name, ())} & base
+        assert brought or name in others or name in EXTRAS, (
+            f"{file}: {name} is in no list of pyproject.toml"
+        )
 
 
 def test_another_missing_package_is_no_matter_of_extras() -> None:
