@@ -70,7 +70,7 @@ def test_a_planted_defect_is_found(defect: Defect) -> None:
     found = planted(defect, defect.first)
     assert is_found(defect, found), (
         f"not found with seed {defect.first}: {found.text}; if the observers are right, "
-        f"give the first seed of: python -m scripts.defects --only '{defect.name}'"
+        f"give the first seed of: python scripts/defects.py --only '{defect.name}'"
     )
     if REPEATED.get(defect.worlds) == defect.name:
         holds_without(found)
