@@ -26,7 +26,6 @@ from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
-from heliotrope.optics import FluxView
 from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import ORDERED, EmergencyOrder
@@ -48,6 +47,7 @@ from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
     CameraView,
     Explanation,
+    PredictedView,
     Summary,
     SunView,
 )
@@ -159,7 +159,7 @@ class Operations:
         self.telemetry: Path | None = None
         self._history = History(plant, records, self._figures)
         self._records = records
-        self._flux = PredictedFlux(plant, self.viewer, automatic.installed, worker)
+        self._flux = PredictedFlux(plant, self.viewer, automatic.book, automatic.installed, worker)
         self._closing, self.begun = asyncio.Event(), asyncio.Event()
 
     # -- running ---------------------------------------------------------------------------
@@ -348,7 +348,7 @@ class Operations:
         found = sun.position(at, self.plant.design.site)
         return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
 
-    async def receiver_flux(self, name: str = "") -> FluxView:
+    async def receiver_flux(self, name: str = "") -> PredictedView:
         """Return the predicted flux on a receiver ("": the first); see `PredictedFlux`.
 
         Raises
