@@ -269,12 +269,16 @@ class PredictedView(FluxView):
         Standard deviation of the power, W.
     peak, peak_sigma
         Flux in the hottest cell and its standard deviation, W/m².
+    measured
+        What a camera measures now in the cells, W/m², (H, W), or another sensor as the mean, ();
+        None: nothing is measured.
     """
 
     sigma: FloatArray
     power_sigma: float
     peak: float
     peak_sigma: float
+    measured: FloatArray | None = None
 
 
 @dataclass(frozen=True)
