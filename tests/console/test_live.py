@@ -1,6 +1,7 @@
 """The live stream, the command line on the API, and what the API does with anything at all."""
 
 import asyncio
+import json
 import math
 import re
 import shlex
@@ -143,6 +144,21 @@ def test_ctl_commands(ctl: Callable[..., Any], console: LiveConsole) -> None:
     assert f"{name} is LOCKED" in why.stdout
     assert "last order: LOCK by operator" in why.stdout
     assert ctl("operator", "command", "unlock", name).exit_code == 0
+
+
+def test_ctl_prints_the_predicted_flux_with_its_uncertainty(
+    ctl: Callable[..., Any], console: LiveConsole
+) -> None:
+    receiver = console.live.operations.receivers[0]
+    shown = ctl("viewer", "flux")
+    assert shown.exit_code == 0, shown.output
+    assert re.search(rf"^{receiver}: \d+ heliostats$", shown.stdout, re.M)
+    assert re.search(r"^power \d+ ± \d+ kW$", shown.stdout, re.M)
+    assert re.search(r"^peak \d+ ± \d+ kW/m²$", shown.stdout, re.M)
+    answer = json.loads(ctl("viewer", "flux", receiver, "--json").stdout)
+    assert np.shape(answer["sigma"]) == np.shape(answer["flux"])
+    wrong = ctl("viewer", "flux", "another")
+    assert f"no receiver 'another'; known: {receiver}" in str(wrong.exception)
 
 
 def test_ctl_says_what_a_proof_has_measured_and_what_it_believes(

@@ -153,6 +153,12 @@ def test_aim_a_group_at_a_point_of_the_flux_picture(
     page.fill(".hx-query", " ".join(names))
     page.keyboard.press("Enter")
     page.wait_for_selector("dt:has-text('Intercept')")
+    page.get_by_text(re.compile(r"^\d+ ± \d+ kW/m²$")).wait_for()
+    picture = "document.querySelector('.hx-flux').toDataURL()"
+    expected = page.evaluate(picture)
+    page.check("label:has-text('Standard deviation') input")
+    assert page.evaluate(picture) != expected
+    page.uncheck("label:has-text('Standard deviation') input")
     with task(page, "aim a group at a point of the receiver"):
         flux = page.locator(".hx-flux")
         box = flux.bounding_box()

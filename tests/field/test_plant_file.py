@@ -726,3 +726,16 @@ def test_an_aim_point_beside_its_target_is_refused() -> None:
     (target,) = example_plant().targets
     with pytest.raises(InputError, match=r"its center lies 17\.00 m from the middle"):
         replace(target, center=target.center + (0.0, 0.0, 17.0))
+
+
+def test_the_power_that_flux_readings_refer_to_is_kept(tmp_path: Path) -> None:
+    plant = example_plant()
+    (receiver, *more) = plant.receivers
+    known = replace(plant, receivers=(replace(receiver, nominal_power=2.5e6), *more))
+    plant_file.write_plant(known, tmp_path / "plant.toml")
+    assert "nominal_power_mw = 2.5" in (tmp_path / "plant.toml").read_text(encoding="utf-8")
+    assert plant_file.read_plant(tmp_path / "plant.toml").receivers[0].nominal_power == 2.5e6
+    text = (tmp_path / "plant.toml").read_text(encoding="utf-8").replace("_mw = 2.5", "_mw = -1.0")
+    (tmp_path / "plant.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(FormatError, match="nominal_power_mw"):
+        plant_file.read_plant(tmp_path / "plant.toml")

@@ -7,7 +7,7 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import bisector, normalize
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import FacetTable, Mirrors, Scene, Tower
-from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate
+from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 from support import dunhuang
 
 MRAD = 1e-3
@@ -240,3 +240,36 @@ def test_bad_scenes_are_refused_in_one_line() -> None:
         mirrors().with_facets(table)
     with pytest.raises(InputError, match="face 0 has no area"):
         Mesh("mesh", np.zeros((3, 3)), np.array([[0, 1, 2]]))
+
+
+@pytest.mark.parametrize(
+    ("cells", "round_", "off"),
+    [
+        ((3, 3), False, 3e-4),
+        ((8, 5), False, 3e-4),
+        ((24, 24), False, 3e-4),
+        ((96, 96), False, 3e-4),
+        ((24, 24), True, 6e-3),
+        ((48, 96), True, 1e-3),
+    ],
+)
+def test_power_does_not_depend_on_the_cells(
+    cells: tuple[int, int], round_: bool, off: float
+) -> None:
+    """A beam in the middle is caught whole, also where it is narrower than a cell."""
+    middle, up = np.array([0.3, 0.2, 30.0]), np.eye(3)[2]
+    surface: Surface = Plate("p", middle, np.array([-1.0, 0.0, 0.0]), up, 14.0, 13.0, cells)
+    if round_:
+        surface = Cylinder(
+            "c", middle, up, np.array([0.0, 1.0, 0.0]), 9.0, 13.0, (-1.5, 1.5), cells
+        )
+    place = np.stack([np.linspace(-20.0, 20.0, 40), np.linspace(50.0, 70.0, 40), np.zeros(40)], -1)
+    sun = normalize(np.array([0.3, 0.4, 0.8]))
+    aim = middle + np.array([0.0, 9.0, 0.0]) * round_ + np.linspace(-0.6, 0.6, 40)[:, None] * up
+    normal = normalize(sun + normalize(aim - place))
+    mirrors = Mirrors.of(place, normal, (1.0, 1.0), aim, slope=1e-3)
+    engine = FieldFlux(Scene(sun, 900.0, mirrors, (surface,)))
+    shares = engine.efficiencies.intercept
+    np.testing.assert_allclose(shares, 1.0, atol=off)
+    # The tails of the sun's sum of Gaussians, of which one weight is negative.
+    assert float(engine.maps[0].min()) > -5e-4 * engine.maps[0].max()

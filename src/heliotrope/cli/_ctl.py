@@ -307,6 +307,36 @@ def show(
 
 
 @app.command()
+def flux(
+    context: typer.Context,
+    receiver: Annotated[
+        str, typer.Argument(help="Receiver; default: the first.", show_default=False)
+    ] = "",
+    as_json: Json = False,
+) -> None:
+    """Print the predicted flux on a receiver, with standard deviations."""
+    with _client(context) as client:
+        name = receiver or (client.get("field")["receivers"] or [""])[0]
+        if not name:
+            raise InputError("ctl: the plant has no receiver")
+        answer = client.get(f"receivers/{quote(name, safe='')}/flux")
+    if as_json:
+        print_json(answer)
+        return
+    print(f"{answer['receiver']}: {answer['heliostats']} heliostats")
+    print(f"power {_give_or_take(answer['power'], answer['power_sigma'], 'kW')}")
+    print(f"peak {_give_or_take(answer['peak'], answer['peak_sigma'], 'kW/m²')}")
+    if answer["intercept"] is not None:
+        print(f"intercept {100 * answer['intercept']:.1f} %")
+
+
+def _give_or_take(value: float, sigma: float | None, unit: str) -> str:
+    """Return a value and its standard deviation in a unit of 1000, if it is known."""
+    digits = f"{1e-3 * value:.0f}"
+    return f"{digits} {unit}" if sigma is None else f"{digits} ± {1e-3 * sigma:.0f} {unit}"
+
+
+@app.command()
 def why(
     context: typer.Context,
     heliostat: Annotated[str, typer.Argument(help="Heliostat.")],

@@ -171,6 +171,8 @@ class Receiver(Value):
         Corners of the aperture in the order of `Target`, (4, 3), if known.
     radius, opening_angle
         Curvature, m and rad; 0 if flat.
+    nominal_power
+        Power on it to which readings of its flux refer, W; 0: not known.
     """
 
     name: str
@@ -182,6 +184,7 @@ class Receiver(Value):
     corners: FloatArray | None = None
     radius: float = 0.0
     opening_angle: float = 0.0
+    nominal_power: float = 0.0
 
     def _card(self) -> Card:
         east, north, up = self.center
@@ -196,7 +199,7 @@ class Receiver(Value):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise InputError(f"receiver {self.name}: {name} {value} m must be above 0")
-        for name in ("radius", "opening_angle"):
+        for name in ("radius", "opening_angle", "nominal_power"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"receiver {self.name}: {name} {value} must be 0 or more")

@@ -231,13 +231,19 @@ class ReceiverLight:
         frame cannot be measured at all.
     doubt
         Why the flux may be higher; empty if it is not.
+    cells
+        Share of the nominal mean flux in each cell that was asked for, (...); NaN outside the
+        frame; None if none was.
     """
 
     share: float
     doubt: str = ""
+    cells: FloatArray | None = None
 
 
-def receiver_light(frame: Frame, reference: ReceiverReference) -> ReceiverLight:
+def receiver_light(
+    frame: Frame, reference: ReceiverReference, places: FloatArray | None = None
+) -> ReceiverLight:
     """Return the flux on a receiver in a frame; see the module's text.
 
     Parameters
@@ -246,6 +252,9 @@ def receiver_light(frame: Frame, reference: ReceiverReference) -> ReceiverLight:
         Of the reference's camera, with the exposure of the reference.
     reference
         See `take_reference`.
+    places
+        Middles of cells of which the flux is wanted too, px, (rows, columns, 2). Daylight counts as
+        even over the receiver.
     """
     sight = reference.sight
     if frame.size != sight.size or _bits(frame) != reference.bits:
@@ -259,10 +268,27 @@ def receiver_light(frame: Frame, reference: ReceiverReference) -> ReceiverLight:
     rise = levels.face - reference.black - max(daylight, 0.0) * reference.face
     share = rise / reference.rise
     doubt = _doubt(frame, levels, reference, daylight, int(counting.sum()), share)
-    if not math.isfinite(frame.exposure * frame.gain * reference.exposure):
-        # A darker picture may be one of a shorter exposure.
-        share /= min(max(daylight, DIMMEST), 1.0)
-    return ReceiverLight(max(share, 0.0), doubt)
+    # A darker picture may be one of a shorter exposure.
+    stated = math.isfinite(frame.exposure * frame.gain * reference.exposure)
+    dimmed = 1.0 if stated else min(max(daylight, DIMMEST), 1.0)
+    cells = None
+    if places is not None:
+        dark = reference.black + max(daylight, 0.0) * reference.face
+        cells = (_at(frame, sight, places) - dark) / (reference.rise * dimmed)
+    return ReceiverLight(max(share / dimmed, 0.0), doubt, cells)
+
+
+def _at(frame: Frame, sight: ReceiverSight, places: FloatArray) -> FloatArray:
+    """Return mean levels in cells about some places, (rows, columns, 2); NaN outside the frame."""
+    import cv2
+
+    grey = _linear(frame, sight)
+    corner = np.array([sight.box[1].start, sight.box[0].start])
+    x, y = np.ascontiguousarray(np.moveaxis(places - corner, -1, 0), dtype=np.float32)
+    wide = max(1, round(float(np.nanmedian(np.linalg.norm(np.diff(places, axis=1), axis=-1)))))
+    high = max(1, round(float(np.nanmedian(np.linalg.norm(np.diff(places, axis=0), axis=-1)))))
+    mean = cv2.blur(grey, (wide, high))
+    return as_float(cv2.remap(mean, x, y, cv2.INTER_LINEAR, borderValue=math.nan))
 
 
 def _doubt(
@@ -423,9 +449,7 @@ class _Levels:
     @classmethod
     def of(cls, frame: Frame, sight: ReceiverSight) -> "_Levels":
         rows, columns = sight.box
-        part = Frame(frame.pixels[rows, columns], frame.name)
-        linear = part.linear(sight.gamma)
-        grey = np.asarray(linear.grey, dtype=np.float32) / np.float32(linear.full_scale)
+        grey = _linear(frame, sight)
         clipped = frame.clipped[rows, columns] > 0
         good = [side.sum() >= LEAST_SIDE for side in sight.sides]
         nan = math.nan
@@ -441,6 +465,12 @@ class _Levels:
             ),
             np.asarray(np.round(65535.0 * np.clip(reduced(grey), 0.0, 1.0)), dtype=np.uint16),
         )
+
+
+def _linear(frame: Frame, sight: ReceiverSight) -> Image:
+    """Return the levels of the box, linear, as shares of the full scale."""
+    linear = Frame(frame.pixels[sight.box], frame.name).linear(sight.gamma)
+    return np.asarray(linear.grey, dtype=np.float32) / np.float32(linear.full_scale)
 
 
 def _bits(frame: Frame) -> int:

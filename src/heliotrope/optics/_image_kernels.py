@@ -28,6 +28,8 @@ IMAGE = 6
 DEEP = 16.0
 #: Parts whose images differ in place by less than this share of the blur are merged.
 CLOSE = 0.7
+#: Exponent beyond which the sum of a Gaussian's values at cells counts as exact: to 1e-4.
+WIDE = 10.0
 FLAT, ROUND = 0, 1
 _FAST = {**OPTIONS, "fastmath": {"contract", "nsz", "arcp", "nnan"}}
 
@@ -318,6 +320,50 @@ def _march(z, step, count, rows, local, room):
             line[k] += up[k]
 
 
+@njit(**INNER)
+def _comb(variance, place):
+    """Sum of a Gaussian's values at whole numbers, by Poisson's formula; 1 if it is wide.
+
+    ``variance`` of the Gaussian, and its place, or that of a whole number relative to it.
+    """
+    depth = 2.0 * math.pi * math.pi * variance
+    if depth > WIDE:
+        return 1.0
+    q, x = math.exp(-depth), 2.0 * math.pi * place
+    return 1.0 + 2.0 * q * math.cos(x) + 2.0 * q**4 * math.cos(2.0 * x)
+
+
+@njit(**_FAST)
+def _narrow(uu, uv, vv, seen, count, step):
+    """Whether a Gaussian is narrow in comparison with a cell."""
+    least = 0.5 * (uu + vv) - math.sqrt(0.25 * (uu - vv) ** 2 + uv * uv)
+    most = 0.0
+    for k in range(count):
+        high = step * step * (seen[3, k] ** 2 + seen[4, k] ** 2)
+        most = max(most, high, 12.0 * (seen[5, k] ** 2 + seen[6, k] ** 2))
+    return 2.0 * math.pi * math.pi * least < WIDE * most
+
+
+@njit(**INNER)
+def _conserve(uu, uv, vv, u, v, seen, count, low, step, room):
+    """Divide the amplitudes by what the sum over narrow cells' middles would be off.
+
+    A Gaussian narrower than the cells, at whose middles it is taken, would lose or gain power.
+    """
+    _, _, shrink, up, _, peak = room
+    box = step * step / 12.0
+    for k in range(count):
+        du, dv, wu, wv = seen[3, k], seen[4, k], seen[5, k], seen[6, k]
+        a = uu + box * du * du + wu * wu
+        b = uv + box * du * dv + wu * wv
+        c = vv + box * dv * dv + wv * wv
+        across = math.sqrt(12.0) * (wv * du - wu * dv)
+        var = du * du * c - 2.0 * du * dv * b + dv * dv * a
+        at = (seen[2, k] - v) * du - (seen[1, k] - u) * dv
+        up[k] /= _comb(var / (across * across), at / across)
+        up[k] /= _comb(1.0 / (shrink[k] * step * step), (peak[k] - low) / step)
+
+
 @njit(**_FAST)
 def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
     """Add one Gaussian to the visible cells; returns the first and the last row that it reaches."""
@@ -338,6 +384,8 @@ def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
         up[k] = power * seen[7, k] * math.sqrt(inverse)
         peak[k] = -beta / alpha
         down[k] = gamma + beta * peak[k]
+    if _narrow(uu, uv, vv, seen, count, step):
+        _conserve(uu, uv, vv, u, v, seen, count, low, step, room)
     flattest, first, last = 1e300, 1e300, -1e300
     middle, nearest = 0.0, 2.0 * DEEP
     for k in range(count):

@@ -158,16 +158,17 @@ def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts,
 
 @njit(**OPTIONS)
 def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, surfaces, moments,
-           shape, columns, grid, scatter, modes, worth, own, shared, value):  # fmt: skip
+           shape, columns, grid, scatter, modes, worth, own, shared, value, slope):  # fmt: skip
     """Add what errors of the beams of mirrors ``rows[first:last]`` do to each cell.
 
     ``scatter`` (H, 3): Cholesky factor (uu, uv, vv) of the covariance of each beam's own error,
     rad. ``modes`` (H, M, 2): displacement of each beam by M shared errors, rad. ``own`` (rows,
     columns) gets variances, (W/m²)²; ``shared`` (M, rows, columns) changes of flux, W/m²;
     ``value`` (H,) the sum over cells of each mirror's own variance times ``worth`` (rows, columns).
+    ``slope`` (H, 2) gets the derivative of each mirror's power by its beam's displacement, W/rad.
     """
     weights, variances = sums
-    low, step, number, _ = grid
+    low, step, number, area = grid
     wide = len(columns[0])
     facing, local = np.empty((8, wide)), np.zeros((number, wide))
     room = (
@@ -219,17 +220,22 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
                     local[r, k] = 0.0
         _take(
             gradient, first_row, last_row, facing, visible, scatter[i], modes[i], worth, own,
-            shared, i, value,
+            shared, i, value, slope[i],
         )  # fmt: skip
+        slope[i, 0] *= area
+        slope[i, 1] *= area
 
 
 @njit(**_FAST)
-def _take(gradient, begin, end, facing, visible, scatter, modes, worth, own, shared, i, value):
+def _take(gradient, begin, end, facing, visible, scatter, modes, worth, own, shared, i, value,
+          slope):  # fmt: skip
     """Add squares and sums of a mirror's derivatives, and clear these."""
     for r in range(begin, end + 1):
         for k in range(visible):
             gu, gv, column = gradient[0, r, k], gradient[1, r, k], int(facing[0, k])
             gradient[0, r, k] = gradient[1, r, k] = 0.0
+            slope[0] += gu
+            slope[1] += gv
             one, two = scatter[0] * gu + scatter[1] * gv, scatter[2] * gv
             square = one * one + two * two
             own[r, column] += square

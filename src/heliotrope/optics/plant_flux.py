@@ -344,23 +344,17 @@ def field_flux(
 
 def result_of(plant: Plant, scene: Scene, engine: FieldFlux) -> PlantFlux:
     """Return the results of an engine for a plant's scene."""
-    return _result(plant, scene, engine.efficiencies, _views(engine))
+    return _result(plant, scene, engine.efficiencies, flux_views(engine))
 
 
-def scene_flux(scene: Scene, light: FieldOptics) -> list[FluxView]:
-    """Return the flux on the surfaces of a scene.
+def flux_views(engine: FieldFlux) -> list[FluxView]:
+    """Return the flux on the surfaces of a scene; without a mirror that shines the maps are zero.
 
     Parameters
     ----------
-    scene
-        The field as it stands. Without a mirror that shines the maps are zero.
-    light
-        Shape of the sun, air, and number of Gaussians.
+    engine
+        The flux of the scene.
     """
-    return _views(light.engine(scene))
-
-
-def _views(engine: FieldFlux) -> list[FluxView]:
     leaving, surfaces = float(engine.leaving.sum()), engine.scene.surfaces
     lit = int((engine.leaving > 0.0).sum())
     return [

@@ -13,7 +13,8 @@ mirrors, and differences in distance within one mirror. The sun's sum of Gaussia
 blur of at least 0.5 mrad from slope and calibration errors.
 """
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -258,7 +259,30 @@ class FieldFlux:
         To first order in the errors.
         """
         plan, errors = self._in_columns(), (as_float(scatter), as_input(modes), as_input(worth))
-        return plan.spread(self._field(), errors, groups)
+        return plan.spread(self._field(), errors, groups)[:3]
+
+    def power_slope(self) -> FloatArray:
+        """Return how the power of each mirror on the first surface changes with its beam.
+
+        Derivatives by a displacement to the right and up as seen from the mirror, W/rad, (H, 2).
+
+        Raises
+        ------
+        InputError
+            If the surface is a mesh or a cavity.
+        """
+        plan, count = self._in_columns(), len(self.scene.mirrors)
+        none = (np.zeros((count, 2, 2)), np.zeros((count, 0, 2)), np.zeros(self._flux[0].shape))
+        groups = np.arange(count) * _BLOCKS // count
+        return plan.spread(self._field(), none, groups)[3]
+
+    def on(self, surface: int) -> "FieldFlux":
+        """Return the same flux with another of its surfaces as the first and only one."""
+        found = copy(self)
+        found.scene = replace(self.scene, surfaces=(self.scene.surfaces[surface],))
+        for name in ("_plans", "_flux", "_power"):
+            setattr(found, name, [getattr(self, name)[surface]])
+        return found
 
     def _in_columns(self) -> "_Grid":
         plan = self._plans[0]
@@ -391,8 +415,11 @@ class _Grid:
 
     def spread(
         self, field: Any, errors: tuple[FloatArray, ...], groups: IntArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return variances, changes of the flux and worths; see `FieldFlux.spread`."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return variances, changes of the flux, worths and slopes of the power.
+
+        See `FieldFlux.spread` and `FieldFlux.power_slope`.
+        """
         scatter, modes, worth = errors
         rows, wide = self._grid[2], len(self._columns[0])
         count, order = int(groups.max(initial=0)) + 1, np.argsort(groups, kind="stable")
@@ -400,17 +427,18 @@ class _Grid:
         root = np.linalg.cholesky(scatter + 1e-30 * np.eye(2))
         factor = as_input(np.stack([root[:, 0, 0], root[:, 1, 0], root[:, 1, 1]], axis=-1))
         own, value = np.zeros((count, rows, wide)), np.zeros(len(groups))
+        slope = np.zeros((len(groups), 2))
         shared = np.zeros((count, modes.shape[1], rows, wide))
 
         def block(first: int, last: int) -> None:
             for k in range(first, last):
                 look_kernels.spread(
                     edges[k], edges[k + 1], order, *field, self._shape, self._columns, self._grid,
-                    factor, modes, worth, own[k], shared[k], value,
+                    factor, modes, worth, own[k], shared[k], value, slope,
                 )  # fmt: skip
 
         run_blocks(block, count, 2)
-        return as_float(own.sum(axis=0)), shared, value
+        return as_float(own.sum(axis=0)), shared, value, slope
 
 
 class _Cells:

@@ -46,7 +46,15 @@ from heliotrope.plant.visits.joint_cycle import JointCycle
 from heliotrope.plant.visits.neighbours import Unhidden
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
-from heliotrope.safety import CONDITIONS, Severity, alarms, differences, limited, numbers
+from heliotrope.safety import (
+    CONDITIONS,
+    FLUX_READING,
+    Severity,
+    alarms,
+    differences,
+    limited,
+    numbers,
+)
 from heliotrope.store.records import PlannedVisit, StoreError
 
 #: A calibration that removes the errors of a quick installation.
@@ -304,6 +312,8 @@ class PlantAssembly:
             news = await sensors.news()
             for name, value in news.values.items():
                 self.plant.put(name, value, made=news.made.get(name))
+            if FLUX_READING in news.seen:
+                self.operations.flux_check.see(news.seen[FLUX_READING])
             for name, text in news.problems.items():
                 self.logbook.take_alarm(
                     alarms.SENSOR.raised(name, problem=text) if text else alarms.SENSOR.ended(name)

@@ -189,6 +189,20 @@ SUN_CONTRADICTED = AlarmKind(
     "correct them.",
     over="{subject} sees the sun where the plant computes it",
 )
+FLUX_DISAGREES = AlarmKind(
+    "flux_disagrees",
+    _PLANT,
+    Severity.WARNING,
+    "For two minutes the flux measured on the receiver has differed from the predicted one by more "
+    "than four standard deviations.",
+    "receiver {receiver}: {measured:.0f} kW are measured and {predicted:.0f} kW predicted; the "
+    "flux is {far:.0f} standard deviations off",
+    "The field goes on as it is.",
+    "Compare both maps (tab Plant): if beams are beside their place, look for a wrong clock, a "
+    "wrong calibration or a moved receiver; if all is darker, for clouds over the field, dirt, or "
+    "a wrong sensor of irradiance or flux.",
+    over="receiver {receiver}: the measured flux agrees with the predicted one again",
+)
 UNWITNESSED = AlarmKind(
     "unwitnessed",
     _PLANT,

@@ -168,7 +168,7 @@ def _check(
     design: Plant, settings: AssemblySettings, outside: "_Outside", cameras: RealCameras | None
 ) -> None:
     """Build the whole plant without starting it, and print what it consists of."""
-    sensors = outside.sensors(cameras)
+    sensors = outside.sensors(cameras, design)
     ports = Ports(outside.all_links, outside.clock, Forgetful(), cameras, sensors)
     PlantAssembly(design, ports, settings)
     watched = 0 if cameras is None else sum(cameras.sees(t.name) for t in design.targets)
@@ -216,12 +216,13 @@ class _Outside:
             **{local.cluster.config.name: local.link for local in self.local},
         }
 
-    def sensors(self, cameras: RealCameras | None) -> Sensors:
+    def sensors(self, cameras: RealCameras | None, design: Plant) -> Sensors:
         """Return the sensors of the plant."""
         files, light = self.links.sensors, self.links.light
         if light is None or cameras is None:
             return files
-        return AllSensors([files, flux_by(cameras, self.clock, light)])
+        receiver = design.receiver(light.sight.receiver)
+        return AllSensors([files, flux_by(cameras, self.clock, light, receiver)])
 
     def ports(
         self, design: Plant, choice: PlantChoice, shown: Shown, keeper: Keeper, worker: Worker
@@ -233,7 +234,7 @@ class _Outside:
             self.clock,
             KeptAudit(keeper, SystemClock(), self.clock.utc()),
             cameras,
-            self.sensors(cameras),
+            self.sensors(cameras, design),
             witnesses=self.links.witnesses,
             # A record takes long in a time that runs faster, so there the loop waits for it.
             disk=None if self.fast else DiskThread(),

@@ -17,12 +17,13 @@ const SENSORS = { dni: [word("Direct sunlight"), "W/m²", 1, 0], receiver_flux_n
   wind_gust: [word("Wind gust (3 s)"), "m/s", 1, 1], wind_mean: [word("Mean wind (10 min)"), "m/s", 1, 1], temperature: [word("Air"), "°C", 1, 0] };
 
 export function plant(box) {
-  const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), sensors = h("div");
+  const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), measured = h("div"), sensors = h("div");
   const { receivers } = store.field, figures = h("div");
   let [name] = receivers;
+  const unsure = h("input", { type: "checkbox", onchange: () => draw() });
   const choice = h("select", { ariaLabel: t("Receiver"), onchange: () => { name = choice.value; predict(); } }, receivers.map((one) => h("option", { value: one }, one)));
   box.append(h("h3", {}, t("Heliostats")), states, proof, h("h3", {}, t("Sun")), light, sensors,
-    ...(name ? [h("h3", {}, t("Predicted flux on the receiver")), receivers.length > 1 ? choice : "", figures, flux,
+    ...(name ? [h("h3", {}, t("Predicted flux on the receiver")), receivers.length > 1 ? choice : "", figures, flux, h("label", { title: t("By the errors of the calibrations; sunlight, reflectivity and soiling come on top.") }, unsure, " ", t("Standard deviation")), measured,
       canCommand() ? h("p", { className: "hx-hint" }, t("Click on the picture to aim the heliostats of the scope at that point.")) : ""] : []));
   let seen = null;
   const show = () => {
@@ -49,7 +50,14 @@ export function plant(box) {
       [t("Seen to move today"), Object.entries(head.order.followed).map(([by, n]) => t("{n} by {by}", { n: count(n), by })).join(", ") || t("none")],
       [t("Believed by reports alone"), head.order.believed.join(", ") + (head.order.believed_count > head.order.believed.length ? `, … (${count(head.order.believed_count)})` : "") || t("none")]])] : []));
   };
-  const draw = () => { if (seen) drawFlux(flux, seen); };
+  const draw = () => {
+    if (!seen) return;
+    drawFlux(flux, unsure.checked ? { ...seen, flux: seen.sigma } : seen);
+    const map = Array.isArray(seen.measured) ? h("canvas", { className: "hx-flux" }) : "";
+    measured.replaceChildren(...(seen.measured === null ? [] : [h("h3", {}, t("Measured flux on the receiver")), map || facts([[t("Mean"), `${number(seen.measured / 1e3, 0)} kW/m²`]])]));
+    if (map) drawFlux(map, { ...seen, flux: seen.measured });
+  };
+  const within = (value, sigma, size, digits) => number(value / size, digits) + (sigma === null ? "" : ` ± ${number(sigma / size, digits)}`);
   const off = [store.on("frame", show), store.on("theme", () => { show(); draw(); })];
   const predict = async () => {
     try { seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`); } catch (error) {
@@ -57,10 +65,9 @@ export function plant(box) {
       figures.replaceChildren(h("p", { className: "hx-hint" }, error.message));
       return;
     }
-    const peak = Math.max(0, ...seen.flux.flat());
-    figures.replaceChildren(facts([[t("Power"), `${number(seen.power / 1e6, 2)} MW`],
+    figures.replaceChildren(facts([[t("Power"), `${within(seen.power, seen.power_sigma, 1e6, 2)} MW`],
       [t("Intercept"), seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],
-      [t("Peak"), `${number(peak / 1e3, 0)} kW/m²`], [t("Heliostats on it"), count(seen.heliostats)]]));
+      [t("Peak"), `${within(seen.peak, seen.peak_sigma, 1e3, 0)} kW/m²`], [t("Heliostats on it"), count(seen.heliostats)]]));
     draw();
   };
   if (name) off.push(refreshed(predict, { every: 10 }));

@@ -108,6 +108,9 @@ class ReceiverTable(StrictTable):
     corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
     radius_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     opening_angle_rad: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    nominal_power_mw: Positive | None = Field(
+        None, description="Power on it to which readings of its flux refer."
+    )
 
 
 class CameraTable(StrictTable):

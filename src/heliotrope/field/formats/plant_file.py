@@ -240,6 +240,7 @@ def _receiver(table: ReceiverTable) -> Receiver:
         None if table.corners_m is None else np.array(table.corners_m),
         table.radius_m,
         table.opening_angle_rad,
+        1e6 * (table.nominal_power_mw or 0.0),
     )
 
 
@@ -352,6 +353,7 @@ def _receiver_document(r: Receiver) -> dict[str, Any]:
         **corners,
         "radius_m": r.radius,
         "opening_angle_rad": r.opening_angle,
+        **({"nominal_power_mw": 1e-6 * r.nominal_power} if r.nominal_power else {}),
     }
 
 

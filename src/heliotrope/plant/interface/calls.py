@@ -20,7 +20,6 @@ from pydantic import BaseModel
 from heliotrope.calibration.flights import FlightDocument, parse_flight
 from heliotrope.errors import InputError
 from heliotrope.field.timetable import TimetableEntry
-from heliotrope.optics import FluxView
 from heliotrope.plant.attempts import Retry
 from heliotrope.plant.interface import orders
 from heliotrope.plant.interface.desk import AuthorityState, CameraReading, Desk, FieldDesign
@@ -184,8 +183,8 @@ def sun(desk: Desk) -> views.SunView:
 
 
 @_call("GET receivers/{name}/flux", "plant", fresh=FRESH)
-async def flux(desk: Desk, order: orders.Named) -> FluxView:
-    """Return the predicted flux on a receiver."""
+async def flux(desk: Desk, order: orders.Named) -> views.PredictedView:
+    """Return the predicted flux on a receiver, with its uncertainty."""
     return await desk.operations.receiver_flux(order.name)
 
 

@@ -16,11 +16,14 @@ from functools import partial
 import numpy as np
 
 from heliotrope.errors import HeliotropeError, InputError
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, project
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver
+from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame, Pixels
 from heliotrope.imaging.receiver_light import ReceiverLight, ReceiverReference, receiver_light
 from heliotrope.links.clock import Clock
+from heliotrope.optics import surface_of
 from heliotrope.plant.io.cameras import dated
 from heliotrope.plant.io.sensors import Readings
 from heliotrope.plant.ports import Cameras
@@ -67,17 +70,29 @@ def check_reference(design: Plant, reference: ReceiverReference) -> None:
         )
 
 
-def flux_by(cameras: Cameras, clock: Clock, reference: ReceiverReference) -> "ReceiverFlux":
+def flux_by(
+    cameras: Cameras, clock: Clock, reference: ReceiverReference, receiver: Receiver
+) -> "ReceiverFlux":
     """Return the flux of a receiver by the camera that a plant's cameras have for it.
+
+    With a map where the receiver is planar and the camera's pose is known.
 
     Raises
     ------
     UnknownNameError
         If no camera looks at it.
     """
-    receiver = reference.sight.receiver
-    newest = partial(cameras.frame, receiver)
-    return ReceiverFlux(cameras.eye(receiver), newest, clock, reference)
+    eye = cameras.eye(receiver.name)
+    newest = partial(cameras.frame, receiver.name)
+    return ReceiverFlux(eye, newest, clock, reference, cell_places(receiver, eye))
+
+
+def cell_places(receiver: Receiver, eye: Camera) -> FloatArray | None:
+    """Return the pixels of a receiver's cells, (H, W, 2); None where a camera cannot map them."""
+    if receiver.kind != "planar" or eye.position is None:
+        return None
+    cells = surface_of(receiver).cells
+    return project(eye, cells.center.reshape(*cells.shape, 3))
 
 
 class ReceiverFlux:
@@ -93,6 +108,8 @@ class ReceiverFlux:
         Clock of the plant.
     reference
         Of this camera.
+    places
+        Pixels of the receiver's cells, (H, W, 2); None: only the whole is measured.
 
     Attributes
     ----------
@@ -106,10 +123,11 @@ class ReceiverFlux:
         newest: Callable[[], Frame],
         clock: Clock,
         reference: ReceiverReference,
+        places: FloatArray | None = None,
     ) -> None:
         self.names = frozenset({FLUX_READING})
         self._eye, self._newest, self._clock = eye, newest, clock
-        self._reference = reference
+        self._reference, self._places = reference, places
         self._read_at = -math.inf
         self._seen: tuple[datetime, Pixels] | None = None
         self._kind = ""
@@ -158,6 +176,8 @@ class ReceiverFlux:
         if light.doubt and not light.share >= FLUX_LIMIT:
             return f"{who}: {light.doubt}"
         found.values[FLUX_READING] = light.share
+        whole = np.array(light.share) if light.cells is None else light.cells
+        found.seen[FLUX_READING] = None if light.doubt else whole
         found.made[FLUX_READING] = self._clock.monotonic() - max(
             0.0, (self._clock.utc() - made).total_seconds()
         )
@@ -171,4 +191,4 @@ class ReceiverFlux:
             # A sensor's noise differs from frame to frame.
             if before.shape == after.shape and np.array_equal(before, after):
                 return None
-        return receiver_light(frame, self._reference)
+        return receiver_light(frame, self._reference, self._places)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from heliotrope.geometry import FloatArray
 from heliotrope.plant.emergency import DNI_READING, OWN_READINGS
 from heliotrope.safety import CONDITIONS, FLUX_READING, Watcher, watched_by
 
@@ -37,11 +38,15 @@ class Readings:
         Why a reading cannot be read, by reading; "" once it can be read again.
     made
         When a new value was made, by reading, monotonic s; one that is not named: now.
+    seen
+        Of a value by a camera: its fraction in the cells of the receiver, (H, W), or on all of it,
+        (); None if the value is only a lower bound.
     """
 
     values: dict[str, float] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
     made: dict[str, float] = field(default_factory=dict)
+    seen: dict[str, FloatArray | None] = field(default_factory=dict)
 
 
 class Sensors(Protocol):
@@ -83,6 +88,7 @@ class AllSensors:
             found.values.update(news.values)
             found.problems.update(news.problems)
             found.made.update(news.made)
+            found.seen.update(news.seen)
         return found
 
 

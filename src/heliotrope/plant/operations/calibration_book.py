@@ -13,7 +13,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, SightingView
-from heliotrope.plant.visits.expected_errors import expected_errors
+from heliotrope.plant.visits.expected_errors import expected_covariances, expected_errors
 
 #: Numbers of points of the quality over time, and of results, that are held.
 _POINTS, RESULTS = 4000, 2000
@@ -40,6 +40,9 @@ class CalibrationBook:
     error
         Predicted standard deviation of the normal (two-dimensional) at the aim, rad, (N,). It
         grows with the time since the calibration.
+    spread
+        Covariance of the beam behind ``error``, to the right of and above the aim as seen from the
+        mirror, rad², (N, 2, 2); NaN before the first calibration.
     measured, calibrated_at, sightings
         See `FieldFrame`.
     results, quality
@@ -52,6 +55,7 @@ class CalibrationBook:
         count = len(plant.field)
         self._plant, self._model = plant, model
         self.error = np.full(count, np.nan)
+        self.spread = np.full((count, 2, 2), np.nan)
         self.measured = np.full(count, np.nan)
         self.calibrated_at = np.full(count, np.nan)
         self.sightings = np.zeros(count, dtype=np.int32)
@@ -118,7 +122,9 @@ class CalibrationBook:
             return
         rows = np.array([self._plant.field.place(r.heliostat) for r in records], dtype=np.intp)
         names = [record.heliostat for record in records]
-        self.error[rows] = 0.5 * expected_errors(self._plant, names, self._aims(rows))
+        self.spread[rows] = expected_covariances(self._plant, names, self._aims(rows))
+        # The normal is off by half as much as the beam.
+        self.error[rows] = 0.5 * np.sqrt(np.trace(self.spread[rows], axis1=-2, axis2=-1))
 
     def error_on(self, target: Target, rows: npt.NDArray[np.intp]) -> FloatArray:
         """Return the expected errors of n beams on a target now, rad RMS (2-D), (n,).

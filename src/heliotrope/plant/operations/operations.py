@@ -12,9 +12,10 @@ heliostat that an operator has raised and that was lost is left to the operators
 """
 
 import asyncio
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -26,7 +27,6 @@ from heliotrope.errors import HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.lcu import messages
 from heliotrope.links.clock import sleep_until
-from heliotrope.optics import FluxView
 from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import ORDERED, EmergencyOrder
@@ -35,6 +35,8 @@ from heliotrope.plant.operations.approvals import Approvals
 from heliotrope.plant.operations.automatic import AUTOMATIC, AutomaticControl
 from heliotrope.plant.operations.errands import Errands
 from heliotrope.plant.operations.explaining import explain
+from heliotrope.plant.operations.flux_check import EVERY as COMPARED
+from heliotrope.plant.operations.flux_check import FluxCheck
 from heliotrope.plant.operations.history import History, figures
 from heliotrope.plant.operations.logbook import MOST_NAMED, Logbook
 from heliotrope.plant.operations.marking import Marking
@@ -48,6 +50,7 @@ from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
     CameraView,
     Explanation,
+    PredictedView,
     Summary,
     SunView,
 )
@@ -129,7 +132,8 @@ class Operations:
 
     Attributes
     ----------
-    plant, logbook, automatic, viewer, security, pictures, parameters, approvals, marking
+    plant, logbook, automatic, viewer, security, pictures, parameters, approvals, marking,
+    flux_check
         See their classes; readers access them directly.
     telemetry
         Folder of the telemetry; None: no telemetry is archived.
@@ -159,7 +163,8 @@ class Operations:
         self.telemetry: Path | None = None
         self._history = History(plant, records, self._figures)
         self._records = records
-        self._flux = PredictedFlux(plant, self.viewer, automatic.installed, worker)
+        self._flux = PredictedFlux(plant, self.viewer, automatic.book, automatic.installed, worker)
+        self.flux_check = FluxCheck(plant, self._flux, logbook)
         self._closing, self.begun = asyncio.Event(), asyncio.Event()
 
     # -- running ---------------------------------------------------------------------------
@@ -171,7 +176,7 @@ class Operations:
         self.begun.set()
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
-            parts = (self._look(), self._follow(), self._history.run())
+            parts = (self._look(), self._follow(), self._compare(), self._history.run())
             beside = [group.create_task(part) for part in parts]
             await self._closing.wait()
             self.automatic.stop()
@@ -188,6 +193,14 @@ class Operations:
             facts = {} if self._extra is None else self._extra()
             self.security.look(str(facts.get(REFUSED_LINK, "")))
             await asyncio.sleep(_LOOKED)
+
+    async def _compare(self) -> None:
+        """Compare the flux on the receiver with the predicted one."""
+        while True:
+            # The process that computes may have ended; then another begins.
+            with contextlib.suppress(HeliotropeError):
+                await self.flux_check.look()
+            await sleep_until(self.plant.clock, self.plant.now() + COMPARED)
 
     async def _follow(self) -> None:
         """Follow operations of persons to their ends."""
@@ -348,7 +361,7 @@ class Operations:
         found = sun.position(at, self.plant.design.site)
         return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
 
-    async def receiver_flux(self, name: str = "") -> FluxView:
+    async def receiver_flux(self, name: str = "") -> PredictedView:
         """Return the predicted flux on a receiver ("": the first); see `PredictedFlux`.
 
         Raises
@@ -359,7 +372,8 @@ class Operations:
         if not name and not self.receivers:
             raise UnknownNameError("receiver", name, self.receivers)
         receiver = self.plant.design.receiver(name or self.receivers[0])
-        return (await self._flux.everywhere())[receiver.name]
+        view = (await self._flux.everywhere())[receiver.name]
+        return replace(view, measured=self.flux_check.measured(receiver.name))
 
     # -- calibration -----------------------------------------------------------------------
 

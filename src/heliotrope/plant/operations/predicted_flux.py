@@ -2,8 +2,9 @@
 
 Every mirror stands where its reported step counts place it under its present calibration, so those
 that turn away or rest in stow shade and block as they stand. The light is that of
-`heliotrope.optics.receiver_flux`, computed beside the plant's loop (`plant.workers`) when somebody
-asks for it.
+`heliotrope.optics.receiver_flux`, and its uncertainty that of `heliotrope.aims.errors` by the
+covariance of each calibration. Both are computed beside the plant's loop (`plant.workers`) when
+somebody asks for them.
 """
 
 import asyncio
@@ -11,13 +12,25 @@ from dataclasses import replace
 
 import numpy as np
 
+from heliotrope.aims.errors import assess
 from heliotrope.field.target import Receiver
-from heliotrope.optics import FieldOptics, FluxView, scene_flux
-from heliotrope.optics.scene import Mirrors, Scene, facets_of
-from heliotrope.optics.surfaces import surface_of
+from heliotrope.optics import (
+    Cavity,
+    FieldFlux,
+    FieldOptics,
+    FluxView,
+    Mesh,
+    Mirrors,
+    Scene,
+    flux_views,
+    surface_of,
+)
+from heliotrope.optics.scene import facets_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
+from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.viewing import Viewer
+from heliotrope.plant.operations.views import PredictedView
 from heliotrope.plant.refusals import RefusedError
 from heliotrope.plant.workers import Worker
 
@@ -31,8 +44,8 @@ class PredictedFlux:
 
     Parameters
     ----------
-    plant, viewer
-        The controller, and the views of its field.
+    plant, viewer, book
+        The controller, the views of its field, and its calibrations.
     installed
         Expected error of a heliostat that was never calibrated, rad.
     worker
@@ -40,19 +53,24 @@ class PredictedFlux:
     """
 
     def __init__(
-        self, plant: PlantController, viewer: Viewer, installed: float, worker: Worker
+        self,
+        plant: PlantController,
+        viewer: Viewer,
+        book: CalibrationBook,
+        installed: float,
+        worker: Worker,
     ) -> None:
-        self._plant, self._viewer, self._worker = plant, viewer, worker
+        self._plant, self._viewer, self._book, self._worker = plant, viewer, book, worker
         self._installed = installed
         design = plant.design
         place = {name: row for row, name in enumerate(design.names)}
         self._rows = np.array([place[name] for name in plant.field.names], dtype=np.intp)
         self._surfaces = tuple(surface_of(receiver) for receiver in design.receivers)
-        self._views: dict[str, FluxView] = {}
+        self._views: dict[str, PredictedView] = {}
         self._made_at = -np.inf
         self._computing: asyncio.Task[None] | None = None
 
-    async def everywhere(self) -> dict[str, FluxView]:
+    async def everywhere(self) -> dict[str, PredictedView]:
         """Return the flux on each receiver, by name: the last one known after `PATIENCE`.
 
         Raises
@@ -80,13 +98,13 @@ class PredictedFlux:
         if not receivers:
             return
         on = self._viewer.frame().on
-        views = await self._worker(scene_flux, self._scene(now), _LIGHT)
+        views = await self._worker(predicted, self.scene(now), _LIGHT)
         for k, (receiver, view) in enumerate(zip(receivers, views, strict=True), 1):
             shown = replace(view, heliostats=int((on == k).sum()))
             self._views[receiver.name] = _from_outside(shown, receiver)
         self._made_at = now
 
-    def _scene(self, now: float) -> Scene:
+    def scene(self, now: float) -> Scene:
         """Return the field as it stands: the mirrors on a receiver shine, the others cast shadows.
 
         The irradiance is measured where there is a sensor.
@@ -95,9 +113,10 @@ class PredictedFlux:
         normal, center = beams.armature.pose(beams.drives.angles(plant.field.posed))
         middle = self._surfaces[0].center
         aims = np.where(np.isfinite(plant.aims).all(axis=-1, keepdims=True), plant.aims, middle)
-        error = np.where(np.isfinite(frame.error), frame.error, self._installed)
         # Two axes of the normal share its variance, and the beam turns by twice the angle.
-        spread = 2.0 * error[:, None, None].astype(np.float64) ** 2 * np.eye(2)
+        unknown = 2.0 * self._installed**2 * np.eye(2)
+        known = np.isfinite(self._book.spread).all(axis=(1, 2), keepdims=True)
+        spread = np.where(known, self._book.spread, unknown)
         size = self._viewer.sizes
         mirrors = Mirrors.of(
             center, normal, (size[:, 0], size[:, 1]), aims, slope=_LIGHT.slope,
@@ -112,7 +131,37 @@ class PredictedFlux:
         return Scene(plant.sun_vector(), max(dni, 0.0), mirrors, self._surfaces, dark=dark)
 
 
-def _from_outside(view: FluxView, receiver: Receiver) -> FluxView:
+def predicted(scene: Scene, light: FieldOptics) -> list[PredictedView]:
+    """Return the expected flux on the surfaces of a scene, with its uncertainty.
+
+    The mirrors' ``pointing`` is the covariance of their errors, which count as independent.
+    """
+    engine = light.engine(scene)
+    views = flux_views(engine)
+    return [_uncertain(view, engine.on(k)) for k, view in enumerate(views)]
+
+
+def _uncertain(view: FluxView, engine: FieldFlux) -> PredictedView:
+    flux, (surface,) = view.flux, engine.scene.surfaces
+    sigma, power_sigma = np.full(flux.shape, np.nan), float("nan")
+    if not isinstance(surface, Mesh | Cavity):
+        count, pointing = len(engine.scene.mirrors), engine.scene.mirrors.pointing
+        alone, together = np.zeros((count, 0, 2)), np.zeros(count, dtype=np.int64)
+        no_limit = np.full(flux.shape, np.inf)
+        sigma = assess(engine, alone, together, 0.5, no_limit, 1.0).sigma
+        slope = engine.power_slope()
+        power_sigma = float(np.sqrt(np.einsum("hi,hij,hj", slope, pointing, slope)))
+    hottest = np.unravel_index(flux.argmax(), flux.shape)
+    return PredictedView(
+        **vars(view),
+        sigma=sigma,
+        power_sigma=power_sigma,
+        peak=float(flux[hottest]),
+        peak_sigma=float(sigma[hottest]),
+    )
+
+
+def _from_outside(view: PredictedView, receiver: Receiver) -> PredictedView:
     """Return a map whose columns run to the right as seen from outside: `Receiver.point`.
 
     The engine's run clockwise, a full cylinder's from the north.
@@ -126,4 +175,5 @@ def _from_outside(view: FluxView, receiver: Receiver) -> FluxView:
         turns = (right / radius + front + np.pi) / (2.0 * np.pi)
         right = radius * (2.0 * np.pi * (turns - np.floor(turns)) - np.pi)
     order = np.argsort(right)
-    return replace(view, right=right[order], flux=view.flux[:, order])
+    shown = {name: getattr(view, name)[:, order] for name in ("flux", "sigma")}
+    return replace(view, right=right[order], **shown)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.geometry import FloatArray
+from heliotrope.optics import FluxView
 from heliotrope.plant.emergency import Call
 from heliotrope.safety import Alarm
 from heliotrope.store.records import FieldPoint, Outlook, PlannedVisit
@@ -251,6 +252,33 @@ class AlarmRow(Alarm):
     at: float = field(kw_only=True)
     acknowledged_by: str = ""
     count: int = 1
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PredictedView(FluxView):
+    """The flux that is expected on a receiver, and its uncertainty.
+
+    Standard deviations are those by the errors of the heliostats' calibrations: see
+    `heliotrope.aims.errors`. Irradiance, reflectivity and soiling come on top.
+
+    Attributes
+    ----------
+    sigma
+        Standard deviation in each cell, W/m², (H, W); NaN on a mesh and in a cavity.
+    power_sigma
+        Standard deviation of the power, W.
+    peak, peak_sigma
+        Flux in the hottest cell and its standard deviation, W/m².
+    measured
+        What a camera measures now in the cells, W/m², (H, W), or another sensor as the mean, ();
+        None: nothing is measured.
+    """
+
+    sigma: FloatArray
+    power_sigma: float
+    peak: float
+    peak_sigma: float
+    measured: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,22 @@ def expected_errors(
 ) -> FloatArray:
     """Return the expected errors of K beams at their aims now, rad RMS (2-D), (K,).
 
-    NaN for a beam that cannot reach its aim, and for a heliostat that was never calibrated and has
-    no ``model``.
+    Arguments and NaN as of `expected_covariances`.
+    """
+    spread = expected_covariances(plant, heliostats, aims, model)
+    return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1)))
+
+
+def expected_covariances(
+    plant: PlantController,
+    heliostats: Sequence[str],
+    aims: FloatArray,
+    model: Mapping[str, tuple[str, ...]] | None = None,
+) -> FloatArray:
+    """Return the covariances of the errors of K beams at their aims now, rad², (K, 2, 2).
+
+    To the right of and above the aim as seen from the mirror. NaN for a beam that cannot reach its
+    aim, and for a heliostat that was never calibrated and has no ``model``.
 
     Parameters
     ----------
@@ -31,7 +45,7 @@ def expected_errors(
         Names of the parameters whose priors count before the first calibration, by heliostat.
     """
     design, beliefs = plant.design, plant.beliefs
-    found = np.full(len(heliostats), np.nan)
+    found = np.full((len(heliostats), 2, 2), np.nan)
     # Heliostats of one group with the same parameters are computed together.
     parts: dict[tuple[int, tuple[str, ...], bool], list[int]] = {}
     for k, name in enumerate(heliostats):
@@ -56,5 +70,5 @@ def expected_errors(
         rows = np.array([plant.field.place(name) for name in chosen], dtype=np.intp)
         present, here = nominal.with_parameters(values), plant.field.counts(rows)
         expected = expected_error(present, names, covariance, sun, aims[members], current=here)
-        found[members] = expected.rms
+        found[members] = expected.covariance
     return found

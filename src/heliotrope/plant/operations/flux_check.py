@@ -1,0 +1,148 @@
+r"""The flux that is measured on the receiver, compared with the predicted one.
+
+A camera gives a map, a calorimeter or flux sensor one number; both are fractions of the receiver's
+nominal power. With the measured flux $M_c$ and the predicted $F_c$ in the cells that were measured,
+
+$$D^2 = \sum_c (M_c - F_c)^2 / \sum_c σ_c^2$$
+
+$$σ_c^2 = s_c^2 + (a^2 + e^2) F_c^2 + (b F_\text{peak})^2 + (f F_\text{nominal})^2$$
+
+with s_c by the errors of the calibrations. D² has the mean 1 if the standard deviations are right,
+however many cells there are and however alike their errors: it is our own measure. `SCALE` (a)
+stands for irradiance, reflectivity and soiling, `SHAPE` (b, of maps) for the mirrors' figure,
+`READ` and `FLOOR` (e, f) for the measurement (from rendered frames, see *how to use cameras*).
+"""
+
+import math
+
+import numpy as np
+
+from heliotrope.field.target import Receiver
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.optics import surface_of
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import DNI_READING
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.predicted_flux import PredictedFlux
+from heliotrope.plant.operations.views import PredictedView
+from heliotrope.safety import FLUX_READING, alarms
+from heliotrope.safety.proof import FLUX_AGE
+
+#: Relative standard deviation of the predicted flux as a whole, and of a cell, of the peak.
+SCALE, SHAPE = 0.10, 0.05
+#: Standard deviation of a measurement: of its value, and of the nominal flux.
+READ, FLOOR = 0.02, 0.005
+#: Distance, in standard deviations, above which the alarm is raised, and below which it is over.
+RAISE, CLEAR = 4.0, 3.0
+#: Time for which the distance must be above or below, s: mirrors on their way have been reported.
+HOLD = 120.0
+#: Time between comparisons, s.
+EVERY = 10.0
+
+
+def distance(view: PredictedView, measured: FloatArray, mean: float, area: float) -> float:
+    """Return how far a measured flux is from the predicted one, in standard deviations.
+
+    Parameters
+    ----------
+    view
+        The prediction.
+    measured
+        W/m²: mean over the receiver, (), or in the cells of the prediction, NaN where it was not
+        measured, (H, W).
+    mean
+        Mean flux on the receiver at nominal power, W/m².
+    area
+        Of the receiver, m².
+
+    Returns
+    -------
+    D of the module's text; NaN if no cell was measured.
+    """
+    if measured.ndim:
+        flux, own, shape = view.flux, view.sigma, SHAPE * view.peak
+    else:
+        flux, own, shape = as_float(view.power / area), as_float(view.power_sigma / area), 0.0
+    seen = np.isfinite(measured)
+    if not seen.any():
+        return math.nan
+    square = np.nan_to_num(own) ** 2 + (SCALE**2 + READ**2) * flux**2 + shape**2
+    square = square + (FLOOR * mean) ** 2
+    away = np.where(seen, measured - flux, 0.0)
+    return float(np.sqrt(np.sum(away**2) / np.sum(square[seen])))
+
+
+class FluxCheck:
+    """Compares the flux on a plant's receiver, and raises an alarm where it is not the predicted.
+
+    It compares if the plant has one receiver, its nominal power is known, and the irradiance is
+    measured.
+
+    Parameters
+    ----------
+    plant, flux, log
+        The controller, the prediction, and the logbook for the alarm.
+    """
+
+    def __init__(self, plant: PlantController, flux: PredictedFlux, log: Logbook) -> None:
+        self._plant, self._flux, self._log = plant, flux, log
+        self._receiver: Receiver | None = None
+        if len(plant.design.receivers) == 1 and plant.design.receivers[0].nominal_power > 0.0:
+            self._receiver = plant.design.receivers[0]
+            self._area = float(surface_of(self._receiver).cells.area.sum())
+            self._mean = self._receiver.nominal_power / self._area
+        #: The camera's last map, fractions, and when it came; a plant without one has none.
+        self._seen: tuple[FloatArray | None, float] | None = None
+        self._apart_since = self._agrees_since = math.inf
+
+    def see(self, fractions: FloatArray | None) -> None:
+        """Take what a camera has just seen: fractions of the nominal mean flux, (H, W) or ().
+
+        None: it has not seen all of the light, so that there is nothing to compare.
+        """
+        self._seen = fractions, self._plant.now()
+
+    def measured(self, name: str) -> FloatArray | None:
+        """Return the measured flux on a receiver, W/m², (H, W) or (); None if there is none now."""
+        if self._receiver is None or self._receiver.name != name:
+            return None
+        now = self._plant.now()
+        if self._seen is not None:
+            fractions, at = self._seen
+            return None if fractions is None or now - at > FLUX_AGE else self._mean * fractions
+        share = self._plant.sentinel.table.shown(now).get(FLUX_READING, math.nan)
+        return as_float(self._mean * share) if math.isfinite(share) else None
+
+    async def look(self) -> None:
+        """Compare, and raise or end the alarm.
+
+        Raises
+        ------
+        HeliotropeError
+            If the prediction cannot be computed.
+        """
+        receiver = self._receiver
+        if receiver is None or (measured := self.measured(receiver.name)) is None:
+            return
+        now = self._plant.now()
+        if not math.isfinite(self._plant.sentinel.table.shown(now).get(DNI_READING, math.nan)):
+            return
+        view = (await self._flux.everywhere())[receiver.name]
+        far, stands = distance(view, measured, self._mean, self._area), self._stands
+        self._apart_since = min(self._apart_since, now) if far > RAISE else math.inf
+        self._agrees_since = min(self._agrees_since, now) if far < CLEAR else math.inf
+        if not stands and now - self._apart_since >= HOLD:
+            self._log.take_alarm(
+                alarms.FLUX_DISAGREES.raised(
+                    receiver=receiver.name,
+                    measured=1e-3 * self._area * float(np.nanmean(measured)),
+                    predicted=1e-3 * view.power,
+                    far=far,
+                )
+            )
+        elif stands and now - self._agrees_since >= HOLD:
+            self._log.take_alarm(alarms.FLUX_DISAGREES.ended(receiver=receiver.name))
+
+    @property
+    def _stands(self) -> bool:
+        return self._log.stands(alarms.FLUX_DISAGREES)
