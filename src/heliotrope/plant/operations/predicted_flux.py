@@ -58,14 +58,14 @@ class PredictedFlux:
             now, receivers = self._plant.now(), self._plant.design.receivers
             if receivers and now - self._made_at >= EVERY:
                 on = self._viewer.frame().on
-                views = await self._worker(scene_flux, self._scene(now), _LIGHT)
+                views = await self._worker(scene_flux, self.scene(now), _LIGHT)
                 for k, (receiver, view) in enumerate(zip(receivers, views, strict=True), 1):
                     shown = replace(view, heliostats=int((on == k).sum()))
                     self._views[receiver.name] = _from_outside(shown, receiver)
                 self._made_at = now
         return self._views
 
-    def _scene(self, now: float) -> Scene:
+    def scene(self, now: float) -> Scene:
         """Return the field as it stands: the mirrors on a receiver shine, the others cast shadows.
 
         The irradiance is measured where there is a sensor.
