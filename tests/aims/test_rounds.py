@@ -22,13 +22,13 @@ NONE, ALL = np.full((COUNT, 3), np.nan), np.ones(COUNT, dtype=np.bool_)
 def given(limit: float, aims: FloatArray, **changes: object) -> Round:
     spread = np.broadcast_to(PLATE.center, (COUNT, 3)).copy()
     demand = Demand(FluxLimit(limit), 0.95)
-    shining = np.isfinite(aims).all(axis=1)
+    shining = np.asarray(np.isfinite(aims).all(axis=1))
     made = Round(SCENE, demand, 0.0, aims, ALL, shining, NONE, spread, 1000, 4)
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
 def true_flux(aims: FloatArray, scene: Scene = SCENE) -> FloatArray:
-    some = np.isfinite(aims).all(axis=1)
+    some = np.asarray(np.isfinite(aims).all(axis=1))
     places = np.where(some[:, None], aims, PLATE.center)
     return FieldFlux(replace(scene, mirrors=scene.mirrors.toward(SUN, places), dark=~some)).maps[0]
 

@@ -360,6 +360,7 @@ def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
     if _last:
         before_at, lit, before = _last[0]
         same = len(lit) == len(now.free) and _alike(before.engine.scene, scene)
+        same = same and before.choice.power > 0.0
         # Images of mirrors that were dark are empty.
         if same and 0.0 <= now.at - before_at < FRESH and not (now.free & ~lit).any():
             at, start = before_at, before

@@ -19,9 +19,11 @@ import numpy.typing as npt
 from heliotrope.aims import Demand, SharedErrors
 from heliotrope.aims.rounds import Answer, Move, Round, next_round
 from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
+from heliotrope.optics.scene import Scene
 from heliotrope.optics.surfaces import surface_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.automatic import AutomaticControl
@@ -32,6 +34,10 @@ from heliotrope.safety import alarms
 
 #: A beam that is not heard may be where it was for this time, s.
 HOLD = 120.0
+#: Most of a heliostat's own error that counts, rad of the beam per axis. Beyond it the flux is no
+#: longer of first order: the beam is elsewhere, as sharp as ever, and the greatest flux is that of
+#: beams that hit their aims. The blur of a larger error would hide that.
+BLUR = 5e-4
 #: Longest wait for a move to end, and wait after it until beams are at rest, s.
 MOVED, SETTLED = 60.0, 4.0
 #: Time for which a heliostat whose beam may not go to its new aim keeps its old one, s.
@@ -284,23 +290,39 @@ class Aiming:
         fixed = np.where((on & ~free)[:, None], plant.aims, np.nan)
         fixed = np.where(comes[:, None] & np.isfinite(allotted), allotted, fixed)
         free &= ~comes
-        scene = self._flux.scene(now)
-        scene = replace(
-            scene,
-            surfaces=(surface_of(plant.design.receivers[0]),),
-            dni=max(scene.dni, settings.dni),
+        spread = np.stack([*plant.default_aims().values()])
+        most = max(1, round(settings.moves / 60.0 * min(now - self._round_at, 60.0)))
+        return Round(
+            self._scene(now),
+            self._demand(settings.limit),
+            now,
+            np.where(free[:, None] | ~np.isfinite(fixed), aims, np.nan),
+            free,
+            on & free,
+            fixed,
+            spread,
+            most,
+            settings.together,
         )
+
+    def _scene(self, now: float) -> Scene:
+        """Return the field with its receiver, in the light for which the limit must hold."""
+        scene, receiver = self._flux.scene(now), self._plant.design.receivers[0]
+        pointing = scene.mirrors.pointing
+        size = np.sqrt(0.5 * np.trace(pointing, axis1=1, axis2=2))
+        less = np.minimum(1.0, BLUR / np.maximum(size, 1e-9)) ** 2
+        mirrors = replace(scene.mirrors, pointing=pointing * less[:, None, None])
+        dni = max(scene.dni, self._settings.dni)
+        return replace(scene, surfaces=(surface_of(receiver),), mirrors=mirrors, dni=dni)
+
+    def _demand(self, limit: FluxLimit) -> Demand:
+        """Return the limit, and with which certainty it must hold."""
+        plant, settings = self._plant, self._settings
         clusters = np.unique(plant.field.cluster, return_inverse=True)[1]
         latitude = math.radians(plant.design.site.latitude_deg)
         shared = SharedErrors(settings.drift, settings.clock, settings.cluster)
         pole = np.array([0.0, math.cos(latitude), math.sin(latitude)])
-        demand = Demand(settings.limit, settings.probability, shared, clusters, pole)
-        spread = np.stack([*plant.default_aims().values()])
-        most = max(1, round(settings.moves / 60.0 * min(now - self._round_at, 60.0)))
-        return Round(
-            scene, demand, now, np.where(free[:, None] | ~np.isfinite(fixed), aims, np.nan), free,
-            on & free, fixed, spread, most, settings.together,
-        )  # fmt: skip
+        return Demand(limit, settings.probability, shared, clusters, pole)
 
     # -- moves -----------------------------------------------------------------------------
 
@@ -313,7 +335,7 @@ class Aiming:
                 return
             on = self._on(self._plant.now())[move.rows]
             free = self._movers(self._plant.now())[move.rows]
-            rests = ~np.isfinite(move.aims).all(axis=1)
+            rests = np.asarray(~np.isfinite(move.aims).all(axis=1))
             for row in move.rows[rests]:
                 aims.pop(names[row], None)
             if not await self._rest(move.rows[rests & on & free]):
