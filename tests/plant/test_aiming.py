@@ -107,21 +107,19 @@ def test_the_true_flux_holds_the_limit_which_the_middle_passes() -> None:
     played(scene)
 
 
-def test_a_lost_cluster_leaves_its_room_to_others_and_a_person_s_beam_stays() -> None:
+def test_a_heliostat_that_leaves_makes_room_and_a_person_s_beam_stays() -> None:
     async def scene(made: LivePlant) -> None:
         await up(made)
         plant, operations = made.plant, made.operations
-        lost = np.array([plant.field.place(n) for n in made.names[: COUNT // 2]])
-        made.field.cut(np.arange(COUNT // 2))
-        # They may shine where they were until they have been silent for long.
-        assert await greatest(made, aiming.HOLD + 25.0, 10.0) <= LIMIT
-        aims = operations.automatic.aims
-        assert not {plant.field.names[row] for row in lost} & set(aims)
-        assert len(aims) == COUNT - COUNT // 2
-        # A person's aim stays although the optimiser would choose another.
-        automatic = operations.automatic
-        automatic.give_way()
+        lost = made.names[0]
         person = Person("Operator", Role.OPERATOR)
+        operations.stow(person, (lost,))
+        assert await greatest(made, 40.0, 4.0) <= LIMIT
+        aims = operations.automatic.aims
+        assert lost not in aims
+        assert len(aims) == COUNT - 1
+        # A person's aim stays although the optimiser would choose another.
+        operations.automatic.give_way()
         token = plant.take_authority(person).token
         name = sorted(aims)[0]
         point = plant.design.receivers[0].center + np.array([0.0, 0.0, 0.9])
@@ -138,7 +136,9 @@ def test_a_limit_that_no_aims_hold_keeps_the_field_at_standby_with_an_alarm() ->
         assert await greatest(made, 60.0, 10.0) == 0.0
         view = made.operations.aims()
         assert (view.aimed, view.resting) == (0, COUNT)
-        made.operations.automatic.aims.clear()
+        (alarm,) = [a for a in made.operations.logbook.alarms() if a.condition == "aims"]
+        assert alarm.active
+        assert "allows not even one beam" in alarm.text
 
     played(scene, 100.0)
 

@@ -198,9 +198,13 @@ class Aiming:
 
     async def _step(self, now: float) -> None:
         """Compute aims, and give them; a failure leaves the last good ones."""
+        given = self._round(now)
+        if not given.free.any():
+            self._good_at = now  # none may be moved, so no aims are late
+            return
         try:
             answer = await asyncio.wait_for(
-                self._worker(next_round, self._round(now)), self._settings.deadline
+                self._worker(next_round, given), self._settings.deadline
             )
         except TimeoutError:
             await self._failed(f"no answer within {self._settings.deadline:g} s")
@@ -209,7 +213,14 @@ class Aiming:
         except Exception as error:  # noqa: BLE001 - the plant goes on whatever fails here
             await self._failed(f"{type(error).__name__}: {error}")
         else:
-            self._round_at = self._good_at = now
+            self._round_at = now
+            if answer.planned <= 0.0 and self._movers(now).any():
+                least = 1e-3 * float(answer.limit.min())
+                await self._failed(
+                    f"the limit, {least:.4g} kW/m² less the margin, allows not even one beam"
+                )
+                return
+            self._good_at = now
             self._take(answer)
             await self._go(answer.moves)
 
