@@ -9,35 +9,14 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 import heliotrope as ht
 from heliotrope.aims import Demand, FluxLimit, SceneAims, SharedErrors, aim_scene, read_limit
-from heliotrope.aims.candidates import candidates, middles
+from heliotrope.aims.candidates import candidates
 from heliotrope.aims.optimiser import bound, optimise
 from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.geometry import bisector, normalize, reflect
+from heliotrope.geometry import normalize, reflect
 from heliotrope.optics.receiver_flux import FieldFlux
-from heliotrope.optics.scene import Mirrors, Scene
-from heliotrope.optics.surfaces import Cylinder, Plate, Surface
-
-UP, NORTH = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
-SUN = normalize(np.array([0.2, -0.5, 0.8]))
-MIDDLE = np.array([0.0, 0.0, 80.0])
-CYLINDER = Cylinder("receiver", MIDDLE, UP, NORTH, 3.0, 6.0, shape=(18, 28))
-PLATE = Plate("plate", MIDDLE, np.array([-1.0, 0.0, 0.0]), UP, 6.0, 6.0, (18, 18))
-
-
-def field(count: int, surface: Surface = CYLINDER, error: float = 0.0) -> Scene:
-    k = np.arange(count) + 0.5
-    turn, radius = k * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(150.0 / np.pi * k + 60.0**2)
-    north = np.abs(np.cos(turn)) if surface is PLATE else np.cos(turn)
-    place = np.stack([radius * np.sin(turn), radius * north, 0.0 * k], axis=-1)
-    mirrors = Mirrors.of(
-        place, bisector(SUN, normalize(MIDDLE - place)), (6.0, 5.0), MIDDLE,
-        pointing=error**2 * np.eye(2),
-    )  # fmt: skip
-    return Scene(SUN, 900.0, mirrors, (surface,))
-
-
-def in_the_middle(scene: Scene) -> Scene:
-    return replace(scene, mirrors=scene.mirrors.toward(scene.sun, middles(scene)))
+from heliotrope.optics.scene import Scene
+from heliotrope.optics.surfaces import Surface
+from support.aimed_field import CYLINDER, PLATE, SUN, field, in_the_middle
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +189,7 @@ def test_the_clock_s_error_is_that_of_a_sun_that_moved() -> None:
     turned = reflect(np.broadcast_to(SUN, m.normal.shape), normalize(ray + assumed))
     right = normalize(np.stack([ray[:, 1], -ray[:, 0], 0.0 * ray[:, 0]], axis=-1))
     true = np.stack(
-        [np.sum(turned * right, -1), turned @ UP * 0 + np.sum(turned * np.cross(right, ray), -1)],
+        [np.sum(turned * right, -1), np.sum(turned * np.cross(right, ray), -1)],
         -1,
     )
     assert np.abs(modes[:, 2] - true).max() < 0.02 * np.abs(true).max()

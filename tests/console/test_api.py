@@ -35,7 +35,7 @@ NEEDED = {
     ("GET", "health"): "",
     ("POST", "session"): "",
     **{("GET", path): "viewer" for path in (
-        "alarms", "authority", "calibration", "clusters", "commands", "commands/{identity}",
+        "aims", "alarms", "authority", "calibration", "clusters", "commands", "commands/{identity}",
         "emergency", "events", "field", "flights", "heliostats/{name}", "holds", "learning",
         "packets", "heliostats/{name}/parameters", "receivers/{name}/flux", "retries", "schedule",
         "session",

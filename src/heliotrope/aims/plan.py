@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.aims.errors import SharedErrors
-from heliotrope.aims.limit import FluxLimit
 from heliotrope.aims.optimiser import Step
 from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene
 from heliotrope.aims.strategies import STRATEGIES, Strategy
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.field.plant import Plant
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray

@@ -15,10 +15,10 @@ import numpy.typing as npt
 
 from heliotrope.aims.candidates import Candidates, candidates, middles, surface_in
 from heliotrope.aims.errors import Risk, SharedErrors, assess, gains
-from heliotrope.aims.limit import FluxLimit
 from heliotrope.aims.optimiser import Choice, Step, optimise
 from heliotrope.aims.strategies import Strategy, choose
 from heliotrope.errors import InputError
+from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import Scene

@@ -269,6 +269,36 @@ def status(context: typer.Context, as_json: Json = False) -> None:
 
 
 @app.command()
+def aims(context: typer.Context, as_json: Json = False) -> None:
+    """Print how aims are chosen, and how far the flux is from its limit."""
+    with _client(context) as client:
+        answer = client.get("aims")
+    if as_json:
+        print_json(answer)
+        return
+    if answer["strategy"] != "limit":
+        print("aims of the plant file; it has no flux limit")
+        return
+    if answer["problem"]:
+        print(answer["problem"])
+    print(f"aims by {answer['source'] or 'nobody yet'}")
+    if answer["peak"] is not None:
+        print(
+            f"limit {1e-3 * answer['limit']:.4g} kW/m², flux with its errors up to "
+            f"{1e-3 * answer['peak']:.4g} kW/m², {100 * answer['reserve']:.1f} % left, "
+            f"{answer['binding']} cells at the limit"
+        )
+        print(f"{1e-3 * answer['power']:.5g} kW of {1e-3 * answer['planned']:.5g} kW")
+    print(
+        f"{answer['aimed']} heliostats have an aim, {answer['resting']} rest for the limit, "
+        f"{answer['left']} still have to move"
+    )
+    if answer["moved"]:
+        names = answer["moved"]
+        print(f"{len(names)} moved {answer['moved_ago']:.0f} s ago: {', '.join(names[:10])}")
+
+
+@app.command()
 def show(
     context: typer.Context,
     what: Annotated[

@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.approval import ApprovalSettings
 from heliotrope.field.camera import Camera, check_unfolded
 from heliotrope.field.coded_visits import JointSettings, ReceiverSettings
@@ -66,6 +67,8 @@ class Plant(Value, Framed):
         Entries of the safety table that this plant overrides; see `safety.limits`.
     approval
         Changes by an operator or engineer that need a second approval.
+    aims
+        How the heliostats' aims on the receiver are chosen.
     """
 
     name: str
@@ -82,6 +85,7 @@ class Plant(Value, Framed):
     timetable: tuple[TimetableEntry, ...] = ()
     safety: Limits = field(default_factory=dict)
     approval: ApprovalSettings = field(default_factory=ApprovalSettings)
+    aims: AimSettings = field(default_factory=AimSettings)
 
     def __post_init__(self) -> None:
         check_site(self.site)
@@ -101,6 +105,11 @@ class Plant(Value, Framed):
             # Both must be known: the camera's place, and a face that it can see.
             _ = self.receiver(self.receiver_visits.receiver).face
             _ = self.camera(self.receiver_visits.camera).pose
+        if self.aims.limit is not None and len(self.receivers) != 1:
+            raise InputError(
+                f'aims: strategy "limit" needs one receiver, and the plant has '
+                f"{len(self.receivers)}; leave [aims] out"
+            )
         if self.timetable:
             check_timetable(self.timetable, self.names, (t.name for t in self.targets))
 

@@ -284,6 +284,27 @@ TILT_SENSOR_SILENT = AlarmKind(
     "the plant file.",
     over="{subject}: its tilt sensor gives readings",
 )
+AIMS = AlarmKind(
+    "aims",
+    _PLANT,
+    Severity.ALARM,
+    "No aims were found that hold the flux limit, or none came within deadline_s.",
+    "aims under the flux limit: {problem}",
+    "The last good aims stay; after five times deadline_s the field goes to the safe spread.",
+    "If beams stay where a person has aimed them, give them back with Automatic; else defocus some "
+    "heliostats, and correct [aims] in the plant file.",
+    over="aims hold the flux limit again",
+)
+FLUX_ABOVE_LIMIT = AlarmKind(
+    "flux_above_limit",
+    _PLANT,
+    Severity.ALARM,
+    "The predicted flux with its errors is above the flux limit of the plant file.",
+    "receiver {subject}: the predicted flux is up to {excess:.1f} % above its limit",
+    "The heliostats that heat this spot go to standby, and come back at other aims.",
+    "If it stays, defocus the heliostats that a person has aimed there.",
+    over="receiver {subject}: the predicted flux is within its limit",
+)
 RECORDS = AlarmKind(
     "records",
     _PLANT,

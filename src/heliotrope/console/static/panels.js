@@ -18,12 +18,12 @@ const SENSORS = { dni: [word("Direct sunlight"), "W/m²", 1, 0], receiver_flux_n
 
 export function plant(box) {
   const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), measured = h("div"), sensors = h("div");
-  const { receivers } = store.field, figures = h("div");
+  const { receivers } = store.field, figures = h("div"), limit = h("div");
   let [name] = receivers;
   const unsure = h("input", { type: "checkbox", onchange: () => draw() });
   const choice = h("select", { ariaLabel: t("Receiver"), onchange: () => { name = choice.value; predict(); } }, receivers.map((one) => h("option", { value: one }, one)));
   box.append(h("h3", {}, t("Heliostats")), states, proof, h("h3", {}, t("Sun")), light, sensors,
-    ...(name ? [h("h3", {}, t("Predicted flux on the receiver")), receivers.length > 1 ? choice : "", figures, flux, h("label", { title: t("By the errors of the calibrations; sunlight, reflectivity and soiling come on top.") }, unsure, " ", t("Standard deviation")), measured,
+    ...(name ? [h("h3", {}, t("Predicted flux on the receiver")), receivers.length > 1 ? choice : "", figures, flux, h("label", { title: t("By the errors of the calibrations; sunlight, reflectivity and soiling come on top.") }, unsure, " ", t("Standard deviation")), measured, limit,
       canCommand() ? h("p", { className: "hx-hint" }, t("Click on the picture to aim the heliostats of the scope at that point.")) : ""] : []));
   let seen = null;
   const show = () => {
@@ -68,6 +68,7 @@ export function plant(box) {
     figures.replaceChildren(facts([[t("Power"), `${within(seen.power, seen.power_sigma, 1e6, 2)} MW`],
       [t("Intercept"), seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],
       [t("Peak"), `${within(seen.peak, seen.peak_sigma, 1e3, 0)} kW/m²`], [t("Heliostats on it"), count(seen.heliostats)]]));
+    limit.replaceChildren(...aimsView(await api("GET", "aims")));
     draw();
   };
   if (name) off.push(refreshed(predict, { every: 10 }));
@@ -77,6 +78,20 @@ export function plant(box) {
   };
   show();
   return () => off.forEach((end) => end());
+}
+
+// The flux limit, and how aims hold it; nothing where aims are spread.
+function aimsView(aims) {
+  if (aims.strategy !== "limit") return [];
+  const share = (value) => value === null ? "–" : `${number(100 * value, 1)} %`, kilowatts = (value) => value === null ? "–" : number(value / 1e3, 0);
+  const sources = { optimiser: t("optimiser"), "last good aims": t("last good aims"), "safe spread": t("safe spread") };
+  return [h("h3", {}, t("Flux limit")), ...(aims.problem ? [h("p", { className: "hx-said bad" }, aims.problem)] : []), facts([
+    [t("Aims by"), sources[aims.source] ?? t("none yet")],
+    [t("Limit, and flux with its errors"), `${kilowatts(aims.limit)}, ${kilowatts(aims.peak)} kW/m²`],
+    [t("Left of the limit"), share(aims.reserve)], [t("Cells at the limit"), count(aims.binding)],
+    [t("Power, and of the best aims"), `${kilowatts(aims.power)}, ${kilowatts(aims.planned)} kW`],
+    [t("With an aim, at rest for the limit, still to move"), `${count(aims.aimed)}, ${count(aims.resting)}, ${count(aims.left)}`],
+    [t("Moved last"), aims.moved.length ? t("{n}, {ago} ago: {names}", { n: count(aims.moved.length), ago: span(aims.moved_ago), names: aims.moved.slice(0, 5).join(", ") }) : t("none")]])];
 }
 
 export function heliostat(box) {

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema, create_model
 
+from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.approval import ApprovalSettings
 from heliotrope.field.coded_visits import CodedSettings, JointSettings, ReceiverSettings
 from heliotrope.safety import CONDITIONS
@@ -414,6 +415,46 @@ class ApprovalTable(StrictTable):
     )
 
 
+class AimsTable(StrictTable):
+    """``[aims]``: how the heliostats' aims on the receiver are chosen."""
+
+    strategy: Literal["spread", "limit"] = Field(
+        "spread",
+        description="spread: aim_m of the heliostats, or the receiver's middle. limit: most power "
+        "under a flux limit.",
+    )
+    limit_kw_m2: Positive | None = Field(None, description="Allowable flux of all cells.")
+    limit_map: str = Field(
+        "",
+        description="Allowable flux of each cell, W/m²: a file of numbers (CSV) beside this one, "
+        "highest row first.",
+    )
+    margin: Number = Field(0.05, description="Share kept for the model's own error; 0 to 0.5.")
+    probability: Number = Field(
+        AimSettings.probability, description="That the limit holds everywhere; 0.5 to 0.9999."
+    )
+    drift_mrad: Number = Field(0.0, description="Error that all normals share; 0 to 50.")
+    clock_s: Number = Field(0.0, description="Error of the field's clock; 0 to 600.")
+    cluster_mrad: Number = Field(0.0, description="Error that a cluster's normals share; 0 to 50.")
+    dni_w_m2: Number = Field(
+        AimSettings.dni, description="The limit holds at this irradiance at least; 1 to 1500."
+    )
+    moves_per_minute: Number = Field(
+        AimSettings.moves, description="Tracking heliostats that get another aim; 1 to 6000."
+    )
+    together: int = Field(
+        AimSettings.together, description="Heliostats that move at once; 1 to 1000."
+    )
+    every_s: Number = Field(
+        AimSettings.every, description="Time between two computations; 5 to 600."
+    )
+    deadline_s: Number = Field(
+        AimSettings.deadline,
+        description="Age of the last good aims at which an alarm is raised; after five times that "
+        "the field goes to the safe spread. Twice every_s to 3600.",
+    )
+
+
 class PlantDocument(StrictTable):
     """The whole file."""
 
@@ -453,3 +494,4 @@ class PlantDocument(StrictTable):
     approval: ApprovalTable | None = Field(
         None, description="Without: no change needs a second person."
     )
+    aims: AimsTable | None = Field(None, description="Without: strategy spread.")

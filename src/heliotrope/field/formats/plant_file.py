@@ -15,6 +15,7 @@ import numpy as np
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.approval import ApprovalSettings
+from heliotrope.field.formats._plant_aims import aims_document, build_aims
 from heliotrope.field.formats._plant_cameras import (
     build_camera,
     build_mark,
@@ -101,6 +102,7 @@ def _models() -> list[Any]:
         models.JointVisitsTable,
         models.TimetableTable,
         models.ApprovalTable,
+        models.AimsTable,
     ]
 
 
@@ -131,6 +133,7 @@ def _assemble(
     receiver = _built(path, "receiver_visits", settings, build_receiver, problems)
     timetable = _all_built(path, "timetable", document.timetable, _timetable_entry, problems)
     approval = _built(path, "approval", document.approval, _approval, problems)
+    aims = _built(path, "aims", document.aims, lambda t: build_aims(t, path.parent), problems)
     _built(
         path,
         "safety",
@@ -138,7 +141,7 @@ def _assemble(
         lambda settings: limited(CONDITIONS, settings or {}),
         problems,
     )
-    if problems or approval is None:
+    if problems or approval is None or aims is None:
         return None
     try:
         return Plant(
@@ -155,6 +158,7 @@ def _assemble(
             timetable=timetable,
             safety=document.safety,
             approval=approval,
+            aims=aims,
         )
     except InputError as error:
         problems.append(FormatError(path, str(error)))
@@ -335,6 +339,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         **coded_document(plant.joint_visits, plant.receiver_visits),
         **({"timetable": [e.document for e in plant.timetable]} if plant.timetable else {}),
         **({"approval": approval} if (approval := plant.approval.document) else {}),
+        **aims_document(plant.aims, place),
         **({"safety": {k: dict(v) for k, v in plant.safety.items()}} if plant.safety else {}),
         "groups": groups,
     }

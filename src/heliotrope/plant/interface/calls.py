@@ -28,6 +28,7 @@ from heliotrope.plant.interface.overview import overview
 from heliotrope.plant.interface.tickets import TicketState
 from heliotrope.plant.operations import bus_frames as bus
 from heliotrope.plant.operations import views
+from heliotrope.plant.operations.aiming import AimsView
 from heliotrope.plant.operations.approvals import WaitingChange
 from heliotrope.plant.operations.marking import MarksView, PictureToMark
 from heliotrope.plant.operations.report import ShiftReport
@@ -186,6 +187,16 @@ def sun(desk: Desk) -> views.SunView:
 async def flux(desk: Desk, order: orders.Named) -> views.PredictedView:
     """Return the predicted flux on a receiver, with its uncertainty."""
     return await desk.operations.receiver_flux(order.name)
+
+
+@_call("GET aims", "plant", fresh=FRESH)
+def aims(desk: Desk) -> AimsView:
+    """Return how aims are chosen, and how far the flux is from its limit.
+
+    `reserve`: least share of the limit that is left in any cell; `gap`: share of the power that
+    still better aims could add at most; `moved`: heliostats that moved last.
+    """
+    return desk.operations.aims()
 
 
 @_call("GET field", "field", fresh=ALWAYS)

@@ -39,6 +39,7 @@ from heliotrope.plant.operations.service import Service
 from heliotrope.plant.operations.timetable import Timetable
 from heliotrope.plant.operations.views import CalibrationView, Running
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
+from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.safety import alarms
 from heliotrope.store.records import Kind, PlannedVisit, Records
@@ -506,6 +507,35 @@ class AutomaticControl:
     def _end_visits(self, why: str) -> None:
         """Refuse all further commands of visits under way: their beams are taken off."""
         self._plant.authority.end_mandates(AUTOMATIC, why)
+
+    # -- aims ------------------------------------------------------------------------------
+
+    @property
+    def aims(self) -> dict[str, FloatArray]:
+        """Aims on the receiver; see `Raising.aims`."""
+        return self._raising.aims
+
+    @property
+    def idle(self) -> str:
+        """Why nothing is moved now, empty if heliostats may be moved."""
+        return self._why_idle() or ""
+
+    def movable(self) -> npt.NDArray[np.bool_]:
+        """Return a mask of the wanted heliostats that it does not leave where they are, (N,)."""
+        return np.asarray(self._raising.wanted & ~self._left_alone())
+
+    @property
+    def visiting(self) -> frozenset[str]:
+        """The heliostats in visits."""
+        return self._visiting()
+
+    def move(self, points: Mapping[str, FloatArray]) -> Ticket:
+        """Aim tracking heliostats at other points, ENU, m, (3,); see `PlantController.aim`."""
+        return self._plant.aim(AUTOMATIC, self._token, points)
+
+    def rest(self, heliostats: Sequence[str]) -> Ticket:
+        """Send heliostats to standby; they stay wanted."""
+        return self._plant.command(AUTOMATIC, self._token, "IDLE", heliostats)
 
     # -- views -----------------------------------------------------------------------------
 

@@ -31,6 +31,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import ORDERED, EmergencyOrder
 from heliotrope.plant.field.lockouts import TOWER
+from heliotrope.plant.operations.aiming import Aiming, AimsView
 from heliotrope.plant.operations.approvals import Approvals
 from heliotrope.plant.operations.automatic import AUTOMATIC, AutomaticControl
 from heliotrope.plant.operations.errands import Errands
@@ -165,6 +166,7 @@ class Operations:
         self._records = records
         self._flux = PredictedFlux(plant, self.viewer, automatic.book, automatic.installed, worker)
         self.flux_check = FluxCheck(plant, self._flux, logbook)
+        self._aiming = Aiming(plant, logbook, automatic, self._flux, worker)
         self._closing, self.begun = asyncio.Event(), asyncio.Event()
 
     # -- running ---------------------------------------------------------------------------
@@ -176,7 +178,10 @@ class Operations:
         self.begun.set()
         async with asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
-            parts = (self._look(), self._follow(), self._compare(), self._history.run())
+            parts = (
+                self._look(), self._follow(), self._compare(), self._history.run(),
+                self._aiming.run(),
+            )  # fmt: skip
             beside = [group.create_task(part) for part in parts]
             await self._closing.wait()
             self.automatic.stop()
@@ -374,6 +379,10 @@ class Operations:
         receiver = self.plant.design.receiver(name or self.receivers[0])
         view = (await self._flux.everywhere())[receiver.name]
         return replace(view, measured=self.flux_check.measured(receiver.name))
+
+    def aims(self) -> AimsView:
+        """Return how aims are chosen, and how far the flux is from its limit."""
+        return self._aiming.view()
 
     # -- calibration -----------------------------------------------------------------------
 
@@ -638,8 +647,9 @@ class Operations:
         return ticket
 
     def aim(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Aim heliostats at points; see `PlantController.aim`."""
+        """Aim heliostats at points, where they stay; see `PlantController.aim`."""
         ticket = self.plant.aim(person, token, points)
+        self._aiming.by_person(ticket.heliostats, aimed=True)
         self._told(person, ticket)
         return ticket
 
@@ -660,8 +670,8 @@ class Operations:
         heliostats
             Names; () for all.
         where
-            Receiver or target: for the first receiver the aims of the design, for others the
-            centre.
+            Receiver or target: for the first receiver the aims of the design, or those under the
+            flux limit; for others the centre.
         place
             Point on the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
 
@@ -679,7 +689,7 @@ class Operations:
                 raise InputError(f"aim: right and up are of a receiver, and {where!r} is none")
             points = dict.fromkeys(names, self.plant.design.receiver(where).point(*place))
         elif where in self.receivers[:1]:
-            points = self.plant.default_aims(names)
+            points = self._aiming.points(names)
         elif where in self.receivers:
             points = dict.fromkeys(names, self.plant.design.receiver(where).center)
         elif where in self.targets:
@@ -687,7 +697,10 @@ class Operations:
             points = dict.fromkeys(names, center)
         else:
             raise UnknownNameError("receiver or target", where, self.receivers + self.targets)
-        return self.aim(person, token, points)
+        ticket = self.aim(person, token, points)
+        if place is None and where in self.receivers[:1]:
+            self._aiming.by_person(ticket.heliostats, aimed=False)
+        return ticket
 
     def standby(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Set standby points; see `PlantController.standby`."""
@@ -767,6 +780,7 @@ class Operations:
         _operator(person, "give back")
         names = tuple(dict.fromkeys(heliostats)) or self.names
         self.automatic.want(names, wanted=True)
+        self._aiming.by_person(names, aimed=False)
         self._tell(person, f"{len(names)} heliostats given to automatic control", "command", names)
         progress = partial(self.automatic.following, self.plant.now())
         return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)

@@ -66,6 +66,9 @@ class Raising:
 
     Attributes
     ----------
+    aims
+        Aims on the receiver, ENU, m, (3,), by name: a heliostat without one stays at standby. Under
+        a flux limit they are `Aiming`'s.
     wanted
         Which heliostats automatic control may move, (N,).
     left
@@ -100,13 +103,18 @@ class Raising:
         self._blocked: dict[str, str] = {}
         self.attempts = Attempts(RAISING, log.take_alarm)
         self._joins: list[Ticket] = []  # some of their heliostats still wait for their turn
-        self._aims = plant.default_aims() if plant.design.receivers else {}
+        limited = plant.design.aims.limit is not None
+        designed = plant.default_aims() if plant.design.receivers else {}
+        self.aims: dict[str, FloatArray] = {} if limited else dict(designed)
         #: Middle, ENU, m, and radius of each target, m.
         self._targets = [
             (np.mean(each.corners, axis=0), 0.5 * math.hypot(each.width, each.height))
             for each in plant.design.targets
         ]
-        self._clear = self._clear_of_targets(clearance)
+        # Under a flux limit an aim may be anywhere on the receiver.
+        reach = plant.design.receivers[0] if limited else None
+        room = 0.0 if reach is None else math.hypot(reach.width, reach.height)
+        self._clear = self._clear_of_targets(clearance, designed, room)
 
     def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
         """Give heliostats to automatic control, or take them out of it.
@@ -162,7 +170,9 @@ class Raising:
     def _known(self) -> Mask:
         """Return a mask of the heliostats known well enough to go to the receiver, (N,)."""
         calibrated = [self._plant.beliefs.record(name) is not None for name in self._names]
-        return (self._clear | np.array(calibrated, dtype=np.bool_)) & bool(self._aims)
+        aimed = [name in self.aims for name in self._names]
+        known: Mask = (self._clear | np.array(calibrated, dtype=np.bool_)) & aimed
+        return known
 
     def _asked(self, command: str, rows: Rows) -> Asked:
         """Return a command to the heliostats of some rows (K,), as guards are asked about it.
@@ -170,7 +180,7 @@ class Raising:
         Whether their paths are free is shown by the command.
         """
         names = tuple(self._names[row] for row in rows)
-        aims = [self._aims[name] for name in names] if command == "TRACK" else []
+        aims = [self.aims[name] for name in names] if command == "TRACK" else []
         return Asked(command, names, np.stack(aims) if aims else None)
 
     def _first(self, command: str, rows: Rows) -> Rows:
@@ -199,16 +209,21 @@ class Raising:
         """Allow a new command to a heliostat at once: its visit to a target has ended."""
         self._busy_until[self._plant.field.place(heliostat)] = -math.inf
 
-    def _clear_of_targets(self, clearance: float) -> Mask:
-        """Return a mask of the uncalibrated beams that miss all targets on the path up, (N,)."""
-        plant, aims = self._plant, self._aims
+    def _clear_of_targets(
+        self, clearance: float, aims: Mapping[str, FloatArray], about: float
+    ) -> Mask:
+        """Return a mask of the uncalibrated beams that miss all targets on the path up, (N,).
+
+        ``about``: how far from these aims they may be sent, m.
+        """
+        plant = self._plant
         if not aims:
             return np.zeros(len(plant.field), dtype=np.bool_)
         points = np.stack([aims[name] for name in plant.field.names])
         slant = np.linalg.norm(points - plant.beams.armature.origin_1, axis=-1)
         room = np.full(len(points), math.inf)
         for middle, reach in self._targets:
-            room = np.minimum(room, np.linalg.norm(points - middle, axis=-1) - reach)
+            room = np.minimum(room, np.linalg.norm(points - middle, axis=-1) - reach - about)
         # The beam is off by twice as much as the normal; that error is two-dimensional.
         return np.asarray(math.sqrt(2.0) * clearance * slant < room)
 
@@ -300,7 +315,7 @@ class Raising:
 
     async def _join(self, rows: Rows, token: int, visiting: Callable[[], frozenset[str]]) -> None:
         """Give heliostats their aims on the receiver, and send them there."""
-        plant, aims = self._plant, self._aims
+        plant, aims = self._plant, dict(self.aims)
         given = self._give(
             rows,
             states.IDLE,
@@ -312,7 +327,11 @@ class Raising:
         await ticket.end(10.0)
         # Meanwhile a visit may have begun, whose aim must stay, or a person may have stowed one.
         away, place = visiting() | ticket.refusals.keys(), plant.field.place
-        done = tuple(name for name in names if name not in away and self.wanted[place(name)])
+        done = tuple(
+            name
+            for name in names
+            if name not in away and self.wanted[place(name)] and self.aims.get(name) is aims[name]
+        )
         if done:
             self._joins.append(plant.command(self._person, token, "TRACK", done))
 

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.files import write_text
 from heliotrope.files.text import read_text
 from heliotrope.geometry import FloatArray, as_float
 
@@ -111,3 +112,9 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
                 where=f"line {number}",
             )  # fmt: skip
     return FluxLimit(np.array(rows[::-1]), margin)
+
+
+def write_limit(path: str | Path, limit: FluxLimit) -> None:
+    """Write a limit's map as `read_limit` reads it; the margin is not written."""
+    flux = np.atleast_2d(as_float(limit.flux))[::-1]
+    write_text(path, "".join(",".join(repr(float(x)) for x in row) + "\n" for row in flux))

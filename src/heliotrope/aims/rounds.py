@@ -1,0 +1,419 @@
+"""From the aims that heliostats have to better ones: a few moves at a time, none above the limit.
+
+Heliostats that have an aim count as if they shone, so that any of them may join at any time: fewer
+beams never bring more light to a cell. Each step moves a few heliostats. While they move, each may
+be anywhere on its way, so a step is taken only if the light of all others, with the greatest that
+each moving beam brings to a cell anywhere on its way, stays within what errors leave of the limit;
+a cell that is above it already must not get more. Heliostats that take most light from the fullest
+cells move first. Where no move is possible, some heliostats rest, and come back at other aims.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.aims.candidates import middles, surface_in
+from heliotrope.aims.errors import Risk, assess
+from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.optics.receiver_flux import FieldFlux, Images
+from heliotrope.optics.scene import Scene
+
+#: Aims nearer to each other than this are one, m.
+ALIKE = 0.05
+#: Places on a beam's way at which its image is computed, at most; one for each of its widths.
+PLACES = 9
+#: A new set of aims is gone to if it has more power by this share, or the old one is above.
+BETTER = 5e-3
+#: Excess over the limit that counts as none, and the fullness from which a cell binds.
+HOLDS, BINDS = 3e-3, 0.99
+#: Heliostats whose moves are looked at in one round, at most.
+LOOKED = 400
+#: Share of the field that the safe spread keeps, from one try to the next.
+THINNER = 0.85
+#: Age at which images are computed anew, s.
+FRESH = 600.0
+
+Mask = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.intp]
+#: A mirror's image before a move, the greatest on its way, and after it, (columns, rows).
+Way = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """What is known of H mirrors when aims are computed.
+
+    Attributes
+    ----------
+    scene
+        With one receiver; its aims and what is dark do not count.
+    demand
+        The limit.
+    at
+        Time, s.
+    aims
+        Aims that the mirrors have been given, ENU m, (H, 3); NaN: none.
+    free
+        Mirrors that may be given others, (H,).
+    shining
+        Mirrors whose beams are on the receiver, (H,).
+    fixed
+        Where the beams of others are that stay, as a person has aimed them, ENU m, (H, 3); NaN:
+        none.
+    spread
+        Aims of the plant file, for the safe spread, ENU m, (H, 3).
+    most, together
+        Shining mirrors that may move in this round, and at once.
+    """
+
+    scene: Scene
+    demand: Demand
+    at: float
+    aims: FloatArray
+    free: Mask
+    shining: Mask
+    fixed: FloatArray
+    spread: FloatArray
+    most: int
+    together: int
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """Mirrors that get other aims at once.
+
+    Attributes
+    ----------
+    rows
+        Which, (K,).
+    aims
+        ENU m, (K, 3); NaN: they rest.
+    """
+
+    rows: Rows
+    aims: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a round has found.
+
+    Attributes
+    ----------
+    moves
+        One after the other.
+    safe
+        The safe spread: aims of the plant file for as many mirrors as hold the limit, (H, 3).
+    flux, above, limit
+        Of the beams that shine now, what errors may add, and what is allowed less the margin,
+        W/m², (rows, columns).
+    planned
+        Power of the best aims, W.
+    power
+        Power of the aims that the mirrors have, W.
+    gap
+        Share of the planned power that still better aims could add at most.
+    left
+        Mirrors whose aims are not yet the best ones.
+    """
+
+    moves: tuple[Move, ...]
+    safe: FloatArray
+    flux: FloatArray
+    above: FloatArray
+    limit: FloatArray
+    planned: float
+    power: float
+    gap: float
+    left: int
+
+    @property
+    def excess(self) -> float:
+        """Greatest of the flux with its errors over the limit, less 1."""
+        return float(((self.flux + self.above) / self.limit).max()) - 1.0
+
+    @property
+    def binding(self) -> int:
+        """Number of cells that the limit binds."""
+        return int((self.flux + self.above > BINDS * self.limit).sum())
+
+
+#: The last aims of this process, with the time of their images and the mirrors that these show.
+_last: list[tuple[float, Mask, SceneAims]] = []
+
+
+def next_round(now: Round, **light: Any) -> Answer:
+    """Return the moves that bring the mirrors nearer to the aims of most power.
+
+    Parameters
+    ----------
+    now
+        The mirrors, the limit, and what they may do.
+    **light
+        Arguments of `FieldFlux`.
+
+    Raises
+    ------
+    InputError
+        If no aims hold the limit beside the beams that stay.
+    """
+    rows, columns = surface_in(now.scene).shape
+    limit = now.demand.limit.on(rows, columns)
+    fixed, room = np.zeros_like(limit), limit
+    stays = np.isfinite(now.fixed).all(axis=1)
+    if stays.any():
+        engine = FieldFlux(_posed(now.scene, now.fixed), **light)
+        fixed = engine.maps[0]
+        room = limit - fixed - _risk(engine, now.demand, limit).above
+        if (room <= 0.0).any():
+            raise InputError(
+                f"aims: {int(stays.sum())} beams that stay where they are bring up to "
+                f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of them"
+            )
+    best = _best(now, replace(now.demand, limit=type(now.demand.limit)(room)), light)
+    wanted = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
+    engine = FieldFlux(_posed(now.scene, now.aims), **light)
+    above = _risk(engine, now.demand, room).above
+    power, better = engine.powers[0], best.engine.powers[0]
+    full = ((engine.maps[0] + above) / room).max() > 1.0 + HOLDS
+    moves: tuple[Move, ...] = ()
+    left = 0
+    if full or better > (1.0 + BETTER) * power or not now.free[_given(now.aims)].all():
+        cap = room - np.maximum(above, best.risk.above)
+        moves, left = steps(now, wanted, cap, light)
+    shown = FieldFlux(_posed(now.scene, np.where(now.shining[:, None], now.aims, np.nan)), **light)
+    risk = _risk(shown, now.demand, limit)
+    safe = _safe(now, room, light)
+    return Answer(
+        moves, safe, shown.maps[0] + fixed, risk.above, limit, better, power, best.choice.gap, left
+    )
+
+
+def steps(
+    now: Round, wanted: FloatArray, cap: FloatArray, light: dict[str, Any]
+) -> tuple[tuple[Move, ...], int]:
+    """Return the moves towards wanted aims (H, 3), and how many mirrors remain.
+
+    ``cap`` is what the expected flux may be, W/m², (rows, columns).
+    """
+    given, goes = _given(now.aims), _given(wanted)
+    if not given.any():
+        # None shines: they may have the best aims at once.
+        return ((Move(np.flatnonzero(goes), wanted[goes]),) if goes.any() else ()), 0
+    gone = given & ~now.free
+    path = _Path(now, wanted, light)
+    moves = (
+        [Move(np.flatnonzero(gone), np.full((int(gone.sum()), 3), np.nan))] if gone.any() else []
+    )
+    have = given & now.free
+    differs = have != goes
+    differs |= have & goes & (np.linalg.norm(now.aims - wanted, axis=1) > ALIKE)
+    todo = np.flatnonzero(differs & ~gone)
+    flux, cap = path.flux(have), as_float(np.maximum(cap, 0.0).T)
+    walk = _Walk(path, flux, cap, now)
+    moves += walk.through(todo, wanted)
+    moves += walk.relieved(np.flatnonzero(have & ~np.isin(np.arange(len(have)), walk.done)))
+    return tuple(moves), len(todo) - len(np.intersect1d(todo, walk.done))
+
+
+def _rest(rows: Rows) -> Move:
+    return Move(rows, np.full((len(rows), 3), np.nan))
+
+
+class _Path:
+    """Images of mirrors on their ways from aims that they have to wanted ones."""
+
+    def __init__(self, now: Round, wanted: FloatArray, light: dict[str, Any]) -> None:
+        given, goes = _given(now.aims), _given(wanted)
+        start = np.where(given[:, None], now.aims, wanted)
+        end = np.where(goes[:, None], wanted, start)
+        some = given | goes
+        middle = middles(now.scene)
+        start = np.where(some[:, None], start, middle)
+        end = np.where(some[:, None], end, middle)
+        engine = FieldFlux(_posed(now.scene, np.where(some[:, None], start, np.nan)), **light)
+        width = engine.scene.mirrors.slant * 5e-3
+        far = np.linalg.norm(end - start, axis=1) / np.maximum(width, 1e-6)
+        count = int(np.clip(np.ceil(far.max(initial=0.0)) + 1, 2, PLACES))
+        at = np.linspace(0.0, 1.0, count)[:, None]
+        looks = start[:, None] + at * (end - start)[:, None]
+        self._images: Images = engine.images(as_float(looks), np.zeros(len(some), dtype=np.int64))
+        self.given, self.goes = given, goes
+
+    def flux(self, which: Mask) -> FloatArray:
+        """Return the flux of mirrors at the aims that they have, (columns, rows)."""
+        total = np.zeros(self._images.shape[::-1])
+        for row in np.flatnonzero(which):
+            total += self.image(int(row), 0)
+        return total
+
+    def image(self, row: int, place: int) -> FloatArray:
+        """Return the image of a mirror at a place of its way, W/m², (columns, rows)."""
+        images = self._images
+        rows, wide = images.shape
+        j = row * images.looks + place % images.looks
+        first, columns, bottom, tall = (int(n) for n in images.box[j])
+        out = np.zeros((wide, rows))
+        low, high = max(bottom, 0), min(bottom + tall, rows)
+        if columns <= 0 or high <= low:
+            return out
+        begin = int(images.begin[j])
+        block = images.values[begin : begin + columns * tall].reshape(columns, tall)
+        out[(first + np.arange(columns)) % wide, low:high] = block[:, low - bottom : high - bottom]
+        return out
+
+    def most(self, row: int, *, shines: bool) -> Way:
+        """Return a mirror's image before, the greatest on its way, and after."""
+        before = self.image(row, 0) if self.given[row] else np.zeros(self._images.shape[::-1])
+        after = self.image(row, -1) if self.goes[row] else np.zeros_like(before)
+        greatest = np.maximum(before, after)
+        if shines and self.given[row] and self.goes[row]:
+            for place in range(1, self._images.looks - 1):
+                greatest = np.maximum(greatest, self.image(row, place))
+        return before, greatest, after
+
+
+class _Walk:
+    """Moves one after the other, with the flux after each."""
+
+    def __init__(self, path: _Path, flux: FloatArray, cap: FloatArray, now: Round) -> None:
+        self._path, self._flux, self._cap, self._now = path, flux, cap, now
+        self.done: Rows = np.zeros(0, dtype=np.intp)
+        self._moved = 0
+
+    def through(self, todo: Rows, wanted: FloatArray) -> list[Move]:
+        """Return the moves that are possible; where none is, some mirrors rest."""
+        moves, shining = [], self._now.shining
+        ways = {int(row): self._path.most(row, shines=bool(shining[row])) for row in todo[:LOOKED]}
+        while ways:
+            batch = self._batch(ways)
+            if batch:
+                moves.append(Move(np.array(batch, dtype=np.intp), wanted[batch]))
+            else:
+                batch = self._resting(ways)
+                if not batch:
+                    break
+                moves.append(_rest(np.array(batch, dtype=np.intp)))
+            self._moved += int(shining[batch].sum())
+            self.done = np.union1d(self.done, batch).astype(np.intp)
+            for row in batch:
+                before, _, after = ways.pop(row)
+                rests = not np.isfinite(moves[-1].aims).all()
+                self._flux = self._flux - before + (0.0 if rests else after)
+        return moves
+
+    def _batch(self, ways: dict[int, Way]) -> list[int]:
+        """Return the mirrors that move next: those that relieve the fullest cells come first."""
+        fullness = (self._flux / np.maximum(self._cap, 1.0)) ** 8
+        gain = {row: float(((after - b) * fullness).sum()) for row, (b, _, after) in ways.items()}
+        bound = self._flux.copy()
+        batch: list[int] = []
+        most = np.maximum((1.0 + HOLDS) * self._cap, self._flux) + 1e-3
+        for row in sorted(ways, key=gain.__getitem__):
+            before, greatest, _ = ways[row]
+            if self._now.shining[row] and self._moved + len(batch) >= self._now.most:
+                continue
+            tried = bound - before + greatest
+            if (tried <= most).all():
+                batch.append(row)
+                bound = tried
+            if len(batch) >= self._now.together:
+                break
+        return batch
+
+    def _resting(self, ways: dict[int, Way]) -> list[int]:
+        """Return mirrors that rest, so that others may move, and come back later."""
+        if self._moved >= self._now.most:
+            return []
+        stuck = [row for row in ways if self._path.given[row] and self._path.goes[row]]
+        full = self._flux > BINDS * self._cap
+        stuck.sort(key=lambda row: -float(ways[row][0][full].sum()))
+        return stuck[: min(self._now.together, self._now.most - self._moved)]
+
+    def relieved(self, rows: Rows) -> list[Move]:
+        """Return the mirrors that rest since cells are above the limit: the least that help."""
+        moves: list[Move] = []
+        while len(rows):
+            over = np.maximum(self._flux - (1.0 + HOLDS) * self._cap, 0.0)
+            if not over.any():
+                break
+            share = [float((self._path.image(int(row), 0) * over).sum()) for row in rows]
+            k = int(np.argmax(share))
+            if share[k] <= 0.0:
+                break
+            row = rows[k : k + 1]
+            self._flux = self._flux - self._path.image(int(row[0]), 0)
+            moves.append(_rest(row))
+            self.done = np.union1d(self.done, row).astype(np.intp)
+            rows = np.delete(rows, k)
+        return moves
+
+
+def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
+    """Return the aims of most power, from those of this process before where they fit."""
+    scene = replace(now.scene, dark=~now.free)
+    at, start = now.at, None
+    if _last:
+        before_at, lit, before = _last[0]
+        same = len(lit) == len(now.free) and _alike(before.engine.scene, scene)
+        same = same and before.choice.power > 0.0
+        # Images of mirrors that were dark are empty.
+        if same and 0.0 <= now.at - before_at < FRESH and not (now.free & ~lit).any():
+            at, start = before_at, before
+    found = aim_scene(scene, demand, start=start, **light)
+    _last[:] = [(at, now.free, found)]
+    return found
+
+
+def _alike(one: Scene, other: Scene) -> bool:
+    """Return whether two scenes have the same mirrors and receiver; arrays may be copies."""
+    first, second = surface_in(one), surface_in(other)
+    return bool(
+        first.shape == second.shape
+        and first.name == second.name
+        and np.array_equal(first.cells.center, second.cells.center)
+        and np.allclose(one.mirrors.center, other.mirrors.center, atol=1.0)
+    )
+
+
+def _safe(now: Round, room: FloatArray, light: dict[str, Any]) -> FloatArray:
+    """Return the plant file's aims of as many free mirrors as hold the limit, (H, 3)."""
+    turn = (np.arange(len(now.free)) * 0.6180339887498949) % 1.0
+    share = 1.0
+    while share > 0.5 / len(now.free):
+        aims = np.where((now.free & (turn < share))[:, None], now.spread, np.nan)
+        engine = FieldFlux(_posed(now.scene, aims), **light)
+        over = (engine.maps[0] + _risk(engine, now.demand, room).above) / room
+        most = float(over.max())
+        if most <= 1.0:
+            return as_float(aims)
+        share *= min(THINNER, 1.0 / most)
+    return np.full(now.aims.shape, np.nan)
+
+
+def _risk(engine: FieldFlux, demand: Demand, limit: FloatArray) -> Risk:
+    """Return how far the flux may be off."""
+    mirrors, lit = engine.scene.mirrors, engine.leaving > 0.0
+    if not lit.any() or not (mirrors.pointing.any() or demand.shared.any):
+        return Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
+    groups = np.zeros(len(lit), dtype=np.int64) if demand.groups is None else demand.groups
+    modes = demand.shared.modes(mirrors, engine.scene.sun, demand.pole)
+    surface = surface_in(engine.scene)
+    cell = np.sqrt(surface.cells.area[0])
+    wide = float(np.median(mirrors.slant)) * 5e-3 / float(cell)
+    return assess(engine, modes, groups, demand.probability, limit, wide)
+
+
+def _posed(scene: Scene, aims: FloatArray) -> Scene:
+    """Return the scene with its mirrors at aims (H, 3); those without one are dark."""
+    given = _given(aims)
+    places = np.where(given[:, None], aims, middles(scene))
+    return replace(scene, mirrors=scene.mirrors.toward(scene.sun, places), dark=~given)
+
+
+def _given(aims: FloatArray) -> Mask:
+    return np.asarray(np.isfinite(aims).all(axis=1))

@@ -1,0 +1,400 @@
+"""Aims of a plant under a flux limit: computed beside the loop, given a few heliostats at a time.
+
+Every so many seconds `heliotrope.aims.rounds` finds the aims of most power, and the moves to them
+that pass the limit nowhere. Heliostats get their aims by the same commands as a person's, with the
+same proofs. A heliostat at standby joins the receiver only at the aim that it has here, and one
+without an aim stays there. Beams that a person has aimed, or that automatic control may not move,
+stay and take their share of the limit. Without new aims the last good ones stay, and later the safe
+spread: fewer heliostats at the aims of the plant file.
+"""
+
+import asyncio
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.aims import Demand, SharedErrors
+from heliotrope.aims.rounds import Answer, Move, Round, next_round
+from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.field.flux_limit import FluxLimit
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
+from heliotrope.optics.scene import Scene
+from heliotrope.optics.surfaces import surface_of
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.automatic import AutomaticControl
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.predicted_flux import PredictedFlux
+from heliotrope.plant.workers import Worker
+from heliotrope.safety import alarms
+
+#: A beam that is not heard may be where it was for this time, s.
+HOLD = 120.0
+#: Most of a heliostat's own error that counts, rad of the beam per axis. Beyond it the flux is no
+#: longer of first order: the beam is elsewhere, as sharp as ever, and the greatest flux is that of
+#: beams that hit their aims. The blur of a larger error would hide that.
+BLUR = 5e-4
+#: Longest wait for a move to end, and wait after it until beams are at rest, s.
+MOVED, SETTLED = 60.0, 4.0
+#: Time for which a heliostat whose beam may not go to its new aim keeps its old one, s.
+BLOCKED = 300.0
+#: The safe spread follows when the last good aims are so many times the deadline old.
+SAFE = 5.0
+#: States from which a heliostat cannot join without a person.
+_OUT = (states.LOCKED, states.FAULT, states.UNCONFIGURED)
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class AimsView:
+    """How the plant's aims are chosen, and how far the flux is from its limit.
+
+    Attributes
+    ----------
+    strategy
+        "spread" or "limit"; the rest is of "limit".
+    source
+        Where the present aims come from: "optimiser", "last good aims", "safe spread", "" before
+        the first.
+    at
+        Age of the last good computation, s; infinite before the first.
+    limit, peak
+        Least allowable flux less the margin, and greatest predicted flux with its errors, W/m².
+    reserve
+        Least share of the limit that is left anywhere; below 0 it is passed.
+    binding
+        Number of cells that the limit binds.
+    power, planned
+        Of the present aims and of the best, W.
+    gap
+        Share that still better aims could add at most.
+    aimed, resting, left
+        Heliostats with an aim, wanted ones that rest for the limit, and those that still have to
+        move.
+    moved, moved_ago
+        Heliostats that moved last, and how long ago, s.
+    problem
+        Why there are no new aims; empty if there are.
+    """
+
+    strategy: str
+    source: str = ""
+    at: float = math.inf
+    limit: float = math.nan
+    peak: float = math.nan
+    reserve: float = math.nan
+    binding: int = 0
+    power: float = math.nan
+    planned: float = math.nan
+    gap: float = math.nan
+    aimed: int = 0
+    resting: int = 0
+    left: int = 0
+    moved: tuple[str, ...] = ()
+    moved_ago: float = math.inf
+    problem: str = ""
+
+
+class Aiming:
+    """Chooses the aims of a plant under its flux limit.
+
+    Parameters
+    ----------
+    plant, log
+        The controller, and the logbook for alarms and events.
+    automatic
+        Gives the commands, while it has the command authority.
+    flux
+        Knows the field as it stands.
+    worker
+        Place for the computation.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        log: Logbook,
+        automatic: AutomaticControl,
+        flux: PredictedFlux,
+        worker: Worker,
+    ) -> None:
+        self._plant, self._log, self._automatic = plant, log, automatic
+        self._flux, self._worker, self._settings = flux, worker, plant.design.aims
+        count = len(plant.field)
+        self._by_person: Mask = np.zeros(count, dtype=np.bool_)
+        self._blocked_until = np.full(count, -math.inf)
+        self._answer: Answer | None = None
+        self._good_at = self._round_at = plant.now()
+        self._moved: tuple[str, ...] = ()
+        self._moved_at = -math.inf
+        self._source = self._problem = ""
+        self._above = False
+
+    # -- people ----------------------------------------------------------------------------
+
+    def by_person(self, heliostats: Sequence[str], *, aimed: bool) -> None:
+        """Note that a person has aimed heliostats (() for all), or given them back."""
+        rows = [self._plant.field.place(name) for name in heliostats or self._plant.field.names]
+        self._by_person[rows] = aimed
+
+    def points(self, heliostats: Sequence[str]) -> Mapping[str, FloatArray]:
+        """Return the aims on the first receiver, ENU, m, (3,), by name.
+
+        Raises
+        ------
+        InputError
+            If a heliostat has none under the flux limit.
+        """
+        if self._settings.limit is None:
+            return self._plant.default_aims(heliostats)
+        aims = self._automatic.aims
+        without = [name for name in heliostats if name not in aims]
+        if without:
+            raise InputError(
+                f"aim: {len(without)} heliostats, {without[0]} first, have no aim under the flux "
+                "limit; give them to automatic control, or leave them at standby"
+            )
+        return {name: aims[name] for name in heliostats}
+
+    def view(self) -> AimsView:
+        """Return how aims are chosen now."""
+        settings, answer, now = self._settings, self._answer, self._plant.now()
+        wanted, aims = self._automatic.movable(), self._automatic.aims
+        if settings.limit is None:
+            return AimsView(settings.strategy)
+        aimed = sum(name in aims for name in self._plant.field.names)
+        made = AimsView(
+            settings.strategy, self._source, limit=float(np.min(settings.limit.flux)),
+            aimed=aimed, resting=max(int(wanted.sum()) - aimed, 0), problem=self._problem,
+            moved=self._moved, moved_ago=now - self._moved_at,
+        )  # fmt: skip
+        if answer is None:
+            return made
+        return replace(
+            made, at=now - self._good_at, limit=float(answer.limit.min()),
+            peak=float((answer.flux + answer.above).max()), reserve=-answer.excess,
+            binding=answer.binding, power=answer.power, planned=answer.planned, gap=answer.gap,
+            left=answer.left,
+        )  # fmt: skip
+
+    # -- running ---------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Choose aims until cancelled; without a flux limit there is nothing to do."""
+        if self._settings.limit is None:
+            return
+        while True:
+            begun = self._plant.now()
+            if self._automatic.idle:
+                self._good_at = begun  # nothing moves, so nothing is late
+            else:
+                await self._step(begun)
+            await sleep_until(self._plant.clock, begun + self._settings.every)
+
+    async def _step(self, now: float) -> None:
+        """Compute aims, and give them; a failure leaves the last good ones."""
+        given = self._round(now)
+        if not given.free.any():
+            self._good_at = now  # none may be moved, so no aims are late
+            return
+        try:
+            answer = await asyncio.wait_for(
+                self._worker(next_round, given), self._settings.deadline
+            )
+        except TimeoutError:
+            await self._failed(f"no answer within {self._settings.deadline:g} s")
+        except HeliotropeError as error:
+            await self._failed(str(error))
+        except Exception as error:  # noqa: BLE001 - the plant goes on whatever fails here
+            await self._failed(f"{type(error).__name__}: {error}")
+        else:
+            self._round_at = now
+            if answer.planned <= 0.0 and self._movers(now).any():
+                least = 1e-3 * float(answer.limit.min())
+                await self._failed(
+                    f"the limit, {least:.4g} kW/m² less the margin, allows not even one beam"
+                )
+                return
+            self._good_at = now
+            self._take(answer)
+            await self._go(answer.moves)
+
+    def _take(self, answer: Answer) -> None:
+        """Note an answer, and tell what is above the limit or no longer late."""
+        self._answer, self._source = answer, "optimiser"
+        if self._problem:
+            self._problem = ""
+            self._log.take_alarm(alarms.AIMS.ended())
+        name, above = self._plant.design.receivers[0].name, answer.excess > 0.01
+        if above:
+            kind = alarms.FLUX_ABOVE_LIMIT
+            self._log.take_alarm(kind.raised(name, excess=100.0 * answer.excess))
+        elif self._above:
+            self._log.take_alarm(alarms.FLUX_ABOVE_LIMIT.ended(name))
+        self._above = above
+
+    async def _failed(self, problem: str) -> None:
+        """Keep the last good aims; when they are old, go to the safe spread."""
+        if not self._problem:
+            self._log.take_alarm(alarms.AIMS.raised(problem=problem))
+        self._problem = problem
+        late = self._plant.now() - self._good_at
+        if self._answer is None:
+            return
+        if late < SAFE * self._settings.deadline:
+            self._source = "last good aims"
+        elif self._source != "safe spread":
+            self._source = "safe spread"
+            await self._to_safe(self._answer.safe)
+
+    async def _to_safe(self, safe: FloatArray) -> None:
+        """Go to the safe spread: all beams that are elsewhere leave first, so that none meet."""
+        on = self._on(self._plant.now()) & self._movers(self._plant.now())
+        apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
+        rows = np.flatnonzero(on & apart)
+        self._automatic.aims.clear()
+        if await self._rest(rows):
+            names = self._plant.field.names
+            some = np.flatnonzero(np.isfinite(safe).all(axis=1))
+            self._automatic.aims.update({names[row]: safe[row] for row in some})
+
+    # -- the field -------------------------------------------------------------------------
+
+    def _on(self, now: float) -> Mask:
+        """Return a mask of the heliostats whose beams may be on the receiver, (N,)."""
+        field, receiver = self._plant.field, self._plant.design.receivers[0]
+        reach = 0.5 * math.hypot(
+            max(receiver.width, 2.0 * (receiver.radius or 0.0)), receiver.height
+        )
+        near = np.linalg.norm(self._plant.aims - receiver.center, axis=1) <= 1.2 * reach
+        tracks = np.isin(field.rows["state"], states.ON_AIM) & (field.age(now) <= HOLD)
+        return np.asarray(tracks & near)
+
+    def _movers(self, now: float) -> Mask:
+        """Return a mask of the heliostats that may be given other aims now, (N,)."""
+        field = self._plant.field
+        free = self._automatic.movable() & field.live(now) & ~field.among(_OUT, now)
+        free &= ~self._by_person & (self._blocked_until < now)
+        free[[field.place(name) for name in self._automatic.visiting]] = False
+        return np.asarray(free)
+
+    def _allotted(self) -> FloatArray:
+        """Return the aims that heliostats have, (N, 3); NaN: none."""
+        none, aims = np.full(3, np.nan), self._automatic.aims
+        return np.array([aims.get(name, none) for name in self._plant.field.names])
+
+    def _round(self, now: float) -> Round:
+        """Return what is known now, and leave out what has no part in it any more."""
+        plant, settings = self._plant, self._settings
+        assert settings.limit is not None
+        on, free, allotted = self._on(now), self._movers(now), self._allotted()
+        visiting = np.isin(plant.field.names, sorted(self._automatic.visiting))
+        # One that waits for its turn joins at the aim that it was given.
+        waits = free & ~on & plant.field.among((states.IDLE,), now) & (plant.waiting > 0)
+        aims = np.where((on & free)[:, None], plant.aims, allotted)
+        comes = visiting | waits | (~on & self._automatic.movable() & (self._blocked_until >= now))
+        fixed = np.where((on & ~free)[:, None], plant.aims, np.nan)
+        fixed = np.where(comes[:, None] & np.isfinite(allotted), allotted, fixed)
+        free &= ~comes
+        spread = np.stack([*plant.default_aims().values()])
+        most = max(1, round(settings.moves / 60.0 * min(now - self._round_at, 60.0)))
+        return Round(
+            self._scene(now),
+            self._demand(settings.limit),
+            now,
+            np.where(free[:, None] | ~np.isfinite(fixed), aims, np.nan),
+            free,
+            on & free,
+            fixed,
+            spread,
+            most,
+            settings.together,
+        )
+
+    def _scene(self, now: float) -> Scene:
+        """Return the field with its receiver, in the light for which the limit must hold."""
+        scene, receiver = self._flux.scene(now), self._plant.design.receivers[0]
+        pointing = scene.mirrors.pointing
+        size = np.sqrt(0.5 * np.trace(pointing, axis1=1, axis2=2))
+        less = np.minimum(1.0, BLUR / np.maximum(size, 1e-9)) ** 2
+        mirrors = replace(scene.mirrors, pointing=pointing * less[:, None, None])
+        dni = max(scene.dni, self._settings.dni)
+        return replace(scene, surfaces=(surface_of(receiver),), mirrors=mirrors, dni=dni)
+
+    def _demand(self, limit: FluxLimit) -> Demand:
+        """Return the limit, and with which certainty it must hold."""
+        plant, settings = self._plant, self._settings
+        clusters = np.unique(plant.field.cluster, return_inverse=True)[1]
+        latitude = math.radians(plant.design.site.latitude_deg)
+        shared = SharedErrors(settings.drift, settings.clock, settings.cluster)
+        pole = np.array([0.0, math.cos(latitude), math.sin(latitude)])
+        return Demand(limit, settings.probability, shared, clusters, pole)
+
+    # -- moves -----------------------------------------------------------------------------
+
+    async def _go(self, moves: tuple[Move, ...]) -> None:
+        """Make the moves one after the other; one that fails ends them until the next round."""
+        until = self._plant.now() + 2.0 * self._settings.every
+        names, aims = self._plant.field.names, self._automatic.aims
+        for move in moves:
+            if self._plant.now() > until or self._automatic.idle:
+                return
+            on = self._on(self._plant.now())[move.rows]
+            free = self._movers(self._plant.now())[move.rows]
+            rests = np.asarray(~np.isfinite(move.aims).all(axis=1))
+            for row in move.rows[rests]:
+                aims.pop(names[row], None)
+            if not await self._rest(move.rows[rests & on & free]):
+                return
+            pairs = zip(move.rows, move.aims, on, rests, strict=True)
+            goes = [(names[row], aim, shines) for row, aim, shines, rest in pairs if not rest]
+            aims.update({name: aim for name, aim, shines in goes if not shines})
+            if not await self._move({name: aim for name, aim, shines in goes if shines}):
+                return
+
+    async def _move(self, points: dict[str, FloatArray]) -> bool:
+        """Move tracking beams; return whether all of them went."""
+        if not points:
+            return True
+        place = self._plant.field.place
+        try:
+            ticket = self._automatic.move(points)
+        except HeliotropeError as error:
+            refused = getattr(error, "refusals", dict.fromkeys(points, str(error)))
+            self._block(refused)
+            return False
+        await ticket.end(MOVED)
+        await sleep_until(self._plant.clock, self._plant.now() + SETTLED)
+        refused = {**ticket.refusals, **ticket.blocked}
+        self._block(refused)
+        for name in points.keys() - refused.keys():
+            self._automatic.aims[name] = self._plant.aims[place(name)].copy()
+        self._note(tuple(points.keys() - refused.keys()))
+        return not refused
+
+    async def _rest(self, rows: npt.NDArray[np.intp]) -> bool:
+        """Send beams to standby; return whether the order was taken."""
+        names = tuple(self._plant.field.names[row] for row in rows)
+        if not names:
+            return True
+        try:
+            ticket = self._automatic.rest(names)
+        except HeliotropeError as error:
+            self._block(getattr(error, "refusals", dict.fromkeys(names, str(error))))
+            return False
+        await ticket.end(MOVED)
+        self._note(names)
+        return True
+
+    def _block(self, refused: dict[str, str]) -> None:
+        for name in refused:
+            self._blocked_until[self._plant.field.place(name)] = self._plant.now() + BLOCKED
+
+    def _note(self, names: tuple[str, ...]) -> None:
+        if names:
+            self._moved, self._moved_at = tuple(sorted(names)), self._plant.now()

@@ -1,0 +1,176 @@
+"""Aims under a flux limit in a plant at work: the true flux holds the limit."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from heliotrope.errors import InputError
+from heliotrope.field.aim_settings import AimSettings
+from heliotrope.field.flux_limit import FluxLimit
+from heliotrope.field.layouts import lay_out
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.optics.receiver_flux import FieldFlux
+from heliotrope.optics.surfaces import surface_of
+from heliotrope.plant.operations import aiming
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.orders.authority import Person, Role
+from support.live import LiveOptions, LivePlant, play
+
+COUNT = 6
+LIMIT = 70e3
+
+
+def exact(mechanism: Mechanism) -> Mechanism:
+    """Return mirrors that stand as designed: beams hit their aims."""
+    return mechanism
+
+
+def played(
+    work: Callable[[LivePlant], Awaitable[None]], limit: float = LIMIT, **changes: object
+) -> None:
+    """Run a small field in virtual time, with a flux limit."""
+    design = lay_out("radial", COUNT)
+    (name,) = design.groups
+    half = COUNT // 2
+    group = replace(design.groups[name], cluster=("C1",) * half + ("C2",) * half)
+    settings: dict[str, object] = {"probability": 0.95, "moves": 60.0, "every": 15.0}
+    aims = AimSettings("limit", FluxLimit(limit, 0.05), **(settings | changes))  # type: ignore[arg-type]
+    work_settings = AutomaticSettings(wanted=True, calibrate=False, rate=5.0)
+    options = LiveOptions(rendered=False, threads=0, work=work_settings, installed=exact)
+
+    async def later(made: LivePlant) -> None:
+        await asyncio.sleep(4.0)
+        await work(made)
+
+    play(later, replace(design, groups={name: group}, aims=aims), options)
+
+
+def true_flux(made: LivePlant) -> FloatArray:
+    """Return the flux of the true mirrors, W/m²: where the motors are, by the true mechanism."""
+    scene = made.operations._flux.scene(made.plant.now())
+    on = made.plant.field.among((states.TRACKING,), made.plant.now())
+    normal, center = made.field.stand()
+    mirrors = replace(
+        scene.mirrors, normal=normal, center=center, pointing=0.0 * scene.mirrors.pointing
+    )
+    surface = surface_of(made.design.receivers[0])
+    given = replace(scene, mirrors=mirrors, surfaces=(surface,), dni=1000.0, dark=~on)
+    return FieldFlux(given).maps[0]
+
+
+async def greatest(made: LivePlant, seconds: float, every: float = 3.0) -> float:
+    """Return the greatest true flux in a time, W/m²."""
+    most = 0.0
+    for _ in range(int(seconds / every)):
+        await asyncio.sleep(every)
+        most = max(most, float(true_flux(made).max()))
+    return most
+
+
+def in_the_middle(made: LivePlant) -> float:
+    """Return the greatest flux with all beams in the middle, W/m²."""
+    scene, receiver = made.operations._flux.scene(made.plant.now()), made.design.receivers[0]
+    mirrors = replace(scene.mirrors, pointing=0.0 * scene.mirrors.pointing)
+    mirrors = mirrors.toward(scene.sun, receiver.center)
+    surface = surface_of(receiver)
+    given = replace(scene, mirrors=mirrors, surfaces=(surface,), dni=1000.0, dark=None)
+    return float(FieldFlux(given).maps[0].max())
+
+
+async def up(made: LivePlant) -> None:
+    """Wait until all that have an aim track."""
+    for _ in range(60):
+        await asyncio.sleep(2.0)
+        aims = made.operations.automatic.aims
+        tracks = made.plant.field.among((states.TRACKING,), made.plant.now())
+        if aims and tracks.sum() == len(aims):
+            return
+    raise AssertionError(made.operations.aims())
+
+
+def test_the_true_flux_holds_the_limit_which_the_middle_passes() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        assert in_the_middle(made) > 1.3 * LIMIT
+        assert await greatest(made, 40.0) <= LIMIT
+        view = made.operations.aims()
+        assert (view.strategy, view.source, view.problem) == ("limit", "optimiser", "")
+        assert view.reserve >= -0.005
+        assert view.peak <= 1.005 * view.limit
+        assert view.aimed >= 4
+
+    played(scene)
+
+
+def test_a_heliostat_that_leaves_makes_room_and_a_person_s_beam_stays() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        plant, operations = made.plant, made.operations
+        lost = made.names[0]
+        person = Person("Operator", Role.OPERATOR)
+        operations.stow(person, (lost,))
+        assert await greatest(made, 40.0, 4.0) <= LIMIT
+        aims = operations.automatic.aims
+        assert lost not in aims
+        assert len(aims) == COUNT - 1
+        # A person's aim stays although the optimiser would choose another.
+        operations.automatic.give_way()
+        token = plant.take_authority(person).token
+        name = sorted(aims)[0]
+        point = plant.design.receivers[0].center + np.array([0.0, 0.0, 0.9])
+        await operations.aim(person, token, {name: point}).end(30.0)
+        plant.release_authority(person, token)
+        assert await greatest(made, 45.0, 5.0) <= LIMIT
+        np.testing.assert_allclose(plant.aims[plant.field.place(name)], point)
+
+    played(scene)
+
+
+def test_a_limit_that_no_aims_hold_keeps_the_field_at_standby_with_an_alarm() -> None:
+    async def scene(made: LivePlant) -> None:
+        assert await greatest(made, 60.0, 10.0) == 0.0
+        view = made.operations.aims()
+        assert (view.aimed, view.resting) == (0, COUNT)
+        (alarm,) = [a for a in made.operations.logbook.alarms() if a.condition == "aims"]
+        assert alarm.active
+        assert "allows not even one beam" in alarm.text
+
+    played(scene, 100.0)
+
+
+def test_without_answers_the_last_good_aims_stay_and_then_the_safe_spread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        operations, plant = made.operations, made.plant
+        before = {name: aim.copy() for name, aim in operations.automatic.aims.items()}
+
+        def broken(*_: object) -> None:
+            raise InputError("the process that computes beside the plant has ended")
+
+        monkeypatch.setattr(aiming, "next_round", broken)
+        await asyncio.sleep(20.0)
+        assert operations.aims().source == "last good aims"
+        (alarm,) = [a for a in operations.logbook.alarms() if a.active and a.condition == "aims"]
+        assert "has ended" in alarm.text
+        for name, aim in before.items():
+            np.testing.assert_array_equal(operations.automatic.aims[name], aim)
+        assert await greatest(made, 170.0, 6.0) <= LIMIT
+        assert operations.aims().source == "safe spread"
+        here = plant.field.among((states.TRACKING,), plant.now())
+        assert 0 < here.sum() < COUNT
+        np.testing.assert_allclose(
+            plant.aims[here], plant.design.receivers[0].center[None].repeat(here.sum(), 0)
+        )
+        monkeypatch.undo()
+        await asyncio.sleep(20.0)
+        assert operations.aims().source == "optimiser"
+        assert not [a for a in operations.logbook.alarms() if a.active and a.condition == "aims"]
+
+    played(scene, deadline=30.0)
