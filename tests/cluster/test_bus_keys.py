@@ -91,7 +91,7 @@ def test_moving_mirrors_go_on_and_take_the_key_when_they_stand() -> None:
         (alarm,) = field.plant.alarms("bus_unsigned")
         assert alarm.severity == Severity.WARNING
         assert alarm.text.startswith("cluster C1 signs its frames, but A1, A2 do not have")
-        assert "when they stand" in alarm.text
+        assert "once they are at rest" in alarm.text
         await field.order("idle", "IDLE")
         await field.until(lambda: both(field, OLD), 10.0)
         await watched(field, 10.0, "IDLE")

@@ -77,7 +77,7 @@ def test_exchanged_addresses_are_named_and_neither_is_moved_or_written(
             assert "P5A: the board at its address holds the parameters of P5B" in text
             assert not sent(cluster, Emergency), "both are at stow"
             for name in ("APPROACH", "TRACK", "IDLE", "UNLOCK", "CLEAR_FAULT"):
-                with pytest.raises(RefusedError, match=f"{name} P5A.*its address holds the"):
+                with pytest.raises(RefusedError, match=f"{name} P5A.*at its address holds the"):
                     plant.command(ENGINEER, token, name, PAIR)
             with pytest.raises(RefusedError, match="ZERO P5A: the board at its address"):
                 plant.commands.zero(ENGINEER, token, "P5A", (0, 0))

@@ -196,7 +196,7 @@ def test_a_reference_fits_its_plant(known: ReceiverReference) -> None:
         (replace(plant, receivers=()), "the plant's receivers: none"),
         (
             replace(plant, receivers=(RECEIVER, other)),
-            "receivers: receiver, other; .* has one receiver",
+            "receivers: receiver, other; .* exactly one receiver",
         ),
         (replace(plant, cameras=()), "the plant's cameras: none; add it"),
         (

@@ -302,7 +302,7 @@ class RealCameras:
         if frame.time_deviation > _UNSURE:
             known = f"{frame.time_deviation:.2g} s only, the limit is {_UNSURE:g} s"
             text = (
-                f"time: known only within {known}; set the camera to write its time with a "
+                f"time: known within {known}; set the camera to write its time with a "
                 f"time "
                 f"zone"
             )
@@ -322,7 +322,7 @@ class RealCameras:
         if frame.time_deviation > _UNSURE:
             known = f"{frame.time_deviation:.2g} s only, the limit is {_UNSURE:g} s"
             raise FetchError(
-                f"camera {eye.camera.name}: the time of its frames is known only within {known}; "
+                f"camera {eye.camera.name}: the time of its frames is known within {known}; "
                 f"set the camera to write its time with a time zone"
             )
         assert frame.time is not None
