@@ -107,7 +107,7 @@ def test_the_old_file_stays_until_the_new_one_is_whole(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", full)
-        with pytest.raises(AssignedError, match=r"assigned\.json: No space left on device; see to"):
+        with pytest.raises(AssignedError, match=r"assigned\.json: No space left on device; check the disk"):
             store.keep({"AIM": {"A": (9.0, 9.0, 9.0)}, "STANDBY": {}})
     assert store.read() == old
     store.keep({"AIM": {}, "STANDBY": {}})
@@ -163,7 +163,7 @@ def test_standby_points_where_an_eye_sees_more_than_one_sun_are_refused(tmp_path
             with pytest.raises(RefusedError) as refused:
                 plant.standby(OPERATOR, token, dict.fromkeys(names, balcony))
             text = str(refused.value)
-            assert text.startswith("STANDBY P1A (and 17 more): at rest its beam shines on the pl")
+            assert text.startswith("STANDBY P1A (and 17 more): at rest its beam shines on the po")
             assert "suns (limit 1); choose another standby point" in text
             assert np.isnan(plant.standbys).all()
             # One flat mirror is no more than a look at the sun; what rests there already counts.
