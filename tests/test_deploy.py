@@ -148,7 +148,7 @@ def test_an_alarm_says_what_is_wrong_what_happens_and_what_to_do() -> None:
     raised = alarms.NODE_SILENT.raised("H7", worse=True, silence=10.0, last="never heard")
     assert (raised.condition, raised.subject, raised.severity) == ("node_silent", "H7", "alarm")
     assert raised.text == (
-        "H7: no answer for 10 s; never heard. The cluster keeps polling it. Assume that its beam "
+        "H7: no reply for 10 s; never heard. The cluster keeps polling it. Assume that its beam "
         "has not moved; check its supply and its cable."
     )
     assert alarms.NODE_SILENT.ended("H7").text == "H7: it answers again"

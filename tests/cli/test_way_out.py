@@ -96,4 +96,6 @@ def test_what_brings_beams_back_needs_a_person_with_a_token(plant: RunningPlant)
     for words in (("emergency", "--withdraw"), ("command", "track", "--all"), ("resume",)):
         code, text = ctl(plant, *words)
         assert (code, text.count("\n")) == (2, 1)
-        assert f"{getpass.getuser()} on this machine is viewer; it needs operator" in text
+        assert (
+            f"{getpass.getuser()} on this machine is viewer, but the command needs operator" in text
+        )

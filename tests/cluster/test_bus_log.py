@@ -44,7 +44,7 @@ def test_one_record_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     async def main(field: Field) -> None:
         await field.plant.send(Ask("f-1", "frames"))
         second = await _recorded(field, "f-2")
-        assert second.data["error"].startswith("another person records it now")
+        assert second.data["error"].startswith("another user is recording it")
         await field.until(lambda: len(field.plant.all(Answer)) == 2)
         assert decoded(field.plant.all(Answer)[1])
 

@@ -100,7 +100,7 @@ def test_the_example_is_read(folder: Path) -> None:
         (
             "[time]",
             "[time]\nsystem_tolerance_s = 0",
-            "2 s apart; remove the key",
+            "fixed at 2 s; remove the key",
         ),
         ("[time]", "[time]\nntp = true", "time.ntp: the kernel is asked unless error_s is stated"),
         ("[time]", "[time]\ndrift_ppm = 50", "time.drift_ppm: the kernel's bound grows by 500 ppm"),
@@ -200,7 +200,7 @@ def test_the_reference_names_every_setting() -> None:
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"heliostats": ()}, "0 heliostats; one bus carries 1 to 32"),
+        ({"heliostats": ()}, "0 heliostats; one bus supports 1 to 32"),
         ({"name": ""}, "it has no name"),
         ({"heliostats": (Member("X", 1), Member("X", 2))}, "two heliostats have the name X"),
         ({"answer": 5.0}, "answer 5.0 s is not within 0.001 to 1 s"),
@@ -311,7 +311,7 @@ def test_epoch_and_editions_only_rise(tmp_path: Path) -> None:
 def test_a_state_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "state.json"
     path.write_text(text)
-    with pytest.raises(FormatError, match="holds no epoch and edition"):
+    with pytest.raises(FormatError, match="contains no epoch and edition"):
         Kept(path)
 
 

@@ -73,7 +73,7 @@ async def final(field: Field, identity: str, name: str = "A1", limit: float = 15
     [
         (
             Command("c", "TRACK", token=TOKEN + 1),
-            "no command authority: the token is out of date",
+            "no command authority, because the token is out of date",
         ),
         (Command("c", "TRACK"), "no command authority"),
         (Command("c", "FLY", token=TOKEN), "'FLY' is not a command for local controllers"),
@@ -167,7 +167,7 @@ def test_a_lost_answer_is_asked_for_again_and_nothing_acts_twice() -> None:
         field.bus.lose("JOG", 3)
         await field.order("more", "JOG", 0.0, 500.0, heliostats=("A1",))
         assert await final(field, "more") is Stage.FAILED
-        assert "no answer to JOG; it may have been taken" in field.plant.text("more")
+        assert "no reply to JOG; the controller may have accepted it" in field.plant.text("more")
         await asyncio.sleep(3.0)
         assert motion.goal(0) == before + 1000
 
@@ -225,7 +225,7 @@ def test_a_jog_is_done_only_if_the_counts_go_elsewhere(lost: int, steps: float) 
         # Its first answer was lost, the others say "duplicate".
         end = Stage.FAILED if lost else Stage.REFUSED
         assert field.plant.stages("refused", "A2")[-1] is end
-        text = "nothing shows that it was taken" if lost else "value out of range"
+        text = "nothing shows that the command was accepted" if lost else "value out of range"
         assert text in field.plant.text("refused")
         assert (taker.motion.goal(1), refuser.motion.goal(1)) == (goals[0] + steps, goals[1])
 
@@ -274,7 +274,8 @@ def test_a_search_is_done_only_if_it_was_begun(lost: int) -> None:
         assert await final(field, "other", "A2") is Stage.FAILED
         assert field.boards[1].state == "IDLE"
         assert field.plant.text("other") == (
-            "SEARCH: its answer was lost, and nothing shows that it was taken; the state is IDLE"
+            "SEARCH: its reply was lost, and nothing shows that the command was accepted; the "
+            "state is IDLE"
         )
 
     run(main, "IDLE", bus=interrupted)
@@ -298,7 +299,7 @@ def test_a_command_that_nobody_answers_expires() -> None:
         await field.order("aim", "AIM", *AIM, heliostats=("A1",), lifetime=4.0)
         assert await final(field, "aim") is Stage.FAILED
         assert 4.0 <= field.clock.monotonic() - begin < 5.5
-        assert "no answer to AIM before it expired" in field.plant.text("aim")
+        assert "no reply to AIM before the command expired" in field.plant.text("aim")
         field.boards[0].on = True
         await asyncio.sleep(3.0)
         assert field.boards[0].node.controller.motion.aim is None
@@ -577,7 +578,7 @@ def test_an_edition_that_cannot_be_kept_fails_the_order_and_nothing_else(tmp_pat
         message = Parameters.of("p", "A1", items, TOKEN)
         await field.plant.send(dataclasses.replace(message, lifetime=3.0))
         assert await final(field, "p") is Stage.FAILED
-        assert "the edition cannot be kept: No such file or directory" in field.plant.text("p")
+        assert "the edition cannot be stored: No such file or directory" in field.plant.text("p")
         await field.order("lock", "LOCK", heliostats=("A1",))
         assert await final(field, "lock") is Stage.DONE
         tmp_path.mkdir()

@@ -88,7 +88,7 @@ def test_slewing_and_a_clock_that_runs_fast_are_no_jumps_but_many_small_steps_ar
 def test_a_clock_that_was_never_set_is_no_source(year: int) -> None:
     now = SystemTime(VirtualClock(start=datetime(year, 1, 1, 2, tzinfo=UTC))).time()
     assert (now.quality, now.error) == ("none", math.inf)
-    assert now.note == f"the computer's clock says {year}-01-01: it was never set"
+    assert now.note == f"the computer's clock shows {year}-01-01, so it was never set"
 
 
 def test_a_jump_there_and_back_between_two_questions_is_seen_by_run() -> None:

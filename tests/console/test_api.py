@@ -283,7 +283,7 @@ def test_a_new_password_is_told_once_and_ends_sessions(
         again = client.post("session", json=made)
         assert again.status_code == 200
     events = ask("viewer", "GET", "events").text
-    assert "made a new password: desk-2" in events
+    assert "created a new password: desk-2" in events
     assert made["password"] not in events + ask("engineer", "GET", "accounts").text
     assert person("engineer", "POST", "accounts/engineer/password").status_code == 409
     assert person("engineer", "POST", "accounts/nobody/password").status_code == 404
@@ -494,7 +494,7 @@ def test_zero_goes_to_one_heliostat(ask: Ask, console: LiveConsole) -> None:
     order = {"command": "ZERO", "heliostats": [], "values": [0, 10]}
     refused = ask("engineer", "POST", "commands", order)
     assert refused.status_code == 409
-    assert "give one heliostat" in refused.json()["detail"]
+    assert "between heliostats; specify one heliostat" in refused.json()["detail"]
     order["heliostats"] = [console.live.names[0]]
     given = ask("engineer", "POST", "commands", order)
     assert given.status_code == 200, given.text

@@ -98,7 +98,7 @@ def test_two_engineers_by_the_api(console: LiveConsole, ask: Ask) -> None:
     ask(SECOND, "DELETE", "authority")
     record = console.call(lambda: beliefs.record(name))
     assert record.person == "engineer"
-    assert record.note == f"levelled; asked for by engineer, approved by {SECOND}"
+    assert record.note == f"levelled; requested by engineer, approved by {SECOND}"
     console.call(console.live.operations.errands.look)
     ended = ask("engineer", "GET", f"commands/{ticket['identity']}").json()
     assert f"approved by {SECOND}" in ended["text"]
@@ -118,7 +118,7 @@ def test_ctl_asks_lists_refuses_and_approves(console: LiveConsole, ctl: Ctl) -> 
 
     number = asked("tilt_east_mrad=0.5")
     shown = ctl("viewer", "parameters", name)
-    assert f"change {number} of {name}, asked for by engineer" in shown
+    assert f"change {number} of {name}, requested by engineer" in shown
     assert "the beam moves by" in shown
     assert "needs engineer" in ctl("viewer", "approvals", number, "--withdraw", code=1)
     ctl(SECOND, "approvals", number, "--refuse", "--reason", "look again")

@@ -94,12 +94,12 @@ CHANGES: tuple[tuple[str, str, dict[str, Any], str], ...] = (
         "POST",
         "accounts",
         {"name": "desk-8", "role": "viewer", "password": "a long password"},
-        "made an account: desk-8, viewer",
+        "created an account: desk-8, viewer",
     ),
     ("PATCH", "accounts/desk-8", {"role": "operator"}, "changed an account: desk-8, role operator"),
     ("PATCH", "accounts/desk-8", {"disabled": True}, "changed an account: desk-8, disabled"),
-    ("POST", "accounts/desk-8/password", {}, "made a new password: desk-8"),
-    ("POST", "tokens", {"label": "one", "role": "viewer"}, "made a token: one, viewer, 30 days"),
+    ("POST", "accounts/desk-8/password", {}, "created a new password: desk-8"),
+    ("POST", "tokens", {"label": "one", "role": "viewer"}, "created a token: one, viewer, 30 days"),
 )
 
 
@@ -112,7 +112,7 @@ def test_changes_of_accounts_leave_a_trace(console: LiveConsole, person: Ask) ->
     recorded(console, "engineer: revoked a token: one of engineer")
     wrong = {"own_password": "not it"}
     assert person("engineer", "POST", "accounts/desk-8/password", wrong).status_code == 403
-    recorded(console, "engineer: gave a wrong password for a change of accounts")
+    recorded(console, "engineer: entered a wrong password for an account change")
 
 
 def test_a_running_plant_records_what_people_do_with_its_records(console: LiveConsole) -> None:

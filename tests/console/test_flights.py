@@ -61,7 +61,7 @@ def test_a_flight_of_a_drone_is_taken_by_the_page_and_the_command_line(
     assert [word for word, _, _ in taken["shared"]] == flight["shared"]
     again = ask("engineer", "POST", "flights", flight)
     assert again.status_code == 409
-    assert "flight by the page: engineer gave it on" in again.json()["detail"]
+    assert "flight by the page: engineer imported it on" in again.json()["detail"]
     place, secret = tmp_path / "flight.json", tmp_path / "token"
     place.write_text(json.dumps(flight))
     secret.write_text(tokens["engineer"])

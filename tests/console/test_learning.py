@@ -22,7 +22,7 @@ def test_what_is_in_force_is_shown_and_an_order_without_a_learner_is_refused(
         (group, 0, None) for group in groups
     ]
     assert "zeros wander by 1 and 1 mrad over 300 days" in rows[0]["drift"]
-    assert "the defaults are in force" in rows[0]["said"]
+    assert "the default values are in force" in rows[0]["said"]
     assert AtPlant(tokens["viewer"], console.folder).get("learning") == rows
     answer = ask("engineer", "POST", "learning", {"group": "nobody"})
     assert (answer.status_code, "nobody" in answer.json()["detail"]) == (404, True)

@@ -219,10 +219,10 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     assert ctl("operator", *where, "give-back", name).exit_code == 0
     follows = ctl("operator", *where, "automatic", name)
     assert follows.exit_code == 0, follows.output
-    assert f"AUTOMATIC: 1 done ({name}: automatic control has it: " in follows.stdout
+    assert f"AUTOMATIC: 1 done ({name}: it is under automatic control" in follows.stdout
     asked = ctl("operator", *where, "calibrate", name, "--wait", "0")
     assert asked.exit_code == 0, asked.output or str(asked.exception)
-    assert asked.stdout.startswith(f"CALIBRATE: 1 waiting ({name}: it waits: "), asked.stdout
+    assert asked.stdout.startswith(f"CALIBRATE: 1 waiting ({name}: it is waiting: "), asked.stdout
     called = ctl("viewer", *where, "emergency", "--reason", "smoke")
     assert "emergency in force" in called.stdout
     assert "smoke" in called.stdout
@@ -230,19 +230,22 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     assert mine.exit_code != 0, mine.output
     withdrawn = ctl("engineer", *where, "emergency", "--withdraw", "--owner", "viewer")
     assert withdrawn.exit_code == 0, withdrawn.output
-    left = "every order is withdrawn; it ends when an operator acknowledges operator_emergency, 2 s"
+    left = (
+        "all orders are withdrawn; the emergency ends when an operator acknowledges "
+        "operator_emergency, which is possible 2 s"
+    )
     assert left in withdrawn.stdout
     assert left in ctl("viewer", *where, "status").stdout
     again = ctl("engineer", *where, "emergency", "--withdraw")
     assert again.exit_code != 0, again.output
-    assert f"no emergency order of engineer stands; {left}" in str(again.exception)
+    assert f"engineer has no active emergency order; {left}" in str(again.exception)
     here = console.live.operations
     console.until(lambda: any(a.waits for a in here.plant.sentinel.table.actions))
     done = ctl("operator", *where, "acknowledge", "operator_emergency")
     assert (done.exit_code, done.stdout) == (0, "acknowledged operator_emergency\n"), done.output
     console.calm()
     for words, text in (
-        (("show", "accounts"), "leave out --data"),
+        (("show", "accounts"), "omit --data"),
         (("resume",), "needs operator"),
         (("show", "nobody"), "nobody"),
     ):

@@ -40,7 +40,7 @@ def test_api_and_ctl_name_them(
 ) -> None:
     names = console.live.names
     found = ask("viewer", "GET", "events").json()
-    (event,) = (one for one in found if "given to automatic control" in one["text"])
+    (event,) = (one for one in found if "under automatic control" in one["text"])
     assert event["heliostats"] == len(names) == 12
     path = f"events/{event['number']}/heliostats"
     assert ask("viewer", "GET", path).json() == list(names)
@@ -50,7 +50,7 @@ def test_api_and_ctl_name_them(
     for where in (["--url", console.address], ["--data", str(console.folder)]):
         run = ["ctl", *where, "--token-file", str(secret), "events"]
         plain = CliRunner().invoke(app, run).output
-        assert "12 heliostats given to automatic control" in plain
+        assert "put 12 heliostats under automatic control" in plain
         assert names[7] not in plain
         assert ", ".join(names) in CliRunner().invoke(app, [*run, "--all-names"]).output
         listed = json.loads(CliRunner().invoke(app, [*run, "--all-names", "--json"]).output)
@@ -61,7 +61,7 @@ def test_api_and_ctl_name_them(
 def test_an_event_unfolds_and_stays_so(console: LiveConsole, enter: Callable[..., Any]) -> None:
     page, names = enter("viewer"), console.live.names
     page.click(".hx-tabs >> text=Logs")
-    event = f"{FOLDED}:has-text('12 heliostats given to automatic control')"
+    event = f"{FOLDED}:has-text('12 heliostats under automatic control')"
     page.click(f"{event} summary")
     page.wait_for_selector(f"{event} >> text={names[7]}")
     console.call(lambda: console.live.operations.logbook.event("plant", "", "drawn anew"))

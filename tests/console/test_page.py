@@ -280,9 +280,9 @@ def test_the_journal_finds_what_a_person_did(
     page.click(".hx-search >> text=Search")
     page.wait_for_selector(f".hx-logs td:has-text('operator: STOW {name}')")
     page.click("[data-tab=heliostat]")
-    page.wait_for_selector(f".hx-why:has-text('{name} is STOWED: it is not given to automatic')")
+    page.wait_for_selector(f".hx-why:has-text('{name} is STOWED: it is not under automatic')")
     page.click(".hx-why >> text=Give to automatic control")
-    page.wait_for_selector(".hx-why:has-text('automatic control has it')")
+    page.wait_for_selector(".hx-why:has-text('it is under automatic control')")
 
 
 def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> None:
@@ -327,7 +327,7 @@ def test_calibrate_now_is_for_operators(field: LiveConsole, enter: Callable[[str
     control = field.live.operations.automatic
     field.call(lambda: control.want([name], wanted=True))
     button.click()
-    until(page, matches, f"CALIBRATE: 1 (waiting|acknowledged) .{name}: (it waits: |at )")
+    until(page, matches, f"CALIBRATE: 1 (waiting|acknowledged) .{name}: (it is waiting: |at )")
     # In a field that other tests command its turn may never come: it ends when it is withdrawn.
     field.call(lambda: control.want([name], wanted=False))
     until(page, matches, f"CALIBRATE: 1 (done|failed|refused) .{name}: (at .*: |withdrawn: )")
@@ -513,7 +513,10 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
             page.click("dialog >> text='Resume'")
             page.wait_for_timeout(3000)
         others = page.locator(".hx-alarms >> text=Acknowledge all")
-        if "the emergency goes on" in page.inner_text(".hx-said >> nth=0") and others.count():
+        if (
+            "the emergency is still active" in page.inner_text(".hx-said >> nth=0")
+            and others.count()
+        ):
             others.click(force=True)
         page.wait_for_timeout(1000)
     assert not field.call(lambda: field.live.operations.plant.sentinel.on)

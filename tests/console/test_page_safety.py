@@ -151,7 +151,7 @@ def test_an_emergency_is_withdrawn_after_one_question_and_its_text_ends(
     page.click(".hx-alert button >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
     field.calm()
-    page.wait_for_selector('.hx-alert.on:has-text("wait for a person\'s Resume")')
+    page.wait_for_selector('.hx-alert.on:has-text("wait until an operator presses Resume")')
     page.wait_for_selector(".hx-plant p:has-text('ordered by')", state="detached")
     page.click(".hx-alert button >> text=Resume")
     page.click("dialog >> text='Resume'")

@@ -72,5 +72,5 @@ def test_the_plant_itself_photographs_calibrates_and_lists(
     assert f"CALIBRATE: 1 waiting ({name}" in ctl("calibrate", name, "--wait", "0", data=True)
     listed = json.loads(ctl("photographs", "--limit", "5", "--json", data=True))
     assert listed == ask("viewer", "GET", "photographs?limit=5").json()
-    with pytest.raises(HeliotropeError, match="only known to the console"):
+    with pytest.raises(HeliotropeError, match="known only to the console"):
         AtPlant("", console.folder).get("accounts")

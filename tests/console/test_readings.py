@@ -52,8 +52,8 @@ def test_a_reading_reaches_the_safety_table_and_who_gave_it_is_recorded(
         within(lambda value=value: give(console, ask, value))
         assert console.call(lambda: table._put["wind_gust", ""].value) == value
     texts = [row["text"] for row in ask("viewer", "GET", "events").json()]
-    assert texts.count("gives wind_gust; the first is 27") == 1
-    assert "gives wind_gust; the first is 3" not in texts
+    assert texts.count("sends wind_gust; the first value is 27") == 1
+    assert "sends wind_gust; the first value is 3" not in texts
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_readings_come_in_order(console: LiveConsole, ask: Ask) -> None:
             return False  # the machine was busy: it came too late
         answer = ask("engineer", "PUT", GUST, order)
         assert answer.status_code == 422
-        return "older than the last one" in answer.json()["detail"]
+        return "older than the last reading" in answer.json()["detail"]
 
     within(given_twice)
 

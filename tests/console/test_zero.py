@@ -75,7 +75,7 @@ def test_who_may_and_what_fits() -> None:
         plant.release_authority(OPERATOR, token)
         token = plant.take_authority(ENGINEER).token
         for names, values, error, text in (
-            ([], [0, 0], RefusedError, "give one heliostat"),
+            ([], [0, 0], RefusedError, "between heliostats; specify one heliostat"),
             (live.names, [0, 0], RefusedError, "2 heliostats"),
             ([name], [0], InputError, "1 numbers given"),
             ([name], [0.5, 0], InputError, "cannot be sent"),
@@ -97,7 +97,7 @@ def test_lock_position_restores_counts_that_were_lost() -> None:
         with pytest.raises(RefusedError, match="2 heliostats"):
             lock_position(plant, ENGINEER, token, live.names)
         assert await plant.command(ENGINEER, token, "LOCK", live.names).end(20.0)
-        with pytest.raises(RefusedError, match="it has no aim"):
+        with pytest.raises(RefusedError, match="it has no aim point"):
             lock_position(plant, ENGINEER, token, [name])
         target = plant.design.targets[0].center
         assert await plant.aim(ENGINEER, token, dict.fromkeys(live.names, target)).end(20.0)
@@ -117,7 +117,7 @@ def test_lock_position_restores_counts_that_were_lost() -> None:
         assert f"counts {wrong[0]:.0f}, {wrong[1]:.0f} become" in text
         # The other one stands at stow, far from its aim: nothing is sent.
         still = int(plant.field.rows[plant.field.place(other)]["primary"])
-        with pytest.raises(RefusedError, match="above 100 mrad: is it this heliostat's beam"):
+        with pytest.raises(RefusedError, match="the limit is 100 mrad; check that the beam"):
             lock_position(plant, ENGINEER, token, [other])
         await asyncio.sleep(3.0)
         assert plant.field.rows[plant.field.place(other)]["primary"] == still

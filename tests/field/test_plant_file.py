@@ -559,8 +559,16 @@ def test_limits_of_the_site_are_read_checked_and_survive(tmp_path: Path) -> None
         ("trips_m_s = 18", "trips = 18", "wind_gust_stow.trips is not known; did you mean trips_m"),
         ("trips_m_s = 18", "trips_m_s = 14", "which must be below its trip at 14 m/s; set trips"),
         ("trips_m_s = 18", 'trips_m_s = "a"', "safety.wind_gust_stow.trips_m_s: 'a': input should"),
-        ("wind_gust_stow", "wind_gust", "safety: wind_gust: there is no such condition here; did "),
-        ("wind_gust_stow", "cluster_silent", "cluster_silent: no plant sets its numbers, because"),
+        (
+            "wind_gust_stow",
+            "wind_gust",
+            "safety: wind_gust: no such condition is in this table; did ",
+        ),
+        (
+            "wind_gust_stow",
+            "cluster_silent",
+            "cluster_silent: its limits cannot be set in a plant file, because",
+        ),
     ],
 )
 def test_limits_of_the_site_that_cannot_be_are_one_line(

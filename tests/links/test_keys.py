@@ -348,7 +348,7 @@ def test_a_plant_takes_changed_keys_and_keeps_them_where_the_file_is_bad(tmp_pat
     assert found.keys["K2"].newest == new
     before = found.keys["K1"].keys
     good = keys.read_text()
-    for bad, text in (("K1 =", "no key"), ("[clusters]\n", "clusters.K1: its key is gone")):
+    for bad, text in (("K1 =", "no key"), ("[clusters]\n", "clusters.K1: its key is missing, but")):
         keys.write_text(bad)
         (alarm,) = papers.look()
         assert alarm.active

@@ -148,7 +148,7 @@ def test_two_engineers_change_a_parameter(tmp_path: Path, holder: Person) -> Non
         record = desk.bench.plant.beliefs.record(NAME)
         assert record is not None
         assert (record.version, record.person, record.parameters) == (1, ENGINEER.name, ASKED)
-        both = f"asked for by {ENGINEER.name}, approved by {SECOND.name}"
+        both = f"requested by {ENGINEER.name}, approved by {SECOND.name}"
         assert record.note == f"{WHY}; {both}"
         wanted = items_of(example_plant()[NAME].calibrated.with_parameters(ASKED))
         assert desk.bench.cluster_of(NAME).stored[NAME] == wanted
@@ -189,7 +189,7 @@ def test_a_roll_back_waits_too(tmp_path: Path) -> None:
         record = desk.bench.plant.beliefs.record(NAME)
         assert record is not None
         assert (record.version, record.parameters) == (3, ASKED)
-        assert record.note.startswith("version 1 again: ")
+        assert record.note.startswith("back to version 1: ")
         with pytest.raises(UnknownNameError, match="version of P1A '9'"):
             await desk.ask(values={}, version=9)
 
@@ -199,19 +199,19 @@ def test_a_roll_back_waits_too(tmp_path: Path) -> None:
 def test_who_may_ask_and_decide(tmp_path: Path) -> None:
     async def scene(desk: Desk) -> None:
         for person in (OPERATOR, VIEWER):
-            with pytest.raises(RefusedError, match="it needs engineer"):
+            with pytest.raises(RefusedError, match="the command needs engineer"):
                 await desk.approvals.ask(person, NAME, ASKED, 0, WHY)
         number, ticket = await desk.ask()
-        with pytest.raises(RefusedError, match="Egon asked for it, so another engineer must"):
+        with pytest.raises(RefusedError, match="Egon requested it, so another engineer must"):
             await desk.approvals.approve(ENGINEER, number)
         with pytest.raises(RefusedError, match="another engineer must decide"):
             desk.approvals.refuse(ENGINEER, number, "no")
         for person in (OPERATOR, VIEWER):
-            with pytest.raises(RefusedError, match="it needs engineer"):
+            with pytest.raises(RefusedError, match="the command needs engineer"):
                 await desk.approvals.approve(person, number)
-            with pytest.raises(RefusedError, match="it needs engineer"):
+            with pytest.raises(RefusedError, match="the command needs engineer"):
                 desk.approvals.refuse(person, number, "no")
-        with pytest.raises(RefusedError, match="Egon asked for it; Edda can refuse it"):
+        with pytest.raises(RefusedError, match="Egon requested it, so Edda can only refuse it"):
             desk.approvals.withdraw(SECOND, number)
         with pytest.raises(RefusedError, match="a reason is needed"):
             desk.approvals.refuse(SECOND, number, " ")
@@ -228,9 +228,9 @@ def test_who_may_ask_and_decide(tmp_path: Path) -> None:
 def test_what_is_not_credible_never_waits(tmp_path: Path) -> None:
     async def scene(desk: Desk) -> None:
         for given, text in (
-            ({"values": {"tilt_east": 1.5}}, "beyond 6 standard deviations"),
-            ({"values": {"tilt_east": 0.0}}, "has these parameters already"),
-            ({"reason": " "}, "give the reason"),
+            ({"values": {"tilt_east": 1.5}}, "more than 6 standard deviations"),
+            ({"values": {"tilt_east": 0.0}}, "has these parameters, so"),
+            ({"reason": " "}, "a reason"),
         ):
             with pytest.raises(InputError, match=text):
                 await desk.ask(**given)
@@ -270,7 +270,7 @@ def test_the_wait_ends_by_itself(tmp_path: Path) -> None:
         desk.look()
         assert not ticket.finished
         await desk.bench.wait(10.0)
-        with pytest.raises(RefusedError, match=r"nobody approved it until .* UTC; it has ended"):
+        with pytest.raises(RefusedError, match=r"nobody approved it by .* UTC, so it is no longer"):
             await desk.approvals.approve(SECOND, number)
         desk.look()
         assert (ticket.finished, ticket.good) == (True, False)
@@ -283,7 +283,7 @@ def test_the_wait_ends_by_itself(tmp_path: Path) -> None:
     _, kept = play(tmp_path, scene)
     ends = [text for who, text in kept.told if not who]
     assert len(ends) == 2
-    assert all("of Egon has ended, nobody approved it until" in text for text in ends)
+    assert all("of Egon has ended, nobody approved it by" in text for text in ends)
 
 
 def test_new_parameters_overtake_it(tmp_path: Path) -> None:
@@ -293,7 +293,9 @@ def test_new_parameters_overtake_it(tmp_path: Path) -> None:
             NAME, 1.0, ("tilt_north",), np.array([1e-3]), np.eye(1) * 1e-8, np.ones(1), version=7
         )
         desk.bench.plant.beliefs.take(record)
-        with pytest.raises(RefusedError, match=r"has had version 7 since .*; it has ended"):
+        with pytest.raises(
+            RefusedError, match=r"has received version 7 since .*, so it is no longer"
+        ):
             await desk.approvals.approve(SECOND, number)
         assert (desk.approvals.waiting, desk.writes) == ((), 0)
 
@@ -308,7 +310,7 @@ def test_what_cannot_be_written_now_waits_on(tmp_path: Path) -> None:
         desk.bench.cluster_of(NAME).set(states.STOWED, NAME)
         await desk.bench.wait(3.0)
         desk.bench.plant.release_authority(ENGINEER, desk.token)
-        with pytest.raises(RefusedError, match="nobody has it; Edda must take command first"):
+        with pytest.raises(RefusedError, match="nobody has it, so Edda must take command first"):
             await desk.approvals.approve(SECOND, number)
         desk.bench.plant.take_authority(OPERATOR)
         with pytest.raises(RefusedError, match="Olga has it"):
@@ -349,7 +351,7 @@ def test_a_plant_file_that_asks_for_it_no_more_ends_it(tmp_path: Path) -> None:
         desk.kept.document = document
         desk.again()
         assert (desk.approvals.waiting, desk.kept.document) == ((), "")
-        assert "asks for no second approval any more" in desk.kept.told[-1][1]
+        assert "no longer requires a second approval" in desk.kept.told[-1][1]
         ticket = desk.typed.change(ENGINEER, desk.token, NAME, ASKED, WHY)
         assert await ticket.end(20.0)
 

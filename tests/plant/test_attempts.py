@@ -46,7 +46,7 @@ def test_each_failure_waits_longer_and_the_last_one_is_the_end_with_one_alarm_of
         ("calibration_given_up", "A"),
         ("calibration_given_up", "A"),
     ], "again after the one more turn"
-    assert "A: 3 visits to targets have not calibrated it; the last: no beam." in told[0].text
+    assert "A: 3 visits to targets failed to calibrate it; the last visit: no beam." in told[0].text
     assert list(made.given_up) == ["A"]
     made.done("A")
     assert not told[-1].active

@@ -46,13 +46,19 @@ def test_the_file_of_an_audit_is_a_hash_chain(tmp_path: Path) -> None:
             lambda lines: [*lines[:2], lines[2].replace("TRACK", "AIM"), *lines[3:]],
             "line 3: record 1",
         ),
-        (lambda lines: [*lines[:2], *lines[4:]], "line 3: record 2 does not fit"),
-        (lambda lines: [*lines[1:]], "line 1: record 0 does not fit"),
+        (
+            lambda lines: [*lines[:2], *lines[4:]],
+            "line 3: record 2 does not match the hash chain; this record or an earlier one",
+        ),
+        (
+            lambda lines: [*lines[1:]],
+            "line 1: record 0 does not match the hash chain; this record or an earlier one",
+        ),
         (
             lambda lines: [*lines, '{"event":"accepted","identity":"x"}\n'],
             "line 7: it has no digest",
         ),
-        (lambda lines: lines[:4], "head audit:6:.* is not in it"),
+        (lambda lines: lines[:4], "head audit:6:.* is missing, so"),
     ],
 )
 def test_a_changed_audit_is_named(change: Any, text: str, tmp_path: Path) -> None:
@@ -77,7 +83,9 @@ def test_lines_of_before_and_torn_ones_are_covered(tmp_path: Path) -> None:
     assert verify(path).number == 2
     assert len(read(path)[0]) == 4
     path.write_text(path.read_text().replace('"done"', '"good"', 1))
-    with pytest.raises(FormatError, match="record new does not fit"):
+    with pytest.raises(
+        FormatError, match="record new does not match the hash chain; this record or an earlier one"
+    ):
         verify(path)
 
 

@@ -50,7 +50,7 @@ def test_equal_orders_merge_and_stronger_or_new_ones_count() -> None:
     assert scene.order("Olga")
     calls = [(call.who, call.act, call.reason) for call in scene.callers.calls]
     assert calls == [("Vera", "STOW", "smoke; a fire; at the tower"), ("Olga", "DEFOCUS", "smoke")]
-    assert scene.withdraw(by="Vera") == "it was repeated 3 times"
+    assert scene.withdraw(by="Vera") == "the order was repeated 3 times"
 
 
 def test_reasons_that_are_ever_new_fill_nothing() -> None:
@@ -63,21 +63,23 @@ def test_reasons_that_are_ever_new_fill_nothing() -> None:
 def test_a_program_that_repeats_a_withdrawn_order_pauses_and_nobody_else_does() -> None:
     scene = Scene()
     scene.flood()
-    assert "Vera's next one is taken in 30 s" in scene.withdraw()
+    assert "Vera's next order is accepted in 30 s" in scene.withdraw()
     assert scene.flood() == 200
-    with pytest.raises(RefusedError, match=r"that of Vera was withdrawn .* is taken in 2[89] s"):
+    with pytest.raises(
+        RefusedError, match=r"the order of Vera was withdrawn .* is accepted in 2[89] s"
+    ):
         scene.order()
     assert scene.order("Olga")
     scene.now += PAUSE
     assert scene.order()  # the pause has an end
     assert scene.flood() == 0
-    assert f"is taken in {2 * PAUSE:.0f} s" in scene.withdraw()
+    assert f"is accepted in {2 * PAUSE:.0f} s" in scene.withdraw()
     for _ in range(9):
         scene.now += LONGEST_PAUSE
         assert scene.order()
         scene.flood()
         told = scene.withdraw()
-    assert f"is taken in {LONGEST_PAUSE:.0f} s" in told
+    assert f"is accepted in {LONGEST_PAUSE:.0f} s" in told
     scene.now += REMEMBERED
     assert scene.order()
     assert scene.withdraw() == ""
@@ -94,7 +96,7 @@ def test_a_person_may_order_again_at_once() -> None:
         assert scene.order()
         assert scene.withdraw() == ""
     assert scene.order()
-    assert "next one is taken in 30 s" in scene.withdraw()
+    assert "next order is accepted in 30 s" in scene.withdraw()
     with pytest.raises(RefusedError):
         scene.order()
 
@@ -103,7 +105,7 @@ def test_a_person_who_presses_often_and_withdraws_it_pauses_too() -> None:
     scene = Scene()
     for _ in range(REPEATED):
         scene.order()
-    assert "next one is taken" in scene.withdraw(by="Vera")
+    assert "next order is accepted" in scene.withdraw(by="Vera")
 
 
 def test_nothing_is_kept_of_those_who_are_long_gone() -> None:

@@ -52,7 +52,7 @@ def test_a_cluster_with_other_settings_is_named_within_10_s_and_moves_on(tmp_pat
         texts = named(list(told))
         assert set(texts) == {"pod-2"}
         assert "cluster pod-2: its settings differ" in texts["pod-2"]
-        assert "the 5 other clusters, which agree among themselves" in texts["pod-2"]
+        assert "the 5 other clusters, which all have the same settings" in texts["pod-2"]
         raised = [a for a in told if a.condition == alarms.SETTINGS_DIFFER.name]
         assert [a.severity for a in raised] == [Severity.WARNING]
         assert not odd.of(Emergency)
@@ -108,9 +108,11 @@ def test_the_minority_is_named_and_all_where_there_is_no_majority(
 
 def test_the_text_says_whether_the_others_agree() -> None:
     assert "from those of B." in named_of(SAME, OTHER)["A"]
-    assert "the 2 other clusters, which agree" in named_of(SAME, OTHER, SAME)["B"]
+    assert (
+        "the 2 other clusters, which all have the same settings" in named_of(SAME, OTHER, SAME)["B"]
+    )
     text = named_of(SAME, SAME, SAME, OTHER, THIRD)["D"]
-    assert "4 of the 4 other clusters, which do not all agree" in text
+    assert "4 of the 4 other clusters, whose settings are not all the same" in text
 
 
 def test_the_alarm_waits_is_told_once_and_follows_the_others() -> None:
@@ -132,7 +134,7 @@ def test_the_alarm_waits_is_told_once_and_follows_the_others() -> None:
     # A third agrees with one of them: the other is the odd one.
     second(PATIENCE + 2.0, C=good, A=good, B=bad)
     assert set(named(told)) == {"B"}
-    assert "the 2 other clusters, which agree" in named(told)["B"]
+    assert "the 2 other clusters, which all have the same settings" in named(told)["B"]
     # An older program in its place sends none: nothing is known to differ.
     second(PATIENCE + 3.0, B=STATUS)
     assert told[-1] == alarms.SETTINGS_DIFFER.ended("B")

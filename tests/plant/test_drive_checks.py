@@ -97,7 +97,7 @@ def test_a_mirror_that_does_not_follow_joins_no_receiver(tmp_path: Path) -> None
         await diagnosed(bench, "P5A", diagnosis.STUCK_PRIMARY | diagnosis.MOVED_SECONDARY)
         (alarm,) = [a for a in plant.alarms if a.condition == alarms.DRIVE_STALLED.name]
         assert alarm.text.startswith(
-            "P5A: its primary drive made steps, and its mirror did not follow. It joins no receiver"
+            "P5A: its primary drive made steps, but its mirror did not follow. It joins no receiver"
         )
         token = plant.take_authority(ENGINEER).token
         bench.cluster_of("P5B").set(states.IDLE, "P5B")
@@ -164,8 +164,8 @@ def test_nothing_that_a_stalled_mirror_reports_proves_an_emergency(
         report = order.report(plant.now())
         assert report.not_done == ("P5A",)
         assert (
-            "P5A: its primary drive made steps, and its mirror did not follow, so nothing that it "
-            "reports proves that it is off"
+            "P5A: its primary drive made steps, but its mirror did not follow, so its reports "
+            "cannot prove that its beam is off the receiver"
         ) in report.text
         plant.acknowledge(OPERATOR, "drive_stalled", "P5A")
         await bench.wait(3.0)
@@ -198,8 +198,9 @@ def test_a_proof_says_which_mirrors_were_seen_to_follow_and_which_are_believed(
         assert {"P1A", "P5A", "P5B", "P5C"}.isdisjoint(view.believed)
         assert not view.measured
         assert view.basis == (
-            "flux on the receiver not measured, so this is believed: a stalled drive reports the "
-            "same; 2 seen to move today by photograph; 1 seen to move today by tilt sensor; "
+            "the flux on the receiver is not measured, so this is not proven, because a stalled "
+            "drive reports the same; 2 seen to move today by photograph; 1 seen to move today by "
+            "tilt sensor; "
             "14 by reports alone: P1B, P1C, P2A, P2B, P2C, P3A, P3B, P3C, …"
         )
         assert view.text.endswith(view.basis)

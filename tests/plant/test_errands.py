@@ -30,7 +30,7 @@ async def followed(ticket: Ticket, limit: float = 900.0) -> list[str]:
         await asyncio.sleep(1.0)
         if said[-1] != ticket.text:
             said.append(ticket.text)
-    raise AssertionError(f"not ended within {limit} s: {said[-5:]}")
+    raise AssertionError(f"not finished within {limit} s: {said[-5:]}")
 
 
 async def until(condition: Callable[[], bool], limit: float = 600.0) -> None:
@@ -47,7 +47,7 @@ def test_a_calibration_ends_with_its_result_and_says_what_it_waits_for() -> None
         await until(lambda: shown.automatic.view().on)
         ticket = shown.calibrate(OPERATOR, name)
         assert not ticket.finished
-        assert ticket.steps[name].startswith("it waits: "), ticket
+        assert ticket.steps[name].startswith("it is waiting: "), ticket
         said = await followed(ticket)
         assert any(f"{name}: at " in text and "photograph" in text for text in said), said
         assert ticket.good, said
@@ -60,10 +60,13 @@ def test_a_calibration_ends_with_its_result_and_says_what_it_waits_for() -> None
 @pytest.mark.parametrize(
     ("act", "reason"),
     [
-        (lambda shown, name: shown.stow(OPERATOR, (name,)), "a person has taken it away"),
+        (
+            lambda shown, name: shown.stow(OPERATOR, (name,)),
+            "an operator has taken it out of automatic control",
+        ),
         (
             lambda shown, name: shown.hold(OPERATOR, (name,), "x"),
-            "Olga has taken it out of service",
+            "Olga took it out of service",
         ),
     ],
     ids=["stowed", "out of service"],
@@ -101,7 +104,7 @@ def test_out_of_service_is_done_when_it_is_parked_and_names_who_is_not() -> None
         again = shown.hold(OPERATOR, names[:1], "washing")
         shown.unhold(OPERATOR, names[:1])
         await followed(again, 5.0)
-        assert again.refusals == {names[0]: "it was given back to service"}
+        assert again.refusals == {names[0]: "it was returned to service"}
 
     live(work, BY_HAND)
 
@@ -128,7 +131,7 @@ def test_a_lock_on_a_target_parks_what_gets_its_aim_back_on_the_way_to_stow() ->
         shown.unhold(OPERATOR, (third,))
         said = await followed(ticket, 200.0)
         assert ticket.good, said
-        assert "parked in stow; it may go up again" in ticket.text
+        assert "parked in stow; it may be raised again because" in ticket.text
         # The lock stands, and they go back to work at the receiver.
         assert [lock.name for lock in shown.automatic.service.out] == ["left"]
         await until(lambda: shown.viewer.heliostat(first).state == "TRACKING")
@@ -143,7 +146,7 @@ def test_a_calibration_waits_for_the_start_and_names_the_lock(place: str) -> Non
         await until(lambda: shown.automatic.view().on)
         shown.release_authority(ENGINEER, shown.take_authority(ENGINEER).token)
         ticket = shown.calibrate(OPERATOR, name)
-        assert ticket.steps[name] == "it waits: it is starting"
+        assert ticket.steps[name] == "it is waiting: it is starting"
         heliostats = (name,) if place == "heliostat" else ()
         shown.hold(OPERATOR, heliostats, "washing", tower=place == "tower")
         reason = "out of service" if place == "heliostat" else "the tower is locked"
@@ -166,7 +169,9 @@ def test_one_that_does_not_come_to_stow_is_named_with_an_alarm_and_the_ticket_en
         (retry,) = (one for one in shown.automatic.retries() if one.subject == name)
         assert retry.work == "stow of a heliostat out of service"
         await followed(ticket)
-        assert ticket.refusals[name].startswith("not ended within 600 s: on its way to stow: not h")
+        assert ticket.refusals[name].startswith(
+            "not finished within 600 s: on its way to stow: not h"
+        )
         found = [a for a in shown.logbook.alarms() if a.condition == "not_parked" and a.active]
         assert [alarm.subject for alarm in found] == [name]
         plant.links["C1"].plugged = True
@@ -212,7 +217,7 @@ def test_automatic_at_dusk_and_in_an_emergency_says_that_nothing_follows() -> No
         await until(lambda: shown.automatic.view().reason == "the sun is too low")
         await followed(asked, 30.0)
         assert asked.refusals == {
-            plant.names[0]: "withdrawn: the sun is too low; ask again tomorrow"
+            plant.names[0]: "withdrawn: the sun is too low; repeat the request tomorrow"
         }
         ticket = shown.give_back(OPERATOR)
         assert ticket.finished
@@ -240,8 +245,8 @@ def test_an_operation_ends_at_its_limit_and_with_the_program() -> None:
         assert slow.counted() == {"waiting": 1, "done": 1}
         await asyncio.sleep(10.0)
         errands.look()
-        assert slow.refusals == {"A": "not ended within 10 s: it waits"}
-        assert dropped == [(("A",), "not begun within 10 s")]
+        assert slow.refusals == {"A": "not finished within 10 s: it waits"}
+        assert dropped == [(("A",), "not started within 10 s")]
         errands.end("the plant's program has ended")
         assert other.refusals == {"C": "the plant's program has ended"}
 

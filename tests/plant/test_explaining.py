@@ -35,11 +35,12 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         shown.give_back(OPERATOR, (name,))
         first = shown.why(other)
         assert not first.tracks
-        assert first.text == f"{other} is STOWED: it is not given to automatic control"
+        assert first.text == f"{other} is STOWED: it is not under automatic control"
         assert (first.button, first.order) == (Button.AUTOMATIC, None)
         await asyncio.sleep(20.0)
         assert (
-            shown.why(name).text == f"{name} is APPROACHING: automatic control has it: APPROACHING"
+            shown.why(name).text
+            == f"{name} is APPROACHING: it is under automatic control: APPROACHING"
         )
         await _tracking(plant, name)
         up = shown.why(name)
@@ -60,7 +61,7 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         shown.command(OPERATOR, token, "UNLOCK", (name,))
         await asyncio.sleep(5.0)
         taken = shown.why(name)
-        assert taken.button is Button.AUTOMATIC, "a person who locks it has taken it"
+        assert taken.button is Button.AUTOMATIC, "a person who locks it took it"
 
         shown.give_back(OPERATOR, (name,))
         held = shown.why(name)
@@ -89,7 +90,7 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         await asyncio.sleep(15.0)
         silent = shown.why(name)
         assert silent.text.startswith(f"{name} is not heard for "), silent.text
-        assert "its cluster C1 has not heard it" in silent.text
+        assert "its cluster C1 receives no reply from it" in silent.text
         with pytest.raises(UnknownNameError):
             shown.why("nobody")
 
@@ -119,7 +120,9 @@ def test_work_that_is_tried_again_is_shown_with_its_end() -> None:
         await _cut(plant, "C2")
         await asyncio.sleep(10.0)
         why = shown.why(name)
-        assert "1 of 5 tries have failed (left the receiver without an order)" in why.follows, why
+        assert "1 of 5 attempts have failed (left the receiver without an order)" in why.follows, (
+            why
+        )
         assert why.button is Button.NONE
 
     live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))

@@ -385,23 +385,26 @@ def test_what_is_refused(play: Play) -> None:
             with pytest.raises(HeliotropeError, match=re.escape(said)):
                 site.intake.take_now(person, document, document.model_dump_json())
 
-        refused(good, "flight: Olga is operator; it needs engineer", OPERATOR)
+        refused(good, "flight: Olga is operator, but the command needs engineer", OPERATOR)
         stranger = good.rows[0].model_copy(update={"heliostat": "Z9"})
         refused(good.model_copy(update={"rows": [stranger]}), "heliostat 'Z9'")
         late = good.rows[0].model_copy(update={"time": 4e9})
-        refused(good.model_copy(update={"rows": [late]}), "set the clock of the drone")
+        refused(good.model_copy(update={"rows": [late]}), "set the drone's clock")
         single = good.rows[0].model_copy(update={"counts": [1.0]})
-        refused(good.model_copy(update={"rows": [single]}), "1 counts a row; P1A has 2 drives")
+        refused(good.model_copy(update={"rows": [single]}), "1 step counts, but P1A has 2 drives")
         # Poses of other heliostats: nothing is believed.
         wrong = [
             row.model_copy(update={"place_m": good.rows[-k - 1].place_m})
             for k, row in enumerate(good.rows)
         ]
-        refused(good.model_copy(update={"rows": wrong}), "mirrors cannot stand like that, f")
+        refused(
+            good.model_copy(update={"rows": wrong}),
+            "mirrors cannot have the reported orientation, f",
+        )
         assert len(site.plant.beliefs.flights) == 0
         assert site.keeper.flights() == []
         site.take(good)
-        refused(good, "flight one: Egon gave it on ")
+        refused(good, "flight one: Egon imported it on ")
 
     play(scene)
 

@@ -150,7 +150,7 @@ def test_a_setting_waits_for_the_end_of_a_visit_of_others() -> None:
     visit = SimpleNamespace(where="target 1", token=7)
     visited = plant(authority=SimpleNamespace(visited=lambda: {"A": visit}))
     (text,) = visited.reasons(Asked("ROUGH", NAMES, token=1), BEAM_REFUSED).values()
-    assert "in a visit to target 1" in text
+    assert "on a calibration visit to target 1" in text
     assert not visited.reasons(Asked("ROUGH", NAMES, token=7), BEAM_REFUSED)
     assert not visited.reasons(Asked("ROUGH", NAMES), BEAM_REFUSED), "the plant's own order"
     assert not visited.reasons(Asked("IDLE", NAMES, token=1), BEAM_REFUSED)

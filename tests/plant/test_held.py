@@ -127,7 +127,10 @@ def test_a_new_program_opens_the_lock_of_a_visit(store: AssignedFile, stage: str
         await bench.wait(10.0)
         assert mirror.orders == [], "nothing moves by itself at the start"
         if mirror.state == states.LOCKED:
-            text = "a visit that the plant's program did not survive has left it locked (since "
+            text = (
+                "a calibration visit that was cut off when the plant's program ended has left "
+                "it locked (since "
+            )
             assert plant.locked_for(NAME).startswith(text)
         token = await bench.commanded()
         for _ in range(30):
@@ -163,7 +166,7 @@ def test_a_persons_lock_stays(store: AssignedFile, when: str) -> None:
         for _ in range(30):
             await bench.wait(1.0)
             bench.plant.authority.keep(OPERATOR, token)
-        text = "locked by an order; it stays locked until a person gives UNLOCK"
+        text = "locked by an order; it stays locked until someone sends UNLOCK"
         assert bench.plant.locked_for(NAME) == text
 
     play(mirror, store, before)
@@ -186,7 +189,7 @@ def test_a_lock_from_an_old_store_is_left_to_a_person(store: AssignedFile, later
             await bench.wait(1.0)
             bench.plant.authority.keep(OPERATOR, token)
         assert mirror.orders == []
-        assert "ask, then give UNLOCK" in bench.plant.locked_for(NAME)
+        assert "ask, then send UNLOCK" in bench.plant.locked_for(NAME)
         assert await bench.plant.command(OPERATOR, token, "UNLOCK", (NAME,)).end(5.0)
         for _ in range(10):
             await bench.wait(1.0)
@@ -328,8 +331,10 @@ def test_one_heliostat_in_detail_says_why_it_is_locked(tmp_path: Path) -> None:
             kept = await locked_by_a_visit(bench)
             await bench.wait(2.0)
             text = shown.viewer.heliostat(NAME).locked
-            assert text.startswith("the visit to left of Egon has locked it since ")
-            assert text.endswith(" UTC, until its parameters are written and read back")
+            assert text.startswith("the visit to left of Egon locked it since ")
+            assert text.endswith(
+                " UTC; it stays locked until its parameters are written and read back"
+            )
             assert kept
             bench.cluster_of(NAME).mute = True
             await bench.wait(30.0)

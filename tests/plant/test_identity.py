@@ -74,14 +74,14 @@ def test_exchanged_addresses_are_named_and_neither_is_moved_or_written(
             await bench.wait(5.0)
             assert named(bench) == set(PAIR)
             text = next(a.text for a in plant.alarms if a.subject == "P5A")
-            assert "P5A: its address answers with the parameters of P5B" in text
+            assert "P5A: the board at its address holds the parameters of P5B" in text
             assert not sent(cluster, Emergency), "both are at stow"
             for name in ("APPROACH", "TRACK", "IDLE", "UNLOCK", "CLEAR_FAULT"):
-                with pytest.raises(RefusedError, match=f"{name} P5A.*its address answers with the"):
+                with pytest.raises(RefusedError, match=f"{name} P5A.*at its address holds the"):
                     plant.command(ENGINEER, token, name, PAIR)
-            with pytest.raises(RefusedError, match="ZERO P5A: its address answers with"):
+            with pytest.raises(RefusedError, match="ZERO P5A: the board at its address"):
                 plant.commands.zero(ENGINEER, token, "P5A", (0, 0))
-            with pytest.raises(RefusedError, match="PARAMETERS P5A: its address answers"):
+            with pytest.raises(RefusedError, match="PARAMETERS P5A: the board at its address"):
                 plant.parameters(ENGINEER, token, "P5A", items_of(DESIGN["P5A"].calibrated))
             ticket = plant.command(ENGINEER, token, "APPROACH", (*PAIR, "P5C"))
             assert ticket.blocked.keys() == set(PAIR)
@@ -193,7 +193,7 @@ def test_an_emergency_is_never_proven_for_boards_of_other_mirrors(tmp_path: Path
             await bench.wait(5.0)
             report = order.report(plant.now())
             assert set(report.not_done) == set(PAIR)
-            assert "so nothing that it reports proves that it is off" in report.unknown[0]
+            assert "so its reports cannot prove that its beam is off" in report.unknown[0]
             # A spare board with another mirror's journal says STOWED wherever its mirror stands.
             rows = [cluster.names.index(name) for name in PAIR]
             await bench.until(lambda: set(cluster.rows["state"][rows]) == {states.STOWED}, 60.0)
@@ -220,7 +220,10 @@ def test_a_board_with_an_armature_that_nobody_knows_proves_nothing(tmp_path: Pat
             await bench.wait(5.0)
             report = order.report(plant.now())
             assert set(report.not_done) == {"P5A"}
-            assert "P5A: its local controller stores parameters that this" in report.unknown[0]
+            assert (
+                "P5A: its local controller stores parameters that are unknown to this"
+                in report.unknown[0]
+            )
 
     run_virtual(main)
 
@@ -261,7 +264,7 @@ def test_the_other_of_a_pair_is_named_unless_it_answers_itself(tmp_path: Path) -
             await bench.wait(2.0)
             assert named(bench) == set(PAIR)
             assert bench.plant._identities.mismatched["P5B"] == (
-                "its parameters answer at the address of P5A"
+                "its parameters are stored at the address of P5A"
             )
 
     run_virtual(main)
@@ -291,9 +294,9 @@ def test_nothing_moves_before_the_boards_of_a_connection_are_known(tmp_path: Pat
             await bench.wait(0.1)
             items = items_of(DESIGN["P5A"].calibrated)
             for motion in ("IDLE", "UNLOCK"):
-                with pytest.raises(RefusedError, match=f"{motion} P5A.*has not been heard since"):
+                with pytest.raises(RefusedError, match=f"{motion} P5A.*has sent nothing since"):
                     plant.command(ENGINEER, token, motion, PAIR)
-            with pytest.raises(RefusedError, match="PARAMETERS P5A: it has not been heard since"):
+            with pytest.raises(RefusedError, match="PARAMETERS P5A: it has sent nothing since"):
                 plant.parameters(ENGINEER, token, "P5A", items)
             assert plant.defocus("Vera", PAIR)
             exchange(bench)

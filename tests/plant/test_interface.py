@@ -149,7 +149,7 @@ def _console_alarm(plant: LiveConsole, *, active: bool) -> str:
 
 
 @pytest.mark.parametrize(
-    ("how", "text"), [(signal.SIGKILL, "signal 9"), (signal.SIGSTOP, "no sign of life")]
+    ("how", "text"), [(signal.SIGKILL, "signal 9"), (signal.SIGSTOP, "has not responded")]
 )
 def test_a_console_that_dies_or_hangs_is_started_again_and_the_plant_goes_on(
     plant: LiveConsole, undisturbed: Callable[[], None], how: signal.Signals, text: str
@@ -518,7 +518,7 @@ def test_a_request_of_the_api_is_the_call_of_its_row() -> None:
         if call.request:
             assert asked(call.request)[0] == name
     for request in ("GET accounts", "PUT stow", "GET heliostats/A/B/parameters", "GET heliostats/"):
-        with pytest.raises(InputError, match="only known to the console; leave out --data"):
+        with pytest.raises(InputError, match="known only to the console; omit --data"):
             asked(request)
 
 
@@ -591,7 +591,7 @@ def test_an_aim_is_a_place_or_points_and_never_both() -> None:
     assert isinstance(_done(here, "aim", {"points": ["A"]}, point.tobytes()), Later)
     assert aimed == [(7, ["A"], "left"), (7, [1.0, 2.0, 3.0])]
     for given, blob in ((place | {"points": ["A"]}, point.tobytes()), ({"heliostats": ["A"]}, b"")):
-        with pytest.raises(InputError, match="give either where"):
+        with pytest.raises(InputError, match="specify either where"):
             _done(here, "aim", given, blob)
 
 
@@ -601,7 +601,7 @@ def test_an_aim_is_a_place_or_points_and_never_both() -> None:
 def test_a_point_that_is_none_is_refused_by_its_name(point: list[Any]) -> None:
     good = {"A": [1.0, 2.0, -100_000.0]}
     assert AimOrder(points=good).points == good
-    with pytest.raises(ValidationError, match="B: give east, north and up, m"):
+    with pytest.raises(ValidationError, match="B: specify east, north and up in m"):
         AimOrder(points=good | {"B": point})
 
 

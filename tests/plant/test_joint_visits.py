@@ -150,7 +150,7 @@ def test_one_that_is_stowed_meanwhile_drops_out_and_the_others_go_on() -> None:
         results = await here.run()
         assert gone not in sent, "what is on its way to stow is off the target"
         assert results[gone].outcome is CalibrationOutcome.TAKEN_OUT
-        assert "it left the visit: Vera ordered STOW" in results[gone].text
+        assert "it dropped out of the visit: Vera ordered STOW" in results[gone].text
         good = [r for name, r in results.items() if name != gone]
         assert {r.outcome for r in good} == {_CALIBRATED}, results
         # The codes of the others begin anew: eight photographs in a row without the light of it.
@@ -357,7 +357,7 @@ def test_automatic_control_sends_those_that_are_known_together(tmp_path: Path) -
             await asyncio.sleep(1.0)
         operations.automatic.switch(on=False)
         assert seen["right"] >= set(names[3:]), "what a person asked for"
-        assert "joint visit: 3 of 3 heliostats proven together" in told
+        assert "joint visit: the beams of 3 of 3 heliostats were identified together" in told
         assert all(plant.beliefs.count(name) for name in names)
         # The photographs are kept once, and each of the heliostats has them with its own result.
         kept: dict[str, list[PictureRow]] = {}
@@ -387,7 +387,7 @@ def test_a_plant_file_without_joint_visits_refuses_them() -> None:
                     assert clock.monotonic() < until
                     await asyncio.sleep(1.0)
                 first, second = live.names[:2]
-                with pytest.raises(RefusedError, match="allows no joint visits; ask for one"):
+                with pytest.raises(RefusedError, match="does not allow joint visits; request one"):
                     live.operations.calibrate(ENGINEER, first, together=[second])
                 assert not live.operations.automatic.view().asked
                 live.operations.calibrate(ENGINEER, first)
@@ -658,8 +658,8 @@ def test_a_joint_visit_that_is_refused_is_one_event_and_not_one_of_each() -> Non
     calibrating.ask_together(("A", "B", "C"), "left")
     assert asyncio.run(calibrating.visit("left", ready, ENGINEER, 1)) == ("A", "B", "C")
     text = (
-        "joint visit: 0 of 3 heliostats proven together; command authority: Egon has it, so "
-        "nothing was sent for automatic control; take command first"
+        "joint visit: the beams of 0 of 3 heliostats were identified together; command authority: "
+        "Egon has it, so the order of automatic control was not sent; take command first"
     )
     assert noted == [("calibration", "left", text)]
     assert not done, "no heliostat is to blame"

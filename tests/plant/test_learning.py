@@ -212,10 +212,10 @@ def test_a_failure_and_what_is_no_better_leave_in_force_what_is(tmp_path: Path) 
 
     night.step()
     for answer, said in (
-        (fails, "nothing new: its process ended with code -9; version 1 stays in force"),
+        (fails, "nothing new was learnt: its process ended with code -9; version 1 stays in force"),
         (
             lambda found: replace(found, gain=-0.1),
-            "240 photographs of 5 heliostats are foretold no",
+            "240 photographs of 5 heliostats: new values would not predict them better, so",
         ),
         (lambda found: replace(found, gain=float("nan")), "240 photographs of 5 heliostats are"),
     ):
@@ -236,7 +236,7 @@ def test_a_person_orders_it_by_day(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="nobody"):
         night.learning.order(ENGINEER, "nobody")
     night.learning.order(ENGINEER, NAME)
-    assert night.learning.views()[0].said.startswith("waits to be learnt; ")
+    assert night.learning.views()[0].said.startswith("learning is queued; ")
     night.step(night=False)
     (view,) = night.learning.views()
     assert (view.version, view.person) == (1, ENGINEER.name)

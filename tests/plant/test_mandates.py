@@ -143,7 +143,7 @@ def test_a_persons_orders_take_heliostats_out_one_by_one_and_the_others_go_on() 
         results = await visit
         assert good(results, *gone), results
         for name, order in gone.items():
-            assert f"left the visit: Vera ordered {order}" in results[name].text
+            assert f"dropped out of the visit: Vera ordered {order}" in results[name].text
             assert results[name].outcome is CalibrationOutcome.TAKEN_OUT
         stands = {"IDLE": "IDLE", "STOW": "STOWED", "DEFOCUS": "DEFOCUSED"}
         ends = {name: stands.get(gone.get(name, ""), "TRACKING") for name in here.names}
@@ -173,7 +173,9 @@ def test_an_order_to_all_ends_the_visit_in_order(stage: str, order: str) -> None
             texts = [result.text for result in (await visit).values()]
         except RefusedError as error:
             texts = [str(error)]
-        assert any(f"left the visit: Vera ordered {order}" in text for text in texts), texts
+        assert any(f"dropped out of the visit: Vera ordered {order}" in text for text in texts), (
+            texts
+        )
         ends = {"IDLE": {"IDLE"}, "STOW": {"STOWED"}, "DEFOCUS": {"DEFOCUSED"}}[order]
         if stage == "LOCKED" and order == "DEFOCUS":  # locked mirrors are unlocked at stow
             ends |= {"STOWED"}
@@ -254,9 +256,9 @@ def test_rough_stepping_waits_for_those_in_a_visit() -> None:
         token = commanded(here, VERA)
         await asyncio.sleep(3.0)
         ticket = plant.command(VERA, token, "ROUGH", (), (1,))
-        said = "it is in a visit to left; give the command again when the visit has ended"
+        said = "it is on a calibration visit to left; repeat the command when the visit has ended"
         assert ticket.refusals == dict.fromkeys(visited, said)
-        with pytest.raises(BeamError, match="in a visit to left"):
+        with pytest.raises(BeamError, match="on a calibration visit to left"):
             plant.command(VERA, token, "LOCK_AIM", (visited[0],), (1,))
         results = await visit
         assert "visit" not in ticket.refusals.get(free, "")

@@ -126,7 +126,7 @@ def test_a_book_counts_alarms_until_they_are_over_and_acknowledged() -> None:
 def test_a_book_names_all_heliostats_of_an_event_that_counts_them() -> None:
     book, many = Logbook(VirtualClock(), events=3), tuple(f"P{n}" for n in range(57))
     book.event("command", "Olga", "STOW P0, P1, P2 and 54 more", heliostats=many)
-    book.event("command", "Olga", "1 heliostats given to automatic control", heliostats=("P5",))
+    book.event("command", "Olga", "put 1 heliostats under automatic control", heliostats=("P5",))
     book.event("command", "Olga", "STOW P0, P1, P2", heliostats=many[:3])
     plain, one, all_of_them = book.events()
     assert [row.heliostats for row in (plain, one, all_of_them)] == [0, 1, 57]
@@ -291,7 +291,7 @@ def test_persons_come_before_the_automat() -> None:
             lambda: shown.give_back(VIEWER),
             lambda: shown.acknowledge(VIEWER, "records"),
         ):
-            with pytest.raises(RefusedError, match="it needs operator"):
+            with pytest.raises(RefusedError, match="the command needs operator"):
                 refused()
         with pytest.raises(RefusedError, match="a reason is needed"):
             shown.hold(OPERATOR, names[:1], " ")
@@ -344,7 +344,7 @@ def test_persons_come_before_the_automat() -> None:
         await asyncio.sleep(40.0)
         assert shown.summary().emergency
         with pytest.raises(
-            RefusedError, match=r"no emergency order of Otto stands.*Olga \(DEFOCUS"
+            RefusedError, match=r"Otto has no active emergency order.*Olga \(DEFOCUS"
         ):
             shown.withdraw(Person("Otto", Role.OPERATOR))
         with pytest.raises(RefusedError, match="withdraw the emergency of Olga: Otto is operator"):
@@ -352,7 +352,9 @@ def test_persons_come_before_the_automat() -> None:
         shown.withdraw(ENGINEER, "Olga")
         view = shown.viewer.emergency()
         assert (view.who, view.calls) == ("safety table", ())
-        assert view.reason.startswith("every order is withdrawn; it ends when an operator")
+        assert view.reason.startswith(
+            "all orders are withdrawn; the emergency ends when an operator"
+        )
         await asyncio.sleep(20.0)
         assert shown.summary().states == {"STOWED": 4}
         with pytest.raises(UnknownNameError, match="act of an emergency"):
@@ -369,7 +371,7 @@ def test_resume_ends_an_emergency_and_brings_back_what_automatic_control_had() -
         shown.stow(OPERATOR, (first,))
         shown.emergency(VIEWER, "STOW", "a fire")
         await asyncio.sleep(3.0)
-        with pytest.raises(RefusedError, match="the emergency goes on: Vera: a fire"):
+        with pytest.raises(RefusedError, match="the emergency is still active: Vera: a fire"):
             shown.resume(OPERATOR)
         shown.withdraw(ENGINEER, "Vera")
         with pytest.raises(RefusedError, match="Vera is viewer"):
@@ -380,7 +382,7 @@ def test_resume_ends_an_emergency_and_brings_back_what_automatic_control_had() -
         await asyncio.sleep(2.0)
         assert not shown.summary().emergency
         said = [event.text for event in shown.logbook.events() if event.who == "Olga"]
-        assert said[0] == "automatic control resumed: 3 heliostats given back to it"
+        assert said[0] == "automatic control resumed: 3 heliostats are under it again"
         # Which a person had stowed before stays stowed.
         await _stand(plant, ["STOWED", "TRACKING", "TRACKING", "TRACKING"], 250.0)
 
@@ -394,7 +396,7 @@ def test_resume_ends_an_emergency_and_brings_back_what_automatic_control_had() -
         await asyncio.sleep(20.0)
         assert set(_states(plant)[1:]) == {"DEFOCUSED"}
         assert shown.summary().resume == (
-            "The emergency is over: 3 heliostats wait for a person's Resume."
+            "The emergency is over: 3 heliostats wait until an operator presses Resume."
         )
         shown.give_back(OPERATOR, (second,))
         assert "2 heliostats wait" in shown.summary().resume
@@ -446,7 +448,7 @@ def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
         # Another person's lock holds too: both must be returned before it goes up again.
         other = Person("Otto", Role.OPERATOR)
         with pytest.raises(
-            RefusedError, match=r"Otto has no lock on \S+, which is locked: washing"
+            RefusedError, match=r"Otto has no lock on \S+, which others have locked: washing"
         ):
             shown.unhold(other, (name,))
         shown.hold(other, (name,), "a new gear")
@@ -763,7 +765,9 @@ def test_after_a_restart_in_an_emergency_a_person_resumes(tmp_path: Path) -> Non
         assert _waits(plant)
         shown = plant.operations
         text = shown.summary().resume
-        assert text.startswith("operator_emergency held when the last program ended; raised at ")
+        assert text.startswith(
+            "operator_emergency was active when the plant's program last ended; it was raised at "
+        )
         await _stand(plant, ["STOWED"] * 4, 100.0)
         await asyncio.sleep(20.0)
         assert _states(plant) == ["STOWED"] * 4
@@ -978,9 +982,9 @@ def test_the_work_survives_a_camera_that_fails() -> None:
 
 
 def test_work_settings_that_are_none() -> None:
-    with pytest.raises(InputError, match="heliostats a second, a beat of"):
+    with pytest.raises(InputError, match="heliostats per second, a cycle of"):
         AutomaticSettings(rate=0.0)
     with pytest.raises(InputError, match="-1 losses"):
         AutomaticSettings(losses=-1)
-    with pytest.raises(InputError, match=r"losses of 1\.5 of the field"):
+    with pytest.raises(InputError, match=r"losses_share is 1\.5; it must be"):
         AutomaticSettings(losses_share=1.5)

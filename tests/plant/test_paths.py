@@ -318,7 +318,9 @@ def test_to_standby_only_where_the_way_is_clear(tmp_path: Path) -> None:
         with pytest.raises(RefusedError, match="IDLE P5A: the beam enters walkway"):
             plant.command(OPERATOR, token, "IDLE", ("P5A",))
         await stands(bench, "P5B", states.DEFOCUSED, counts(plant, "P5B", WEST))
-        with pytest.raises(RefusedError, match="IDLE P5B: its standby point is not known here"):
+        with pytest.raises(
+            RefusedError, match="IDLE P5B: the plant does not know its standby point"
+        ):
             plant.command(OPERATOR, token, "IDLE", ("P5B",))
         rest_on(plant.standbys, (-12.0, 0.0, 8.0))
         assert np.array_equal(plant.standbys[plant.field.place("P5A")], EAST)
@@ -369,7 +371,7 @@ def test_a_search_does_not_reach_into_a_volume(tmp_path: Path) -> None:
         wide = plant.command(OPERATOR, token, "SEARCH", ("P5A",), (2e-2, 0.3))
         assert not await wide.end(10.0)
         assert "walkway" in wide.refusals["P5A"]
-        assert "while it searches" in wide.refusals["P5A"]
+        assert "during the beam search" in wide.refusals["P5A"]
 
     play(tmp_path, scene)
 
@@ -982,7 +984,9 @@ def test_an_approach_is_refused_by_name_and_the_others_go(tmp_path: Path) -> Non
     async def scene(bench: Bench) -> None:
         plant = bench.plant
         token = await bench.commanded()
-        with pytest.raises(RefusedError, match="APPROACH P5A: its standby point is not known"):
+        with pytest.raises(
+            RefusedError, match="APPROACH P5A: the plant does not know its standby point"
+        ):
             plant.command(OPERATOR, token, "APPROACH", ("P5A",))
         rest_on(plant.standbys, (4.0, 0.0, 14.0))
         free, texts = [], {}
@@ -1249,8 +1253,8 @@ def test_a_stop_that_the_safe_path_passes_is_named() -> None:
     for text in morning.values():
         assert re.fullmatch(
             r"point 1 of \d+ of the safe path, \(.*, 0\.0\) m: axis 1 would have to turn to "
-            r"-\d+\.\d°, and its stop is at -90\.0°; move the stop in the plant file, or give "
-            "other points as way_m",
+            r"-\d+\.\d°, beyond its stop at -90\.0°; move the stop in the plant file, or set other "
+            r"points in way_m",
             text,
         )
     assert not any("stop" in text for text in found(stopped, 0.0).values())

@@ -107,7 +107,7 @@ def test_the_folder_is_bounded_and_the_oldest_go_first(tmp_path: Path, most: flo
 
 def test_settings_that_contradict_each_other_are_refused() -> None:
     for wrong in ({"whole": 10.0, "last": 5.0}, {"most": 0.0}, {"whole": 0.0}):
-        with pytest.raises(InputError, match="give days above 0"):
+        with pytest.raises(InputError, match="the days must be above 0"):
             PictureSettings(**wrong)
 
 
@@ -253,7 +253,7 @@ def test_a_heliostat_is_calibrated_when_it_is_asked_for(tmp_path: Path) -> None:
         operations.calibrate(OPERATOR, last)
         operations.stow(OPERATOR, [last])
         assert operations.automatic.view().asked == ()
-        with pytest.raises(RefusedError, match="automatic control does not have it"):
+        with pytest.raises(RefusedError, match="it is not under automatic control"):
             operations.calibrate(OPERATOR, last)
         operations.take_authority(OPERATOR)
         with pytest.raises(RefusedError, match="olga has the command authority"):
@@ -299,7 +299,7 @@ def test_a_photograph_is_taken_when_it_is_asked_for(tmp_path: Path) -> None:
         view = await operations.photograph(OPERATOR, target)
         assert view.version > before
         (row,) = listed(pictures, "")
-        assert (row.target, row.text, row.at) == (target, "asked for by olga", view.at)
+        assert (row.target, row.text, row.at) == (target, "requested by olga", view.at)
         assert jpeg(pictures, row.identity) == view.jpeg
 
     live(work, tmp_path)

@@ -116,7 +116,10 @@ def test_a_command_comes_through_all_stages(tmp_path: Path) -> None:
         assert not await ticket.end()
         assert 9.0 < bench.clock.monotonic() - begin < 14.0
         assert ticket.counted() == {"done": 2, "refused": 1, "failed": 1}
-        assert ticket.refusals == {"P1A": "not in this state", "P2A": "no answer before it expired"}
+        assert ticket.refusals == {
+            "P1A": "not in this state",
+            "P2A": "no reply before the command expired",
+        }
         assert "P1A: not in this state" in ticket.text
         assert not ticket.good
 
@@ -135,16 +138,20 @@ def test_a_command_comes_through_all_stages(tmp_path: Path) -> None:
 def test_only_the_one_authority_commands(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
-        with pytest.raises(RefusedError, match="nobody has it; Olga must take command first"):
+        with pytest.raises(RefusedError, match="nobody has it, so Olga must take command first"):
             plant.command(OPERATOR, 1, "APPROACH")
-        with pytest.raises(RefusedError, match="Vera is viewer; it needs operator"):
+        with pytest.raises(RefusedError, match="Vera is viewer, but the command needs operator"):
             plant.take_authority(VIEWER)
         token = await bench.commanded()
         with pytest.raises(RefusedError, match="Olga has it and renewed it 0 s ago"):
             plant.take_authority(ENGINEER)
-        with pytest.raises(RefusedError, match="Olga has it, so nothing was sent for Olga; take"):
+        with pytest.raises(
+            RefusedError, match="Olga has it, so the order of Olga was not sent; take"
+        ):
             plant.command(OPERATOR, token + 1, "APPROACH")
-        with pytest.raises(RefusedError, match="JOG: Olga is operator; it needs engineer"):
+        with pytest.raises(
+            RefusedError, match="JOG: Olga is operator, but the command needs engineer"
+        ):
             plant.command(OPERATOR, token, "JOG", ("P1A",), (0, 10))
         with pytest.raises(RefusedError, match="a reason is needed"):
             plant.seize_authority(ENGINEER, " ")
@@ -201,11 +208,11 @@ def test_defocus_and_stow_are_taken_from_anybody(tmp_path: Path) -> None:
         ("DANCE", (), "no command"),
         ("AIM", (1.0, 2.0, 3.0), "given by aim and standby"),
         ("SET_STOW", (1, 2), "no command"),
-        ("JOG", (0,), "JOG: 1 numbers given; the wire takes 2"),
+        ("JOG", (0,), "JOG: got 1 numbers, but the command takes 2"),
         ("JOG", (0, 0.5), "cannot be sent"),
         ("JOG", (0, 2**31), "cannot be sent"),
-        ("SEARCH", (float("nan"), 1.0), "give finite numbers"),
-        ("SEARCH", (1e-3, float("inf")), "give finite numbers"),
+        ("SEARCH", (float("nan"), 1.0), "send finite numbers"),
+        ("SEARCH", (1e-3, float("inf")), "send finite numbers"),
         ("SEARCH", (1e300, 1.0), "cannot be sent"),
     ],
 )
@@ -264,7 +271,7 @@ def test_who_waits_to_join_is_dropped_when_things_change(tmp_path: Path) -> None
         plant.release_authority(OPERATOR, token)
         await bench.wait(1.0)
         assert first.finished
-        assert "changed while it waited" in first.refusals["P2A"]
+        assert "changed while it was waiting" in first.refusals["P2A"]
         assert plant.waiting == 0
 
     bench = play(tmp_path, scene, settings=settings)
@@ -349,7 +356,7 @@ def test_of_those_that_join_each_is_proven_by_its_own_way(tmp_path: Path) -> Non
             await bench.wait(2.0)
             wrong = plant._proofs.joining("TRACK", (), names, plant.now())
             alone = plant._proofs.joining("TRACK", (), names[1:], plant.now())
-            assert "its aim is not known here" in wrong.pop("P1A")
+            assert "does not know its aim" in wrong.pop("P1A")
             assert wrong == alone
 
     run_virtual(main)
@@ -380,7 +387,7 @@ def test_whose_beam_would_sweep_through_a_volume_does_not_join(tmp_path: Path) -
         other = plant.command(OPERATOR, token, "TRACK", ("P5B",))
         assert not await other.end(5.0)
         assert other.refusals == {
-            "P5B": "TRACK: its aim is not known here; give it one (AIM) first"
+            "P5B": "TRACK: the plant does not know its aim; set one (AIM) first"
         }
 
     bench = play(tmp_path, scene, volumes=(walkway,))
@@ -430,7 +437,7 @@ def test_a_status_whose_names_were_lost_is_understood_all_the_same(tmp_path: Pat
     async def scene(bench: Bench) -> None:
         await bench.wait(8.0)
         assert bench.plant.field.counted(bench.clock.monotonic()) == {"STOWED": 18}
-        assert "status without names" in bench.plant.counters.problems[0]
+        assert "status arrived before its list of names" in bench.plant.counters.problems[0]
 
     async def main(clock: VirtualClock) -> None:
         bench = Bench(clock, tmp_path)
@@ -589,5 +596,5 @@ def test_a_plant_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
     run_virtual(main)
     with pytest.raises(InputError, match=r"a lease of 1.5 s renewed every 1.0 s"):
         PlantSettings(lease=1.5)
-    with pytest.raises(InputError, match=r"a beat of 2.0 s"):
+    with pytest.raises(InputError, match=r"a cycle of 2.0 s"):
         PlantSettings(beat=2.0)

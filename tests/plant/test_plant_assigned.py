@@ -84,7 +84,7 @@ def test_what_cannot_be_kept_is_not_sent(tmp_path: Path) -> None:
             ticket = bench.plant.aim(OPERATOR, token, {"P1A": AIM})
             assert not await ticket.end(5.0)
             assert "not sent, because it cannot be stored: assigned points" in ticket.text
-            assert "No such file or directory; see to its disk" in ticket.text
+            assert "No such file or directory; check the disk" in ticket.text
             assert np.isnan(bench.plant.aims).all()
             assert not bench.cluster_of("P1A").commands("AIM")
 
@@ -107,7 +107,9 @@ def test_the_old_file_stays_until_the_new_one_is_whole(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", full)
-        with pytest.raises(AssignedError, match=r"assigned\.json: No space left on device; see to"):
+        with pytest.raises(
+            AssignedError, match=r"assigned\.json: No space left on device; check the disk"
+        ):
             store.keep({"AIM": {"A": (9.0, 9.0, 9.0)}, "STANDBY": {}})
     assert store.read() == old
     store.keep({"AIM": {}, "STANDBY": {}})
@@ -117,14 +119,23 @@ def test_the_old_file_stays_until_the_new_one_is_whole(
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("{", "no assigned points; remove it, then assign"),
-        ('{"version": 7}', "no assigned points of version 1; remove it"),
-        ('{"version": 1, "AIM": 3}', "AIM: no points by name; remove the file"),
+        ("{", "no assigned points; delete it, then assign"),
+        ('{"version": 7}', "the file is not an assigned-points file of version 1; delete it"),
+        (
+            '{"version": 1, "AIM": 3}',
+            "AIM: the points are not listed by heliostat name; delete the file",
+        ),
         (
             '{"version": 1, "AIM": {"A": [1.0, NaN, 0.0]}}',
             r"AIM of A: \[1.0, nan, 0.0\] is not a point",
         ),
-        ('{"version": 1, "AIM": {"A": [1.0]}}', r"AIM of A: \[1.0\] is not a point in ENU, m"),
+        (
+            '{"version": 1, "AIM": {"A": [1.0]}}',
+            (
+                r"AIM of A: \[1.0\] is not a point in ENU "
+                r"coordinates \(m\)"
+            ),
+        ),
     ],
 )
 def test_another_file_is_refused(tmp_path: Path, text: str, says: str) -> None:
@@ -135,9 +146,9 @@ def test_another_file_is_refused(tmp_path: Path, text: str, says: str) -> None:
 
 
 def test_points_are_checked_and_grouped() -> None:
-    with pytest.raises(InputError, match="AIM: no points; give one for each heliostat"):
+    with pytest.raises(InputError, match="AIM: no points; specify one for each heliostat"):
         points_of("AIM", {})
-    with pytest.raises(InputError, match="STANDBY: a point 1e\\+09 m away; at most"):
+    with pytest.raises(InputError, match="STANDBY: a point is 1e\\+09 m away, the limit is"):
         points_of("STANDBY", {"A": (0.0, 1e9, 0.0)})
     points = points_of("AIM", {"A": AIM, "B": STANDBY, "C": AIM})
     assert grouped("ABC", points) == {AIM: ["A", "C"], STANDBY: ["B"]}
@@ -154,7 +165,7 @@ def test_standby_points_where_an_eye_sees_more_than_one_sun_are_refused(tmp_path
             with pytest.raises(RefusedError) as refused:
                 plant.standby(OPERATOR, token, dict.fromkeys(names, balcony))
             text = str(refused.value)
-            assert text.startswith("STANDBY P1A (and 17 more): at rest its beam shines on the pl")
+            assert text.startswith("STANDBY P1A (and 17 more): at rest its beam shines on the po")
             assert "suns (limit 1); choose another standby point" in text
             assert np.isnan(plant.standbys).all()
             # One flat mirror is no more than a look at the sun; what rests there already counts.
@@ -196,9 +207,11 @@ def test_no_mirror_tracks_whose_last_aim_was_not_taken(tmp_path: Path) -> None:
             ticket = plant.command(OPERATOR, token, "TRACK", (first, second))
             assert not await ticket.end(5.0)
             assert ticket.stage(second) is Stage.DONE
-            assert ticket.refusals[first].startswith("its last aim was not taken (")
+            assert ticket.refusals[first].startswith("its latest aim was not accepted (")
             assert all(first not in message.heliostats for message in cluster.commands("TRACK"))
-            with pytest.raises(RefusedError, match=rf"SEARCH {first}: its last aim was not taken"):
+            with pytest.raises(
+                RefusedError, match=rf"SEARCH {first}: its latest aim was not accepted"
+            ):
                 plant.command(OPERATOR, token, "SEARCH", (first,), (1e-3, 5e-3))
             assert await plant.aim(OPERATOR, token, {first: AIM}).end(5.0)
             assert await plant.command(OPERATOR, token, "TRACK", (first,)).end(5.0)
@@ -244,7 +257,7 @@ def test_after_a_restart_the_plant_knows_which_points_were_not_taken(tmp_path: P
             ticket = plant.command(OPERATOR, token, "TRACK", names)
             assert not await ticket.end(5.0)
             assert ticket.refusals.keys() == {"P1A"}
-            text = "its last aim was not taken (the plant's program ended before it was ackn"
+            text = "its latest aim was not accepted (the plant's program ended before it was ackn"
             assert ticket.refusals["P1A"].startswith(text)
             assert await plant.aim(OPERATOR, token, {"P1A": AIM}).end(5.0)
             assert await plant.command(OPERATOR, token, "TRACK", ("P1A",)).end(5.0)
@@ -278,7 +291,7 @@ def test_after_a_restore_no_mirror_goes_to_a_standby_point_that_it_may_not_have(
             plant, token = bench.plant, await bench.commanded()
             await bench.wait(2.0)
             for name in ("APPROACH", "IDLE"):
-                with pytest.raises(RefusedError, match="its standby point was not taken"):
+                with pytest.raises(RefusedError, match="its standby point was not accepted"):
                     plant.command(OPERATOR, token, name, names)
             rows = [plant.field.place(name) for name in names]
             assert plant.standby_unknown[rows].all()
@@ -400,7 +413,7 @@ def test_an_earlier_aim_that_is_taken_after_a_later_one_counts(tmp_path: Path) -
             # A name that comes twice is one heliostat.
             await cluster.send(Progress(late.identity, Stage.DONE, ("P1A", "P1A")))
             await bench.wait(1.0)
-            with pytest.raises(RefusedError, match="TRACK P1A: its last aim was not taken"):
+            with pytest.raises(RefusedError, match="TRACK P1A: its latest aim was not accepted"):
                 plant.command(OPERATOR, token, "TRACK", ("P1A",))
             assert await plant.aim(OPERATOR, token, {"P1A": AIM}).end(5.0)
             assert await plant.command(OPERATOR, token, "TRACK", ("P1A",)).end(5.0)
@@ -418,7 +431,7 @@ def test_what_was_refused_is_not_taken_by_a_report_on_all(tmp_path: Path) -> Non
             cluster.stubborn.clear()
             await cluster.send(Progress(cluster.commands("AIM")[-1].identity, Stage.DONE))
             await bench.wait(1.0)
-            with pytest.raises(RefusedError, match="TRACK P1A: its last aim was not taken"):
+            with pytest.raises(RefusedError, match="TRACK P1A: its latest aim was not accepted"):
                 plant.command(OPERATOR, token, "TRACK", ("P1A",))
 
     run_virtual(main)
@@ -458,10 +471,10 @@ def test_who_waits_to_join_while_its_aim_is_refused_is_not_sent(tmp_path: Path) 
             plant.aim(OPERATOR, token, {name: OTHER})
             track = plant.command(OPERATOR, token, "TRACK", (other, name))
             await bench.wait(0.5)
-            assert track.stage(name) is None, "it waits for its turn"
+            assert track.stage(name) is None, "it is waiting its turn"
             cluster.stubborn.clear()
             assert not await track.end(10.0)
-            assert track.refusals[name].startswith("its last aim was not taken")
+            assert track.refusals[name].startswith("its latest aim was not accepted")
             assert track.stage(other) is Stage.DONE
 
     run_virtual(main)
@@ -505,7 +518,7 @@ def test_a_beam_that_did_not_leave_its_standby_point_counts_in_an_eye(tmp_path: 
             assert await plant.standby(OPERATOR, token, {first: balcony}).end(5.0)
             bench.cluster_of(first).stubborn.add(first)
             assert not await plant.standby(OPERATOR, token, {first: away}).end(5.0)
-            with pytest.raises(RefusedError, match="at rest its beam shines on the place"):
+            with pytest.raises(RefusedError, match="at rest its beam shines on the point"):
                 plant.standby(OPERATOR, token, {second: balcony})
             bench.cluster_of(first).stubborn.clear()
             assert await plant.standby(OPERATOR, token, {first: away}).end(5.0)
@@ -536,7 +549,7 @@ def test_an_aim_that_is_given_up_before_its_turn_was_never_assigned(
                 own = mandate.token if giver == "a visit" else token
                 ticket = plant.aim(ENGINEER, own, dict.fromkeys(names, target))
                 await bench.wait(1.0)
-                assert ticket.stage(names[1]) is None, "it waits for its turn"
+                assert ticket.stage(names[1]) is None, "it is waiting its turn"
                 places = dict(zip(names, (target, AIM), strict=True))
                 assert store.read()["AIM"] == places
                 assert plant.aims[rows].tolist() == [list(target), list(AIM)]
@@ -545,7 +558,7 @@ def test_an_aim_that_is_given_up_before_its_turn_was_never_assigned(
             plant.release_authority(ENGINEER, token)
             await bench.wait(1.0)
             assert ticket.stage(names[1]) is Stage.REFUSED
-            assert "changed while it waited its turn" in ticket.refusals[names[1]]
+            assert "changed while it was waiting" in ticket.refusals[names[1]]
             assert plant.aims[rows].tolist() == [list(target), list(AIM)]
             assert store.read()["AIM"] == places
             # It has the aim that it had, so it may track.

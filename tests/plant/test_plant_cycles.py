@@ -296,7 +296,7 @@ def test_a_calibration_stays_if_its_verification_cannot_be_learnt_from(
     async def once(self: CalibrationCycle, visit: Visit, mechanism: Any, why: str) -> Any:
         pushes.append(why)
         if len(pushes) == 2:
-            raise RefusedError(f"{NAME}: it waits for its turn to go to stow")
+            raise RefusedError(f"{NAME}: it is waiting its turn to go to stow")
         return await push(self, visit, mechanism, why)
 
     monkeypatch.setattr(CalibrationCycle, "_push", once)
@@ -344,12 +344,12 @@ def test_one_whose_verification_was_broken_off_moves_when_the_old_parameters_are
             await bench.wait(1.0)
             plant.authority.keep(ENGINEER, again)
             for name in ("TRACK", "REFOCUS"):
-                with pytest.raises(RefusedError, match=f"{name} P2A.*parameters that differ"):
+                with pytest.raises(RefusedError, match=f"{name} P2A.*stored parameters differ"):
                     plant.command(ENGINEER, again, name, (NAME,))
         assert cluster.stored[NAME] != old, "its beam is out: they are written at stow"
         told = [a for a in plant.alarms if a.condition == alarms.PARAMETERS_DIFFER.name]
         assert told[-1].subject == NAME
-        assert "No motion but DEFOCUS and STOW is accepted" in told[-1].text
+        assert "No motion except DEFOCUS and STOW is accepted" in told[-1].text
         plant.stow("Vera", (NAME,))
         for _ in range(70):
             await bench.wait(1.0)

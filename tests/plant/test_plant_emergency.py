@@ -82,7 +82,7 @@ def test_an_order_is_proven_or_the_nodes_are_named(tmp_path: Path) -> None:
         plant.put(FLUX_READING, 0.04)
         assert order.report(plant.now()).complete
         assert order.report(plant.now()).text.startswith(
-            "every heliostat has acknowledged and is done"
+            "every heliostat has acknowledged and reports that it is done"
         )
         # What nobody lifts goes on to stow.
         await bench.wait(35.0)
@@ -131,8 +131,9 @@ def test_where_nobody_measures_the_flux_the_proof_rests_on_the_mirrors(tmp_path:
         report = order.report(plant.now())
         assert report.complete
         assert report.text == (
-            "every heliostat has acknowledged and is done, as it reports; flux on the receiver not "
-            "measured, so this is believed: a stalled drive reports the same; 18 by reports alone: "
+            "every heliostat has acknowledged and reports that it is done; the flux on the "
+            "receiver is not measured, so this is not proven, because a stalled drive reports the "
+            "same; 18 by reports alone: "
             "P1A, P1B, P1C, P2A, P2B, P2C, P3A, P3B, …"
         )
         assert plant.sentinel.order is order
@@ -228,7 +229,9 @@ def test_an_order_that_is_withdrawn_at_once_waits_to_be_acknowledged_too(tmp_pat
         plant.raise_emergency("Olga", reason="smoke")
         plant.withdraw_emergency(OPERATOR)
         (waits,) = plant.sentinel.causes().values()
-        assert waits.startswith("every order is withdrawn; it ends when an operator acknowledges")
+        assert waits.startswith(
+            "all orders are withdrawn; the emergency ends when an operator acknowledges"
+        )
         await bench.wait(5.0)
         assert plant.sentinel.on
         plant.acknowledge(OPERATOR, "operator_emergency")
@@ -246,14 +249,16 @@ def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_pa
         token = await bench.commanded()
         plant.raise_emergency("Olga")
         await bench.wait(3.0)
-        with pytest.raises(RefusedError, match=r"APPROACH: not accepted now: an emergency holds"):
+        with pytest.raises(
+            RefusedError, match=r"APPROACH: not accepted now: an emergency is active"
+        ):
             plant.command(OPERATOR, token, "APPROACH")
         assert plant.command(OPERATOR, token, "LOCK", ("P2A",))
-        with pytest.raises(RefusedError, match="the cause has not gone"):
+        with pytest.raises(RefusedError, match="the cause is not gone"):
             plant.acknowledge(OPERATOR, "operator_emergency")
         with pytest.raises(RefusedError, match="Vera is viewer"):
             plant.withdraw_emergency(VIEWER)
-        with pytest.raises(RefusedError, match="no emergency order of Otto stands; it was ordered"):
+        with pytest.raises(RefusedError, match="no active emergency order; it was ordered"):
             plant.withdraw_emergency(Person("Otto", Role.OPERATOR))
         plant.withdraw_emergency(OPERATOR)
         with pytest.raises(RefusedError, match="Vera is viewer"):
@@ -295,8 +300,8 @@ def test_a_flood_of_orders_leaves_one_record(tmp_path: Path) -> None:
             assert plant.raise_emergency("Vera", reason="smoke") is order
         await bench.wait(2.0)
         told = plant.withdraw_emergency(ENGINEER, "Vera")
-        assert told == "it was repeated 500 times; Vera's next one is taken in 30 s"
-        with pytest.raises(RefusedError, match="EMERGENCY: that of Vera"):
+        assert told == "the order was repeated 500 times; Vera's next order is accepted in 30 s"
+        with pytest.raises(RefusedError, match="EMERGENCY: the order of Vera"):
             plant.raise_emergency("Vera", reason="smoke")
         assert plant.raise_emergency(OPERATOR.name, Act.STOW).act is Act.STOW
         await bench.wait(2.0)
@@ -324,7 +329,7 @@ def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
             return str(caught.value)
 
         both = "Otto: smoke at the tower; Olga: a person at the receiver"
-        text = "TRACK: not accepted now: an emergency holds (DEFOCUS; {})"
+        text = "TRACK: not accepted now: an emergency is active (DEFOCUS; {})"
         assert refused() == text.format(both)
         plant.withdraw_emergency(otto)
         one = "Olga: a person at the receiver"
@@ -339,13 +344,13 @@ def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
         assert (plant.sentinel.order.who, plant.sentinel.order.reason) == ("safety table", one)
         plant.withdraw_emergency(OPERATOR)
         left = (
-            "every order is withdrawn; it ends when an operator acknowledges operator_emergency, "
-            "2 s after the last withdrawal"
+            "all orders are withdrawn; the emergency ends when an operator acknowledges "
+            "operator_emergency, which is possible 2 s after the last withdrawal"
         )
         assert refused().endswith(f"(STOW; safety table: {left})")
         with pytest.raises(RefusedError) as again:
             plant.withdraw_emergency(OPERATOR)
-        assert str(again.value) == f"withdraw: no emergency order of Olga stands; {left}"
+        assert str(again.value) == f"withdraw: Olga has no active emergency order; {left}"
         await bench.wait(3.0)
         plant.acknowledge(OPERATOR, "operator_emergency")
         await bench.wait(1.0)
@@ -504,7 +509,7 @@ def test_defocus_of_some_is_repeated_until_it_is_acknowledged(tmp_path: Path) ->
         assert bench.count(states.DEFOCUSED) == 1
         bench.lines["pod-2"].heal()
         assert not await ticket.end(20.0)
-        assert ticket.refusals == {"P3A": "no answer before it expired"}
+        assert ticket.refusals == {"P3A": "no reply before the command expired"}
         assert bench.count(states.DEFOCUSED) == 2
 
         # What came after it ends the repetition.
@@ -536,7 +541,7 @@ def test_when_the_plant_ends_so_do_its_leases(tmp_path: Path) -> None:
 def test_a_row_of_a_cluster_is_acknowledged_there(tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         bench.plant.acknowledge(ENGINEER, "clock_jump", "pod-1")
-        with pytest.raises(RefusedError, match="there is no such condition"):
+        with pytest.raises(RefusedError, match="no such condition"):
             bench.plant.acknowledge(ENGINEER, "clock_jump", "pod-9")
         await bench.wait(1.0)
 
@@ -591,7 +596,7 @@ def test_drives_that_are_switched_off_away_from_stow_are_never_done(
         report = order.report(bench.plant.now())
         assert report.not_done == ("P3B",)
         assert not report.complete
-        assert "P3B: its drives are switched off at the mirror, so it is not proven" in report.text
+        assert "P3B: its drives were switched off at the heliostat" in report.text
         flags[row] = off | 1 << meanings.FLAGS.index("AT_STOW")
         await bench.wait(2.0)
         report = order.report(bench.plant.now())
@@ -622,9 +627,14 @@ def test_unknown_step_counts_are_never_done(act: Act, seen: bool, tmp_path: Path
         report = order.report(plant.now())
         assert report.not_done == ("P3B",)
         assert not report.complete
-        text = r"P3B: step counts unknown, so it is not proven to be off; "
+        text = (
+            r"P3B: its step counts are unknown, so its beam is not proven to be off the "
+            r"receiver; "
+        )
         last = r"1\d s ago it was TRACKING with its beam at \(1.0, 0.0, 15.0\) m"
-        assert re.search(text + (last if seen else "nothing is known of its beam"), report.text)
+        assert re.search(
+            text + (last if seen else "the position of its beam is unknown"), report.text
+        )
         cluster.rows["flags"][row] = 0
         cluster.set(LEADS[act.name], "P3B")
         await bench.wait(2.0)
@@ -681,7 +691,10 @@ def test_a_given_reading_counts_from_when_it_was_made_and_goes_stale_as_any_othe
             give(3.0, 0.5)
             await bench.wait(1.0)
         assert "wind_gust_stow" not in {alarm.condition for alarm in plant.alarms}
-        for age, said in ((1.5, r"is 0\.0 s older than the last one"), (2.5, r"is 1\.0 s older")):
+        for age, said in (
+            (1.5, r"is 0\.0 s older than the last reading; send"),
+            (2.5, r"is 1\.0 s older"),
+        ):
             with pytest.raises(InputError, match=said):
                 give(3.0, age)
         with pytest.raises(InputError, match=r"is 6\.0 s old, the limit is 5 s"):
@@ -700,7 +713,7 @@ def test_a_given_reading_counts_from_when_it_was_made_and_goes_stale_as_any_othe
         # A program whose clock was an hour ahead, as the plant's was, goes on once both are right.
         newest, taken = given._last["wind_gust"]
         given._last["wind_gust"] = newest + 3600.0, taken
-        with pytest.raises(InputError, match="older than the last one"):
+        with pytest.raises(InputError, match="older than the last reading; send"):
             give(3.0)
         await bench.wait(1.0)
         give(3.0)
@@ -720,11 +733,11 @@ def test_an_order_that_is_given_again_is_not_acknowledged_away(tmp_path: Path) -
             await bench.wait(3.0)
             plant.raise_emergency("Vera", reason="a person on the tower")
             await bench.wait(pause)
-            with pytest.raises(RefusedError, match="the cause has not gone"):
+            with pytest.raises(RefusedError, match="the cause is not gone"):
                 plant.acknowledge(OPERATOR, "operator_emergency")
             await bench.wait(5.0)
             assert plant.sentinel.on
-            with pytest.raises(RefusedError, match="the cause has not gone"):
+            with pytest.raises(RefusedError, match="the cause is not gone"):
                 plant.acknowledge(OPERATOR, "operator_emergency")
             plant.withdraw_emergency(ENGINEER, "Vera")
             await bench.wait(3.0)
@@ -816,7 +829,7 @@ def test_no_motion_begins_in_the_cold(tmp_path: Path) -> None:
         for _ in range(63):
             plant.authority.keep(OPERATOR, token)
             await bench.wait(1.0)
-        with pytest.raises(RefusedError, match="no reading of temperature of the air"):
+        with pytest.raises(RefusedError, match="no reading of air temperature"):
             plant.command(OPERATOR, token, "APPROACH", ("P2C",))
 
     settings = PlantSettings(sensors=frozenset({"temperature"}))

@@ -78,13 +78,13 @@ def test_records_come_back_and_open_ones_are_ended_at_the_next_start(tmp_path: P
     audit.finish("1", "done", "later")
     audit.begin(record("2"))
     audit.confirm()
-    with pytest.raises(InputError, match="a record 1 exists"):
+    with pytest.raises(InputError, match="record 1 already exists"):
         audit.begin(record("1"))
-    with pytest.raises(InputError, match="no record 1 waits"):
+    with pytest.raises(InputError, match="no record 1 is waiting"):
         audit.finish("1", "done", "later")
     audit.close()
     again = JsonLines(path, AT)
-    with pytest.raises(InputError, match="a record 2 exists"):
+    with pytest.raises(InputError, match="record 2 already exists"):
         again.begin(record("2"))
     again.close()
     found, torn = read(path)
@@ -126,10 +126,10 @@ def test_a_file_cut_at_any_byte_loses_at_most_its_last_line(
 
 def test_only_one_plant_writes(tmp_path: Path) -> None:
     audit = JsonLines(tmp_path / "a.jsonl", AT)
-    with pytest.raises(AuditError, match="another process writes to it"):
+    with pytest.raises(AuditError, match="another process is writing to it"):
         JsonLines(tmp_path / "a.jsonl", AT)
     audit.close()
-    with pytest.raises(AuditError, match=r"Is a directory; give a writable file"):
+    with pytest.raises(AuditError, match=r"Is a directory; specify a writable file"):
         JsonLines(tmp_path, AT)
 
 
@@ -143,7 +143,7 @@ def test_a_disk_that_fails_is_an_error_and_the_line_is_not_glued_to_the_next(
 
     with monkeypatch.context() as patch:
         patch.setattr("os.fsync", fail)
-        with pytest.raises(AuditError, match="Input/output error; see to its disk"):
+        with pytest.raises(AuditError, match="Input/output error; check the disk"):
             audit.begin(record("1"))
         with pytest.raises(AuditError, match="Input/output error"):
             audit.confirm()
@@ -283,7 +283,7 @@ def test_stages_never_go_back_and_nothing_follows_the_end() -> None:
     assert [ticket.stage(n) for n in "ABC"] == [Stage.ACKNOWLEDGED, Stage.REFUSED, None]
     clock.advance(10.0)
     ticket.expire(clock.monotonic())
-    assert ticket.refusals == {"B": "no", "C": "no answer before it expired"}
+    assert ticket.refusals == {"B": "no", "C": "no reply before the command expired"}
     # What is told again gives it no more time.
     ticket.advance(("A",), Stage.ACKNOWLEDGED)
     clock.advance(49.0)
@@ -291,7 +291,7 @@ def test_stages_never_go_back_and_nothing_follows_the_end() -> None:
     assert not ticket.finished
     clock.advance(1.0)
     ticket.expire(clock.monotonic())
-    assert ticket.refusals["A"] == "acknowledged, but not done within 60 s"
+    assert ticket.refusals["A"] == "acknowledged, but not completed within 60 s"
     assert ticket.text.startswith("TRACK: 1 refused, 2 failed (")
     assert "1 refused" in repr(ticket)
 
@@ -299,14 +299,14 @@ def test_stages_never_go_back_and_nothing_follows_the_end() -> None:
 def test_one_reason_of_many_heliostats_stands_once() -> None:
     names = [f"P{k:04d}" for k in range(64)]
     ticket = Ticket("1", "TRACK", names, VirtualClock(), 60.0)
-    ticket.advance(names[:57], Stage.REFUSED, "it has not been heard")
+    ticket.advance(names[:57], Stage.REFUSED, "it has sent nothing")
     ticket.advance(names[57:59], Stage.REFUSED, "it is out of service")
     for name, text in zip(names[59:62], ("a", "b", "c"), strict=True):
         ticket.advance((name,), Stage.FAILED, text)
     ticket.advance(names[62:], Stage.DONE)
     assert ticket.text == (
-        "TRACK: 2 done, 59 refused, 3 failed (57 heliostats: it has not been heard; P0057, P0058: "
-        "it is out of service; P0059: a; 2 more for other reasons)"
+        "TRACK: 2 done, 59 refused, 3 failed (57 heliostats: it has sent nothing; P0057, P0058: "
+        "it is out of service; P0059: a; 2 more refused for other reasons)"
     )
 
 
@@ -364,7 +364,7 @@ def test_aim_points_are_given_out_evenly_and_neighbours_differ() -> None:
     # Every thirtieth part of the field, as a cloud covers it, keeps the mixture.
     for part in np.array_split(which[np.argsort(bearing)], 30):
         assert np.ptp(np.bincount(part, minlength=3)) <= 1
-    with pytest.raises(InputError, match="aim points: 0 of them"):
+    with pytest.raises(InputError, match="aim points: got 0; specify"):
         spread(places, np.empty((0, 3)))
     with pytest.raises(InputError, match="aim points"):
         spread(places, (np.nan, 0.0, 0.0))
@@ -378,7 +378,7 @@ def test_a_beam_moves_by_3_mrad_about_its_aim_at_most(mrad: float, good: bool) -
     slant = np.linalg.norm(aim - armature.origin_1[rows[0]])
     beside = aim + np.array([1e-3 * mrad * slant, 0.0, 0.0])
     movements, tracks = Movements((face,), armature), np.array([True])
-    text = r"^AIM A: 3\.1 mrad beside its aim; a movement has 3 mrad at most$"
+    text = r"^AIM A: 3\.1 mrad from its aim; a movement is limited to 3 mrad$"
     with nullcontext() if good else pytest.raises(BeamError, match=text):
         movements.check(("A",), rows, aim[None], beside[None], tracks)
 
@@ -417,9 +417,14 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
             "K", count, 0.0, "gps", 0.0, 3.0, 0.1, names=names, block=rows[:count].tobytes()
         )
 
-    assert "status without names" in field.take("K", status(3), 10.0)[0]
+    assert "status arrived before its list of names" in field.take("K", status(3), 10.0)[0]
     problems = field.take("K", status(3, ("B", "A", "C")), 10.0)
-    assert problems == ["cluster K: it reports C, which is not its own; correct its configuration"]
+    assert problems == [
+        (
+            "cluster K: it reports heliostat C, which belongs to another cluster; "
+            "correct its configuration"
+        )
+    ]
     assert field.of("A", 10.0).state == "TRACKING"
     assert field.of("B", 10.0).state == "IDLE"
     gone = field.of("C", 10.0)
@@ -429,7 +434,7 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     last = 10.0 + field.limit
     for now in (last, np.nextafter(last, np.inf)):
         assert field.live(now)[0] == field.of("A", now).live == (now == last)
-    assert field.take("K", status(2), 11.0) == ["cluster K: 2 rows for 3 names"]
+    assert field.take("K", status(2), 11.0) == ["cluster K: its status has 2 records for 3 names"]
     with pytest.raises(ProtocolError, match="are not rows of"):
         field.take("K", ClusterStatus("K", 1, 0.0, "gps", 0.0, 3.0, 0.1, block=b"x"), 11.0)
     # Who falls into FAULT or silent counts as failed for ten minutes.
@@ -631,7 +636,7 @@ def test_a_mandate_outlives_its_holder_and_ends_heliostat_by_heliostat() -> None
         with pytest.raises(RefusedError, match="Vera has it"):
             authority.check(vera, mandate.token, "TRACK")
         authority.prevail(("B", "C"), "Vera ordered IDLE")
-        assert mandate.refused("AB") == {"B": "it left the visit: Vera ordered IDLE"}
+        assert mandate.refused("AB") == {"B": "it dropped out of the visit: Vera ordered IDLE"}
         assert authority.lost(mandate.token, "AB") == authority.left(mandate.token, "AB") == {"B"}
         authority.release(vera, taken)
         last = authority.token

@@ -320,11 +320,13 @@ def test_a_mirror_at_standby_names_the_witness_that_it_waits_for(tmp_path: Path)
             control = AutomaticControl(plant, Logbook(clock), settings=work)
             tasks = asyncio.create_task(control.run())
             await bench.wait(6.0)
-            why = "it waits: no independent witness confirms the sun of this plant: none of its"
+            why = (
+                "it is waiting: no independent witness confirms this plant's sun position: none of"
+            )
             steps = control.following(plant.now(), (NAME, OTHER))
-            assert steps[NAME].text.startswith(f"automatic control has it: IDLE; {why}")
+            assert steps[NAME].text.startswith(f"it is under automatic control: IDLE; {why}")
             assert steps[NAME].stage is Stage.DONE
-            assert steps[OTHER].text == "it waits for its turn: IDLE", "it cannot join"
+            assert steps[OTHER].text == "it is waiting its turn: IDLE", "it cannot join"
             assert bench.count(states.TRACKING) == 0
             plant.witnesses.take("sun sensor", plant.sun_vector(), 0.0)
             await bench.until(lambda: bench.count(states.TRACKING) > 0)
@@ -353,7 +355,7 @@ def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: P
         late.set(states.DEFOCUSED, NAME)
         await bench.until(lambda: bench.count(states.DEFOCUSED) == 0, 40.0)
         told = [each.text for each in logbook.events(100)]
-        assert "the sun is low: 1 heliostats go to stow" in told
+        assert "the sun is low, so 1 heliostats go to stow" in told
         control.give_way()
         token = await bench.commanded()
         late.set(states.DEFOCUSED, NAME)
@@ -383,7 +385,7 @@ def test_the_field_is_raised_again_once_the_sun_is_a_degree_above_where_it_was_s
             await bench.wait(15.0)
             await bench.until(lambda stowed=stowed: bench.count(states.STOWED) == stowed)
             told = [each.text for each in logbook.events(1000)]
-            assert told.count(f"the sun is low: {count} heliostats go to stow") == 1
+            assert told.count(f"the sun is low, so {count} heliostats go to stow") == 1
             assert told.count("the sun is high enough") == (elevation > 9.0)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)

@@ -121,7 +121,7 @@ def test_a_beam_is_seen_where_it_is(plant: Plant, frame: Frame, tmp_path: Path) 
 def test_a_view_taken_at_work_counts_for_the_next_photograph(plant: Plant, frame: Frame) -> None:
     target, known = plant.targets[0], plant.cameras[0]
     cameras = RealCameras(plant, Path(), SystemClock(), sources=Scripted(frame))
-    with pytest.raises(FetchError, match="camera camera: it has given no frame yet"):
+    with pytest.raises(FetchError, match="camera camera: it has not delivered a frame yet"):
         cameras.frame(target.name)
     cameras.start(unheard)
     try:
@@ -144,7 +144,7 @@ def test_a_camera_that_falls_silent_is_told_and_left_alone(plant: Plant, frame: 
     name = plant.targets[0].name
     cameras.start(told.append)
     try:
-        with pytest.raises(FetchError, match=r"camera camera: no frame for 0\.3 s; look at the"):
+        with pytest.raises(FetchError, match=r"camera camera: no frame for 0\.3 s; check the"):
             looked(cameras, name)
         assert (told[0].condition, told[0].subject, told[0].active) == ("camera", name, True)
         assert not cameras.awake(name)
@@ -191,8 +191,8 @@ def test_a_time_that_is_too_unsure_is_a_reason(plant: Plant, frame: Frame) -> No
 @pytest.mark.parametrize(
     ("source", "text"),
     [
-        ("", "names no source of its frames; add source"),
-        ("night.avi", "is a recording; give a source of live frames"),
+        ("", "does not say where its frames come from; add source"),
+        ("night.avi", "is a recording; specify a source of live frames"),
         ("nowhere", "there is no such file"),
         ("ftp://a/b", "not over ftp"),
     ],

@@ -59,7 +59,7 @@ class Desk:
 
     def _newest(self) -> Frame:
         if self.shown is None:
-            raise FetchError("camera eye: it has given no frame yet")
+            raise FetchError("camera eye: it has not delivered a frame yet")
         return self.shown
 
     def news(self, shown: Frame | None, *, old: float = 0.2, unsure: float = 0.05) -> Readings:
@@ -91,7 +91,7 @@ def test_a_reading_counts_from_when_its_frame_was_exposed(known: ReceiverReferen
 
 def test_a_camera_that_has_died_gives_no_reading(known: ReceiverReference) -> None:
     desk = Desk(known)
-    assert "has given no frame yet" in problem(desk.news(None))
+    assert "has not delivered a frame yet" in problem(desk.news(None))
     assert desk.news(frame(0)).values
     told = [desk.news(None) for _ in range(9)]
     assert [news.values for news in told] == [{}] * 9
@@ -119,7 +119,7 @@ def test_a_frozen_picture_gives_no_reading(known: ReceiverReference) -> None:
     """The stream goes on, with new times, and shows the same pixels."""
     desk, still = Desk(known), frame(0, seed=3)
     assert desk.news(still).values
-    assert "repeat themselves to the last pixel; it has frozen" in problem(desk.news(still))
+    assert "are identical in every pixel, so the camera has frozen" in problem(desk.news(still))
     for _ in range(3):
         assert desk.news(still) == Readings(), "told once"
     assert desk.news(frame(0, seed=4)).values
@@ -165,7 +165,7 @@ def test_a_frame_of_another_time_is_no_reading(
 def test_a_frame_without_a_time_is_no_reading(known: ReceiverReference) -> None:
     desk = Desk(known)
     desk.shown = frame(0)
-    assert "has no time with a zone" in problem(desk.news(None))
+    assert "has no time with a time zone" in problem(desk.news(None))
 
 
 def test_several_sensors_are_one(known: ReceiverReference, tmp_path: Path) -> None:
@@ -196,12 +196,12 @@ def test_a_reference_fits_its_plant(known: ReceiverReference) -> None:
         (replace(plant, receivers=()), "the plant's receivers: none"),
         (
             replace(plant, receivers=(RECEIVER, other)),
-            "receivers: receiver, other; .* has one receiver",
+            "receivers: receiver, other; .* exactly one receiver",
         ),
         (replace(plant, cameras=()), "the plant's cameras: none; add it"),
         (
             replace(plant, cameras=(replace(CAMERA, size=(640, 480)),)),
-            "320 × 240 px; the plant file says 640 × 480",
+            "320 × 240 px, but the plant file says 640 × 480",
         ),
         (
             replace(
@@ -209,7 +209,7 @@ def test_a_reference_fits_its_plant(known: ReceiverReference) -> None:
                 cameras=(CAMERA, replace(CAMERA, name="b")),
                 receiver_visits=ReceiverSettings("b", "receiver"),
             ),
-            "receiver visits see it by camera b",
+            "receiver visits use camera b",
         ),
     ):
         with pytest.raises(InputError, match=text):
@@ -237,7 +237,7 @@ CHOSEN = 'receiver_light = "receiver.toml"\nsensors.receiver_flux_nominal = "cam
     [
         ('sensors.receiver_flux_nominal = "camera"', "receiver_light, the reference of that cam"),
         ('receiver_light = "receiver.toml"', 'receiver_flux_nominal = "camera" and receiver_light'),
-        ('sensors.wind_gust = "camera"', "a camera gives receiver_flux_nominal only"),
+        ('sensors.wind_gust = "camera"', "a camera supplies receiver_flux_nominal only"),
     ],
 )
 def test_a_links_file_that_does_not_say_which_camera(
@@ -259,7 +259,7 @@ def test_the_check_reads_reference_and_camera(known: ReceiverReference, tmp_path
     write_plant(seen_plant(), tmp_path / "plant.toml")
     code, _, err = call(*words)
     assert code == 2
-    assert "camera eye: the plant file names no source of its frames" in err
+    assert "camera eye: the plant file does not say where its frames come from;" in err
     write_plant(replace(seen_plant(), cameras=()), tmp_path / "plant.toml")
     code, _, err = call(*words)
     assert code == 2
@@ -362,4 +362,4 @@ def _proven_while_it_is_seen(client: Client, eye: Eye) -> None:
     until(lambda: "flux not proven" not in proof(), proof)
     eye.show([frame(0, seed=40)])
     until(lambda: "flux not proven" in proof(), proof)
-    until(lambda: any("it has frozen" in text for text in told()), told)
+    until(lambda: any("camera has frozen" in text for text in told()), told)

@@ -313,7 +313,7 @@ def test_a_persons_order_takes_one_out_of_production_and_the_others_go_on() -> N
         here.during = stowed
         results = await here.run()
         assert results[gone].outcome is CalibrationOutcome.TAKEN_OUT
-        assert "it left the visit: Vera ordered STOW" in results[gone].text
+        assert "it dropped out of the visit: Vera ordered STOW" in results[gone].text
         # A sixth of the light has gone with it, and stays away: the turn has begun anew.
         assert {results[name].new for name in others} == {1}, results
         await here.until(lambda: here.states()[gone] == "STOWED")
@@ -357,7 +357,7 @@ def test_a_movement_is_refused_that_leaves_the_receiver_or_its_neighbourhood() -
         row = plant.field.place(name)
         aim = plant.aims[row].copy()
         beside = {name: aim + 0.6 * face.axes[0]}
-        with pytest.raises(BeamError, match="a movement has 3 mrad at most"):
+        with pytest.raises(BeamError, match="a movement is limited to 3 mrad"):
             plant.commands.move(ENGINEER, here.token, beside)
         small = aim + 0.1 * face.axes[0]
         stowed = here.names[1]
@@ -378,7 +378,7 @@ def test_a_movement_is_refused_that_leaves_the_receiver_or_its_neighbourhood() -
         np.testing.assert_array_equal(plant.aims[row], other)
         edge = face.point((3.45, 0.0))
         assert await plant.aim(ENGINEER, here.token, {name: edge}).end(30.0)
-        with pytest.raises(BeamError, match="not on a planar receiver"):
+        with pytest.raises(BeamError, match="not on a flat receiver"):
             plant.commands.move(ENGINEER, here.token, {name: face.point((3.55, 0.0))})
         results = await here.run(name, stowed)
         assert "inside the edge of receiver" in results[name].text
@@ -411,7 +411,7 @@ def test_automatic_control_measures_those_that_track_the_receiver(tmp_path: Path
 
         await here.until(lambda: len(told()) > 0)
         assert seen == set(names[2:5]), "what a person asked for comes first"
-        assert told() == ["receiver visit: 3 of 3 heliostats proven together"]
+        assert told() == ["receiver visit: the beams of 3 of 3 heliostats were identified together"]
         # The others are measured by themselves; who was measured already waits for its time.
         await here.until(lambda: len(told()) > 1, 1200.0)
         assert all(plant.beliefs.count(name) for name in names)

@@ -115,7 +115,7 @@ def test_a_trend_of_one_heliostat_comes_from_its_visits_and_its_telemetry(
     found = trend(keeper, kept.folder, "primary", "A", START, START + 120.0, 10)
     assert (found.at - START).tolist() == [0.0, 60.0]
     assert found.mean.tolist() == [100.0, 101.0]
-    with pytest.raises(InputError, match="archives no telemetry"):
+    with pytest.raises(InputError, match="does not archive telemetry"):
         trend(keeper, None, "primary", "A", START, START + 120.0, 10)
     with pytest.raises(UnknownNameError, match="quantity of a heliostat 'mood'"):
         trend(keeper, None, "mood", "A", START, START + 120.0, 10)

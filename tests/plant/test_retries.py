@@ -164,7 +164,7 @@ def test_what_a_person_or_an_emergency_has_ended_is_no_failure(tmp_path: Path) -
 
 def test_a_heliostat_that_a_person_orders_out_of_its_visit_has_not_failed(tmp_path: Path) -> None:
     async def scene(here: Scene) -> None:
-        here.visits.ends = TakenOutError("it left the visit: Vera ordered STOW")
+        here.visits.ends = TakenOutError("it dropped out of the visit: Vera ordered STOW")
         (name,) = await here.visit()
         assert here.schedule.entries == []
         assert here.calibrating.retries() == (), "nor has the target"
@@ -279,7 +279,7 @@ def test_a_heliostat_that_is_raised_in_vain_is_left_alone(tmp_path: Path) -> Non
             assert len(cluster.commands("APPROACH")) == RAISING.most - 1
             assert cluster.rows["state"][cluster.names.index(NAME)] == states.STOWED
             (alarm,) = (a for a in log.alarms() if a.active and a.condition == "raising_given_up")
-            assert "could not go on from where it was" in alarm.text
+            assert "could not continue from its position" in alarm.text
             (retry,) = control.retries()
             assert (retry.subject, retry.given_up) == (NAME, True)
             # A person who gives it back gives it new turns.

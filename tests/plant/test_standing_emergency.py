@@ -76,16 +76,17 @@ def test_a_plant_begins_in_the_emergency_that_held_when_its_program_ended(tmp_pa
         assert plant.sentinel.order is not None
         assert plant.sentinel.order.who == "Olga"
         assert plant.sentinel.order.reason == (
-            "a person on the tower; it held when the plant's program ended, not proven for P3B"
+            "a person on the tower; it was active when the plant's program ended, not proven for "
+            "P3B"
         )
         assert bench.count(states.DEFOCUSED) == 18
         assert {m.name for m in bench.clusters["pod-1"].of(Emergency)} == {"DEFOCUS"}
         assert "operator_emergency" in {alarm.condition for alarm in plant.alarms}
         token = plant.take_authority(OPERATOR).token
-        with pytest.raises(RefusedError, match="an emergency holds"):
+        with pytest.raises(RefusedError, match="an emergency is active"):
             plant.command(OPERATOR, token, "TRACK", ("P2A",))
         # Nobody has withdrawn it, so the row cannot be acknowledged.
-        with pytest.raises(RefusedError, match="the cause has not gone"):
+        with pytest.raises(RefusedError, match="the cause is not gone"):
             plant.acknowledge(OPERATOR, "operator_emergency")
         plant.withdraw_emergency(OPERATOR)
         await bench.wait(3.0)
@@ -116,7 +117,7 @@ def test_a_plant_that_begins_in_an_emergency_names_the_orders_that_stand(tmp_pat
     async def after(bench: Bench) -> None:
         plant, order = bench.plant, bench.plant.sentinel.order
         assert order is not None
-        text = "a person at the receiver; it held when the plant's program ended"
+        text = "a person at the receiver; it was active when the plant's program ended"
         assert (order.act, order.who, order.reason) == (Act.STOW, "Olga", text)
         token = plant.take_authority(OPERATOR).token
         with pytest.raises(RefusedError, match=r"\(STOW; Olga: a person at the receiver\)"):

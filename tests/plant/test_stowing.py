@@ -141,7 +141,7 @@ def test_what_waits_is_not_moved_but_locked(tmp_path: Path) -> None:
         token = await bench.commanded()
         ticket = bench.plant.stow("anybody")
         free, last = bench.plant.field.names[-2:]
-        with pytest.raises(BeamError, match=f"IDLE {free}: it waits for its turn to go to stow"):
+        with pytest.raises(BeamError, match=f"IDLE {free}: it is waiting its turn to go to stow"):
             bench.plant.command(OPERATOR, token, "IDLE", (free,))
         assert await bench.plant.command(OPERATOR, token, "LOCK", (last,)).end(5.0)
         await bench.wait(5.0)
@@ -162,7 +162,9 @@ def test_a_visit_ends_instead_of_taking_its_mirror_out_of_the_turn(tmp_path: Pat
         with plant.authority.mandate(engineer, token, (last,), target.name) as mandate:
             visit = Visit(plant, mandate, last, target)
             ticket = plant.stow("anybody")
-            with pytest.raises(RefusedError, match=f"{last}: it left the visit: anybody ordered"):
+            with pytest.raises(
+                RefusedError, match=f"{last}: it dropped out of the visit: anybody ordered"
+            ):
                 await visit.command("LOCK")
         assert await ticket.end(20.0), ticket.text
         assert bench.count(states.STOWED) == 18

@@ -181,7 +181,10 @@ def test_what_finds_no_place_is_counted_and_told(receivers: Callable[..., Heard]
     found = [LINE.fullmatch(message) for message in heard.messages]
     assert all(found)
     texts = [one["text"].decode() for one in found if one]
-    assert sum("14 messages were lost: more than 10 waited" in text for text in texts) == 1
+    assert (
+        sum("14 messages were lost because more than 10 were waiting" in text for text in texts)
+        == 1
+    )
     tries = [int(number) for text in texts for number in re.findall(r"try (\d+)", text)]
     assert tries == list(range(11))
     sender.close(PATIENCE)
@@ -205,7 +208,7 @@ def test_a_receiver_that_comes_back_gets_the_next_message(receivers: Callable[..
     "url", ["http://host", "host:514", "tls://", "tcp://host:99999", "udp://host/x", "tls://h:0"]
 )
 def test_other_urls_are_refused(url: str) -> None:
-    with pytest.raises(InputError, match="give udp://host, tcp://host or tls://host"):
+    with pytest.raises(InputError, match="specify udp://host, tcp://host or tls://host"):
         Receiver.read(url)
 
 

@@ -49,7 +49,7 @@ def test_heliostats_are_calibrated_at_their_time() -> None:
             assert last not in operations.automatic.view().asked
             assert not said(plant)
             await until(plant, 10, 1)
-            assert said(plant) == ["timetable: 1 of 1 heliostats asked for"]
+            assert said(plant) == ["timetable: requested 1 of 1 heliostats"]
             begun = START.replace(hour=10).timestamp()
 
             def results() -> list[str]:
@@ -78,7 +78,7 @@ def test_what_cannot_be_calibrated_is_named_once() -> None:
             plant.operations.switch_calibration(OPERATOR, on=False)
             await until(plant, 9, 5)
             (row,) = plant.operations.automatic.timetable.rows()
-            assert row.text.startswith("0 of 2 heliostats asked for; not ")
+            assert row.text.startswith("requested 0 of 2 heliostats; not ")
             assert "it is switched off" in row.text
             assert len(said(plant)) == 1
             await plant.end()

@@ -75,7 +75,10 @@ class Day:
 
 def test_none_joins_before_a_witness_has_agreed_and_each_day_anew() -> None:
     day = Day(frozenset({SENSOR}))
-    assert "none of its witnesses (sun sensor) has agreed today" in day.witnesses.refusal
+    assert (
+        "none of its witnesses (sun sensor) has confirmed the sun position today"
+        in day.witnesses.refusal
+    )
     day.witnesses.on_second(0.0)
     assert day.standing() == {"unwitnessed": Severity.ALARM}
     day.witnesses.take("another", day.sun(), 0.0)
@@ -142,7 +145,10 @@ def test_two_photographs_show_a_wrong_time_and_one_does_not() -> None:
     assert day.standing() == {}
     day.photograph(second, 120.0)
     assert day.standing() == {"sun_contradicted": Severity.ALARM}
-    assert "mrad from where the plant computes it, as a clock that is 1" in day.witnesses.refusal
+    assert (
+        "mrad from where the plant computes it, which corresponds to a clock that is 1"
+        in day.witnesses.refusal
+    )
     # What two mirrors have contradicted, one does not settle, however often; two do.
     day.photograph(second, 0.0)
     day.photograph(second, 0.0)
@@ -195,7 +201,7 @@ def test_a_plant_sends_beams_to_targets_only_until_a_witness_agrees(tmp_path: Pa
             await bench.wait(2.0)
             ticket = plant.command(OPERATOR, token, "TRACK", ("P5A", "P5B"))
             assert ticket.blocked.keys() == {"P5B"}
-            assert "no independent witness confirms the sun" in ticket.blocked["P5B"]
+            assert "no independent witness confirms this plant's sun" in ticket.blocked["P5B"]
             assert not plant.guards.reasons(Asked("APPROACH", ("P5A",)), NOT_NOW)
             plant.witnesses.take(SENSOR, sun(600.0), 0.0)
             assert (

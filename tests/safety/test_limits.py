@@ -72,7 +72,7 @@ def test_rows_of_leases_and_of_orders_cannot_be_set() -> None:
     assert {"operator_emergency", "emergency_line", "plant_link_lost", "cluster_silent"} <= fixed
     assert "sun_stale" in fixed
     for name in fixed:
-        with pytest.raises(InputError, match=f"{name}: no plant sets its numbers"):
+        with pytest.raises(InputError, match=f"{name}: its limits cannot be set in a plant file,"):
             safety.limited(CONDITIONS, {name: {"delay_s": 1.0}})
 
 
@@ -117,7 +117,7 @@ def test_rows_of_leases_and_of_orders_cannot_be_set() -> None:
         ),
         (
             {"wind_gst_stow": {"trips_m_s": 18.0}},
-            "wind_gst_stow: there is no such condition here; did you mean wind_gust_stow?",
+            "wind_gst_stow: no such condition is in this table; did you mean wind_gust_stow?",
         ),
         (
             {"pointing_disagrees": {"trips_deg": 0.2, "trips_mrad": 3.0}},

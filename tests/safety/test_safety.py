@@ -31,7 +31,7 @@ ROWS = {row.name: row for row in CONDITIONS}
 #: Row: a bad value, a safe one, what is done to what, what the line says. Written by hand
 #: from the requirements, not from the table.
 TRIPS = {
-    "operator_emergency": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "order of a person stands"),
+    "operator_emergency": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "order is active"),
     "emergency_line": (0.0, 1.0, Act.DEFOCUS, Scope.FIELD, "emergency line carries no current"),
     "nodes_unacknowledged": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "emergency order: 1"),
     "flux_after_emergency": (0.11, 0.02, Act.STOW, Scope.FIELD, "is 11 % of nominal after an em"),
@@ -66,9 +66,21 @@ TRIPS = {
         Scope.HELIOSTAT,
         "in a keep-out volume or headin",
     ),
-    "beam_unsent": (1.0, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, "on a receiver, and nobody sent it"),
-    "pointing_disagrees": (5e-3, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, r"beam 0.286° beside where it"),
-    "pointing_disagrees_many": (120.0, 0.0, Act.DEFOCUS, Scope.FIELD, "counts of 120 heliostats"),
+    "beam_unsent": (1.0, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, "on a receiver, but it was not sent"),
+    "pointing_disagrees": (
+        5e-3,
+        0.0,
+        Act.DEFOCUS,
+        Scope.HELIOSTAT,
+        r"beam is 0.286° away from where it",
+    ),
+    "pointing_disagrees_many": (
+        120.0,
+        0.0,
+        Act.DEFOCUS,
+        Scope.FIELD,
+        "counts the beams of at least 120 heliostats",
+    ),
     "cluster_time_differs": (5.0, 0.0, Act.DEFOCUS, Scope.CLUSTER, "differs from the .* by 5 s"),
     "cluster_site_differs": (0.04, 0.0, Act.DEFOCUS, Scope.CLUSTER, "site is 2.29° off that of"),
     "node_faults": (0.03, 0.0, Act.REFUSE_NEW, Scope.FIELD, "3 % of the heliostats failed"),
@@ -156,7 +168,7 @@ def test_row_holds_in_its_hysteresis_and_releases_beyond(name: str) -> None:
     if row.latched:
         (action,) = run.actions
         assert action.waits
-        assert "the cause has gone" in action.text
+        assert "the cause is gone" in action.text
     else:
         assert run.actions == []
 
@@ -195,9 +207,9 @@ def test_latched_rows_need_their_person(name: str) -> None:
         assert state is run.state
         return why
 
-    assert "the cause has not gone" in refused("Ada", AcknowledgeRole.SUPERVISOR)
+    assert "the cause is not gone" in refused("Ada", AcknowledgeRole.SUPERVISOR)
     run.feed(good, row.clear_for + 1.0)
-    assert "needs a person's name" in refused("  ", AcknowledgeRole.SUPERVISOR)
+    assert "needs the user's name" in refused("  ", AcknowledgeRole.SUPERVISOR)
     if row.role is AcknowledgeRole.SUPERVISOR:
         assert "engineer must acknowledge, not operator" in refused("Ada", AcknowledgeRole.OPERATOR)
     assert run.feed(good, 1000.0).actions, "time alone must not release"
@@ -208,14 +220,14 @@ def test_latched_rows_need_their_person(name: str) -> None:
     # The next trip is a new one.
     run.feed(bad, row.delay + 1.0)
     assert run.state.tracks[name, ""].acknowledged_by == ""
-    assert "the cause has not gone" in refused("Ada", AcknowledgeRole.SUPERVISOR)
+    assert "the cause is not gone" in refused("Ada", AcknowledgeRole.SUPERVISOR)
 
 
 def test_a_cause_that_has_just_gone_is_said_in_plain_words() -> None:
     run = Run("operator_emergency").feed(1.0, 1.0)
     refused = safety.acknowledge(run.state, "operator_emergency", "Ada", AcknowledgeRole.OPERATOR)
     assert refused[1] == (
-        "operator_emergency: the cause has not gone: an emergency order of a person stands. Keep "
+        "operator_emergency: the cause is not gone: a user's emergency order is active. Keep "
         "people away from the receiver and the beams; find the cause, then withdraw the order and "
         "acknowledge."
     )
@@ -231,8 +243,8 @@ def test_a_cause_that_has_just_gone_is_said_in_plain_words() -> None:
     )
     (action,) = run.feed(0.0, 2.0).actions
     assert action.text == (
-        "operator_emergency: the order is withdrawn; the cause has gone; DEFOCUS of the field "
-        "holds until an operator acknowledges"
+        "operator_emergency: the order is withdrawn; the cause is gone; DEFOCUS of the field "
+        "remains in force until an operator acknowledges"
     )
 
 
@@ -244,7 +256,7 @@ def test_acknowledgements_that_mean_nothing_are_refused() -> None:
 
     assert "nothing to acknowledge" in why("operator_emergency")
     assert "no such condition" in why("earthquake")
-    assert "operator_emergency C7: there is no such condition" in why("operator_emergency", "C7")
+    assert "operator_emergency C7: no such condition" in why("operator_emergency", "C7")
     run.feed(25.0, 1.0)
     assert "releases by itself" in why("wind_gust_stow")
 
@@ -349,7 +361,10 @@ def test_a_wrong_name_is_told() -> None:
     run = Run("wind_mean_stow")
     _, actions = safety.evaluate({("wind_maen", ""): Reading(3.0, 100.5)}, run.state, 100.5)
     assert [a.text for a in actions] == [
-        "reading 'wind_maen' is in no row of the safety table, so nothing watches it"
+        (
+            "reading 'wind_maen' is not used by any condition of the safety table, so nothing "
+            "monitors it"
+        )
     ]
     assert not actions[0].waits  # there is nothing to acknowledge
 
@@ -390,7 +405,7 @@ def test_autonomy_moves_the_plant_link_only() -> None:
     assert changed == ["plant_link_lost"]
     assert other["plant_link_lost"].trips == 123.0
     for wrong in (-1.0, math.nan):
-        with pytest.raises(InputError, match=r"autonomy .* must be 0 or more"):
+        with pytest.raises(InputError, match=r"autonomy .* must be finite"):
             safety.conditions(wrong)
 
 
@@ -419,7 +434,7 @@ def test_a_row_that_contradicts_itself_is_refused(
 
 
 def test_start_refuses_what_cannot_be_watched() -> None:
-    with pytest.raises(InputError, match="stands twice in the table"):
+    with pytest.raises(InputError, match="is in the table"):
         safety.start((*CONDITIONS, CONDITIONS[0]), 0.0)
     with pytest.raises(InputError, match="monotonic time must be finite"):
         safety.start(CONDITIONS, math.nan)
@@ -633,7 +648,7 @@ def test_a_proof_rests_on_the_mirrors_where_nobody_measures_the_flux() -> None:
     proof = proof.with_news(acknowledged={"A1": 0.5}).with_news(done={"A1": 12.0})
     report = proof.report(40.0)
     assert not report.complete, "A2 is not known to be done"
-    assert "1 not done: A2; flux on the receiver not measured" in report.text
+    assert "1 not done: A2; the flux on the receiver is not measured" in report.text
     assert safety.proof_readings(proof, 40.0)["flux_after_emergency", ""].value == 0.0
     report = proof.with_news(done={"A2": 41.0}).report(50.0)
     assert report.complete
@@ -702,9 +717,13 @@ def test_a_new_limiter_starts_empty_and_zero_joins_none() -> None:
     assert granted == 0
     assert limiter.admit(5, 1000.2)[1] == 2
     assert limiter.admit(-3, 2000.0)[1] == 0
-    with pytest.raises(InputError, match=r"joining rate -1\.0 mirrors/s must be 0 or more"):
+    with pytest.raises(
+        InputError, match=r"joining rate is -1\.0 heliostats/s; it must be finite and 0 or more"
+    ):
         JoinLimiter(-1.0, 5)
-    with pytest.raises(InputError, match="joining burst 0 must be a whole number from 1"):
+    with pytest.raises(
+        InputError, match="joining burst is 0; it must be a whole number of at least 1"
+    ):
         JoinLimiter(1.0, 0)
 
 

@@ -337,7 +337,7 @@ class TestSchedule:
 class TestEventsAndAlarms:
     @pytest.mark.parametrize("upper", [False, True], ids=["now", "of an older cluster"])
     def test_every_alarm_of_a_cluster_is_kept(self, keeper: Keeper, upper: bool) -> None:
-        raised = Alarm("node_silent", "A1", Severity.WARNING, "no answer for 10 s")
+        raised = Alarm("node_silent", "A1", Severity.WARNING, "no reply for 10 s")
         line = encode(raised)
         heard = decode(line.replace(b'"warning"', b'"WARNING"') if upper else line)
         assert isinstance(heard, Alarm)

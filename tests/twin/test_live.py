@@ -499,7 +499,7 @@ def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool, key: byt
         report = order.report(plant.now())
         assert report.flux is FluxProof.BELOW
         assert report.complete
-        assert "as it reports; measured: the flux is below its limit" in report.text
+        assert "reports that it is done; measured: the flux is below its limit" in report.text
         await asyncio.sleep(10.0)
         assert not [row for row in live.operations.logbook.alarms() if "flux" in row.condition]
 

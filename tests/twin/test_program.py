@@ -78,7 +78,7 @@ def test_a_folder_is_read_as_it_was_written(tmp_path: Path) -> None:
     ("before", "after", "message"),
     [
         ('C001 = "tcp"', 'C001 = "C001.toml"', "beside twin"),
-        ("none = true", "photographs = true", "no witness sees the sun of a simulated field"),
+        ("none = true", "photographs = true", "a witness cannot see the sun of a simulated field"),
     ],
 )
 def test_nothing_real_stands_beside_a_simulated_field(
@@ -202,7 +202,7 @@ def _gone(path: str) -> bytes:
 
 def test_a_field_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("heliotrope.plant.io.followed_clock._STARTING", 0.0)
-    with pytest.raises(FetchError, match="simulated field: no answer"):
+    with pytest.raises(FetchError, match="simulated field: no reply"):
         ClockReader(f"http://127.0.0.1:{free_port()}/{SECRET}")
 
 

@@ -222,7 +222,8 @@ def _local_aim(plant: "Plant", heliostat: str, aim: str | None) -> Any:
     own = plant[heliostat].aim
     if own is None:
         raise InputError(
-            f"heliostat {heliostat}: it has no aim of its own; give --aim x,y,z in metres, in its "
+            f"heliostat {heliostat}: it has no aim point of its own; give --aim x,y,z in metres, "
+            f"in its "
             "frame at zero angles"
         )
     return own

@@ -32,8 +32,11 @@ _TRIES, _PAUSE = 3, 60.0
 #: What is wrong is reported after this time, s: a key is given within a few seconds.
 _PATIENCE = 15.0
 
-_MOVES = "they take the key when they stand (stowed, locked, idle or defocused)"
-_DEAF = "they do not answer QUERY_BUS: older firmware, or no key of their own"
+_MOVES = "they accept the key once they are at rest (stowed, locked, idle or defocused)"
+_DEAF = (
+    "they do not reply to QUERY_BUS because their firmware is older or they have no key of "
+    "their own"
+)
 _OWN = "their own keys are not in the cluster's key file, or differ from it"
 
 

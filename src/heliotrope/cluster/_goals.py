@@ -234,7 +234,10 @@ class Goals:
             return None
         state = states.STATES[node.state]
         if ended or (reached and not watch.sure):
-            return f"its answer was lost, and nothing shows that it was taken; the state is {state}"
+            return (
+                f"its reply was lost, and nothing shows that the command was accepted; the "
+                f"state is {state}"
+            )
         fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
         return "" if reached else f"went to {state}{fault}"
 

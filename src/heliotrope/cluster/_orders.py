@@ -183,21 +183,26 @@ class Orders:
     def _may(self, token: int, lifetime: float, jobs: int) -> None:
         authority = self._authority()
         if authority == 0:
-            raise OrderRefusedError("nobody has command authority: the plant's lease is over")
+            raise OrderRefusedError(
+                "nobody has command authority because the plant's lease has expired"
+            )
         if token != authority:
             raise OrderRefusedError(
-                "no command authority: the token is out of date; take command authority first"
+                "no command authority, because the token is out of date; take command authority "
+                "first"
             )
         if not 0.0 < lifetime <= 3600.0:
-            raise OrderRefusedError(f"a lifetime of {lifetime:g} s; give above 0 to 3600 s")
+            raise OrderRefusedError(
+                f"a lifetime of {lifetime:g} s; it must be above 0 and at most 3600 s"
+            )
         waiting = len(self._ready) + len(self._later)
         if waiting + jobs > _MOST_JOBS:
             raise OrderRefusedError(
-                f"{waiting} orders are waiting; the limit is {_MOST_JOBS}: try again later"
+                f"{waiting} orders are waiting, the limit is {_MOST_JOBS}; try again later"
             )
         if self._gps() is None:
             raise OrderRefusedError(
-                "the local controllers have no time yet, so no command could expire"
+                "the local controllers do not know the time yet, so a command could never expire"
             )
 
     def _authority(self) -> int:
@@ -267,7 +272,9 @@ class Orders:
 
     async def _work(self, job: NodeOrder) -> None:
         if job.order.token != self._authority():
-            return self._fail(job, "command authority has changed, or the plant's lease is over")
+            return self._fail(
+                job, "the command authority has changed, or the plant's lease has expired"
+            )
         if self._clock() >= job.order.deadline:
             return self._fail(job, job.last or "not acknowledged before it expired")
         if not job.told_sent:
@@ -299,11 +306,11 @@ class Orders:
         key = b""
         if messages.who_of(messages.NUMBER_OF[step.name]) == messages.KEY:
             if step.name != "SET_ADDRESS" and not await self._knows_edition(job):
-                return self._again(job, "no answer to QUERY_STORED before it expired")
+                return self._again(job, "no reply to QUERY_STORED before the command expired")
             try:
                 edition = self._epoch.kept.next_edition(job.edition)
             except OSError as error:
-                return self._again(job, f"the edition cannot be kept: {error.strerror}")
+                return self._again(job, f"the edition cannot be stored: {error.strerror}")
             if edition is None:
                 return self._again(job, "the cluster's disk has not stored the edition yet")
             head, key = (*head, edition), node.member.key
@@ -324,8 +331,8 @@ class Orders:
             return self._judge(job, answer.values[2], lost=job.unanswered or answer.attempt > 0)
         job.unanswered = True
         if step.name in _RELATIVE:
-            return self._fail(job, f"no answer to {step.name}; it may have been taken")
-        return self._again(job, f"no answer to {step.name} before it expired")
+            return self._fail(job, f"no reply to {step.name}; the controller may have accepted it")
+        return self._again(job, f"no reply to {step.name} before the command expired")
 
     async def _give_address(self, job: NodeOrder, head: tuple[int, ...], key: bytes) -> None:
         """Broadcast to an unknown address; then ask the node by its serial number."""
@@ -344,7 +351,9 @@ class Orders:
         )
         answers = [] if data is None else heard(data, sequence)[0]
         if not answers:
-            return self._again(job, f"no answer from serial number {serial} before it expired")
+            return self._again(
+                job, f"no reply from serial number {serial} before the command expired"
+            )
         if answers[0].address != address:
             return self._again(
                 job,
@@ -374,13 +383,15 @@ class Orders:
         step, node = job.step, job.node
         data = await self._stored(job, step.item)
         if data is None:
-            return self._again(job, f"no answer to QUERY_STORED of {step.item} before it expired")
+            return self._again(
+                job, f"no reply to QUERY_STORED of {step.item} before the command expired"
+            )
         same = data == step.data
         if same and step.item == "armature":
             asked_at = self._clock()
             await self._look(node)
             if node.status_at < asked_at:
-                return self._again(job, "no answer to QUERY_STATUS before it expired")
+                return self._again(job, "no reply to QUERY_STATUS before the command expired")
             same = node.status[7] == crc32(data)
         if not same:
             return self._fail(

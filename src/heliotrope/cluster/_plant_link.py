@@ -110,7 +110,7 @@ class PlantLink:
         elif isinstance(message, Acknowledge):
             self._take_acknowledgement(message)
         elif isinstance(message, ClusterStatus | Progress | Alarm | Answer):
-            text = f"a {message.kind} came from the plant; only clusters send it"
+            text = f"the plant sent a {message.kind} message, which only clusters may send"
             self._reports.event(alarms.PLANT_UNINTELLIGIBLE.raised(problem=text))
 
     def _take_acknowledgement(self, message: Acknowledge) -> None:
@@ -118,7 +118,7 @@ class PlantLink:
             role = AcknowledgeRole[message.role.upper()]
         except KeyError:
             known = " or ".join(role.name.lower() for role in AcknowledgeRole)
-            refusal: str | None = f"role {message.role!r} is not known; give {known}"
+            refusal: str | None = f"role {message.role!r} is not known; specify {known}"
         else:
             refusal = self._watch.acknowledge(message.condition, message.who, role)
         stage = Stage.REFUSED if refusal else Stage.DONE

@@ -159,9 +159,13 @@ class Polling:
     def _report_silence(self, node: ClusterNode, limit: float) -> None:
         out = node.known and node.state in states.BEAM_OUT
         if not node.known:
-            last = "never heard" if node.heard_at < self._started else "its state was never heard"
+            last = (
+                "never heard"
+                if node.heard_at < self._started
+                else ("it has never reported its state")
+            )
         elif self._clock.monotonic() - node.heard_at <= limit:
-            last = f"it is {states.STATES[node.state]} and does not tell its step counts"
+            last = f"it is {states.STATES[node.state]} and does not report its step counts"
             last += "; the position of its beam is unknown" if out else ""
         else:
             last = f"its last state was {states.STATES[node.state]}"

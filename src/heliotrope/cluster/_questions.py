@@ -74,7 +74,7 @@ class Questions:
             self._record(ask)
         else:
             known = "checksums, stored, diagnosis, statistics, discover, frames"
-            self._error(ask, f"question {ask.what!r} is not known; give one of {known}")
+            self._error(ask, f"query {ask.what!r} is not known; use one of {known}")
 
     def statistics(self) -> dict[str, Any]:
         """Return the counts of each node."""
@@ -97,7 +97,7 @@ class Questions:
 
     def _record(self, ask: Ask) -> None:
         if self._bus.recording:
-            self._error(ask, "another person records it now; ask again in ten seconds")
+            self._error(ask, "another user is recording it; try again in ten seconds")
         else:
             self._recording = ask.identity
             self._bus.record()

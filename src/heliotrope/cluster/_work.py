@@ -51,7 +51,7 @@ class Work:
         elif isinstance(message, Command):
             self._orders.accept(message, nodes)
         else:
-            refusal = f"{message.name!r} is not an emergency; give DEFOCUS or STOW"
+            refusal = f"{message.name!r} is not an emergency order; order DEFOCUS or STOW"
             self._reports.add(message.identity, Stage.REFUSED, text=refusal)
 
     def _take_emergency(self, identity: str, name: str, nodes: list[ClusterNode]) -> None:

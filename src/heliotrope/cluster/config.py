@@ -41,7 +41,7 @@ class Member:
 
     def __post_init__(self) -> None:
         if not self.name:
-            raise InputError(f"heliostat at address {self.address}: it has no name; give one")
+            raise InputError(f"heliostat at address {self.address}: it has no name; enter one")
         for what, value, low, high in (
             ("address", self.address, 1, wire.BROADCAST - 1),
             ("serial number", self.serial, 0, 0xFFFFFFFF),
@@ -102,10 +102,10 @@ class ClusterConfig:
         at = f"cluster {self.name!r}"
         limited(watched_by(CONDITIONS, Watcher.CLUSTER), self.limits)
         if not self.name:
-            raise InputError(f"{at}: it has no name; give one")
+            raise InputError(f"{at}: it has no name; enter one")
         if not 1 <= len(self.heliostats) <= MOST_MEMBERS:
             raise InputError(
-                f"{at}: {len(self.heliostats)} heliostats; one bus carries 1 to {MOST_MEMBERS}"
+                f"{at}: {len(self.heliostats)} heliostats; one bus supports 1 to {MOST_MEMBERS}"
             )
         for what in ("name", "address", "serial"):
             values = [getattr(member, what) for member in self.heliostats]

@@ -21,13 +21,14 @@ from heliotrope.sun import Site
 _CHRONY = "chronyd now keeps the computer's clock"
 #: Keys of ``[time]`` in the first edition, and what to do instead.
 _OLD_TIME = {
-    "source": f"{_CHRONY}, also from a receiver: remove the key, or state error_s for a clock "
-    "that you vouch for",
+    "source": f"{_CHRONY}, also with a receiver: remove the key, or state error_s for a clock that "
+    f"you guarantee",
     "url": f'{_CHRONY}: give the receiver\'s port to gpsd, and write gpsd = "localhost"',
     "baud_rate": f"{_CHRONY}: give the baud rate to gpsd, and remove the key",
     "latency_s": f"{_CHRONY}: state the receiver's latency as the offset of chronyd's refclock, "
     "and remove the key",
-    "system_tolerance_s": "clock and receiver may always be 2 s apart; remove the key",
+    "system_tolerance_s": "the permitted difference between clock and receiver is fixed at 2 s; "
+    "remove the key",
     "ntp": "the kernel is asked unless error_s is stated; remove the key",
     "drift_ppm": "the kernel's bound grows by 500 ppm; remove the key",
 }
@@ -51,15 +52,18 @@ class BusTable(Table):
 
     url: str = Field(min_length=1, description="`/dev/ttyUSB0` or `socket://host:port`.")
     baud_rate: int = Field(115200, ge=1200, le=4_000_000, description="Bits per second.")
-    echo: bool = Field(False, description="The adapter hears its own frames.")
+    echo: bool = Field(False, description="The adapter receives its own frames.")
     answer_s: float = Field(
         0.05,
         ge=0.001,
         le=1.0,
-        description="Time limit from the end of a question to the whole answer.",
+        description="Time limit from the end of a query to the complete reply.",
     )
     stored_answer_s: float = Field(
-        0.6, ge=0.001, le=2.0, description="The same where flash is written before the answer."
+        0.6,
+        ge=0.001,
+        le=2.0,
+        description="The same limit where flash memory is written before the reply.",
     )
 
 
@@ -88,7 +92,7 @@ class TimeTable(Table):
         None,
         gt=0.0,
         le=0.5,
-        description="Bound of the clock's error that you vouch for; default: ask the kernel.",
+        description="Bound of the clock error that you guarantee; default: ask the kernel.",
     )
     gpsd: str = Field(
         "",
@@ -241,7 +245,7 @@ class Installation:
         """
         keys = Keys(self.key_file, HELIOSTATS)
         if not keys.plant:
-            raise FormatError(self.key_file, "its key is gone; the link needs it", "plant")
+            raise FormatError(self.key_file, "its key is missing, but the link needs it", "plant")
         self.plant_keys.keys, self.password.word = keys.plant, keys.password
 
     def take_bus_keys(self) -> None:

@@ -145,7 +145,7 @@ def _read(path: Path) -> tuple[int, int]:
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _LARGEST:
             raise FormatError(
                 path,
-                "holds no epoch and edition (0 to 4294967295); restore or remove it while "
-                "the time is known: the epoch then comes from the time",
+                "contains no epoch and edition (0 to 4294967295); restore or delete it while the "
+                "time is known, because the epoch is then derived from the time",
             )
     return int(epoch), int(edition)

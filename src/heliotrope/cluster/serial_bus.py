@@ -49,7 +49,7 @@ class BusSettings:
     gap
         Silence before a frame, in s; None: 3.5 characters, at least 1.75 ms, as on Modbus.
     echo
-        The adapter hears its own frames.
+        The adapter receives its own frames.
     first_pause, longest_pause
         Pauses between attempts to open the port, in s.
     open_limit
@@ -71,9 +71,9 @@ class BusSettings:
     def __post_init__(self) -> None:
         low, high = _BAUD_RATES
         if not low <= self.baud_rate <= high:
-            raise InputError(f"bus: {self.baud_rate} baud; give {low} to {high}")
+            raise InputError(f"bus: {self.baud_rate} baud; the range is {low} to {high}")
         if self.gap is not None and not 0.0 <= self.gap <= 1.0:
-            raise InputError(f"bus: a gap of {self.gap} s; give 0 to 1 s, or none")
+            raise InputError(f"bus: a gap of {self.gap} s; the range is 0 to 1 s, or none")
         if not 0.0 < self.first_pause <= self.longest_pause:
             raise InputError(
                 f"bus: pauses of {self.first_pause} s to {self.longest_pause} s between attempts; "
@@ -250,7 +250,7 @@ class SerialBus:
                     port, transport = await self._open_port()
             except (OSError, ValueError, serialx.SerialException) as error:
                 self.statistics.failures += 1
-                self.problem = f"{self._url} cannot be opened ({str(error) or 'it takes too long'})"
+                self.problem = f"{self._url} cannot be opened ({str(error) or 'timed out'})"
             else:
                 backoff.reset()
                 await self._hold(port, transport)

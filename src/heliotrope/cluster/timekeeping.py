@@ -264,7 +264,11 @@ class SystemTime:
         now = self._clock.monotonic()
         error = self._error if self._bound is None else self._bound.at(now, jumped=jumped)
         if utc < NOT_BEFORE:
-            return math.inf, "none", f"the computer's clock says {utc:%Y-%m-%d}: it was never set"
+            return (
+                math.inf,
+                "none",
+                (f"the computer's clock shows {utc:%Y-%m-%d}, so it was never set"),
+            )
         if error == math.inf:
             return math.inf, "none", "the computer's clock is not disciplined; is chronyd running?"
         if error > LARGEST_ERROR:
@@ -272,9 +276,9 @@ class SystemTime:
         ahead = None if self._gpsd is None else self._gpsd.ahead
         if ahead is not None and abs(ahead) > CONTRADICTION:
             note = (
-                f"the computer's clock is {ahead:+.1f} s from the receiver, more than "
-                f"{CONTRADICTION:g} s: one of them is wrong; chronyc sources shows what chronyd "
-                "goes by"
+                f"the computer's clock is {ahead:+.1f} s from the receiver, the limit is "
+                f"{CONTRADICTION:g} s; one of the two is wrong; chronyc sources shows which source "
+                f"chronyd uses"
             )
             return math.inf, "none", note
         if self._bound is not None and now - self._bound.renewed_at > _FRESH:

@@ -43,10 +43,10 @@ class Drive:
         if kind not in (ROTARY, JACK_RISING, JACK_FALLING):
             raise ValueError("drive: unknown kind")
         if len(numbers) != 10 or not finite(numbers) or not math.isfinite(bias):
-            raise ValueError("drive: give 10 finite numbers and a finite bias")
+            raise ValueError("drive: it needs 10 finite numbers and a finite bias")
         self.kind, self.numbers, self.bias = kind, numbers, bias
         if numbers[RATE] == 0.0 or abs(1.0 + numbers[SCALE]) < 1e-3:
-            raise ValueError("drive: it stands still; rate 0 or scale −1")
+            raise ValueError("drive: it cannot move because the rate is 0 or the scale is −1")
         worm = abs(numbers[WORM_COS]) + abs(numbers[WORM_SIN])
         self.span = (worm + abs(numbers[SAG])) / abs(1.0 + numbers[SCALE])
         self.eps = epsilon(numbers[RATE] * 0.0 + 1.0)
@@ -54,11 +54,11 @@ class Drive:
         if kind == ROTARY:
             swing = worm * abs(numbers[WORM_RATIO]) + abs(numbers[SAG])
             if swing >= abs(1.0 + numbers[SCALE]):
-                raise ValueError("drive: worm and sag would run it backwards")
+                raise ValueError("drive: the worm and sag terms would reverse its direction")
             return
         k, c, r = numbers[STROKE], numbers[OFFSET], numbers[RADIUS]
         if not (c > 0.0 and r > 0.0 and abs(c - r) < k < c + r):
-            raise ValueError("drive: the jack's sides make no triangle")
+            raise ValueError("drive: the jack's three sides do not form a triangle")
         self.sense = 1.0 if kind == JACK_RISING else -1.0
         self.folded = self._triangle(k)
 

@@ -86,11 +86,11 @@ class Pointing:
 
     def __init__(self, numbers: tuple[float, ...]) -> None:
         if len(numbers) != 18 or not finite(numbers):
-            raise ValueError("armature: give 18 finite numbers")
+            raise ValueError("armature: it needs 18 finite numbers")
         vectors = [(numbers[i], numbers[i + 1], numbers[i + 2]) for i in range(0, 18, 3)]
         for i in (0, 2, 5):
             if abs(norm(vectors[i]) - 1.0) > 1e-3:
-                raise ValueError("armature: axes and normal must be of length 1")
+                raise ValueError("armature: the axes and the normal must be unit vectors")
         self.origin = vectors[1]
         self.one = numbers[0] * 0.0 + 1.0
         self.eps = epsilon(self.one)
@@ -103,7 +103,9 @@ class Pointing:
         self.b_flat = across(b, a)
         flat = across(u, b)
         if not (norm(self.c) > 1e-3 and norm(flat) > 1e-6):
-            raise ValueError("armature: axes parallel, or normal along the secondary axis")
+            raise ValueError(
+                "armature: the axes are parallel, or the normal is parallel to the secondary axis"
+            )
         self.ab, self.ub = dot(a, b), dot(u, b)
         self.inverse = 1.0 / dot(self.c, self.c)
         scale = 1.0 / dot(flat, flat)

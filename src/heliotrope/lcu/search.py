@@ -25,7 +25,7 @@ class Spiral:
         if not (math.isfinite(pitch) and math.isfinite(radius) and pitch > 0.0 and radius > 0.0):
             raise ValueError("search: pitch and radius must be finite and above 0")
         if math.pi * radius * radius > self.MOST * pitch * pitch:
-            raise ValueError("search: too many points; a wider pitch or a smaller radius")
+            raise ValueError("search: too many points; choose a wider pitch or a smaller radius")
         self.pitch, self.radius = pitch, radius
         self.turned = 0.0
         self.offset = [0.0, 0.0]

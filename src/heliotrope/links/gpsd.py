@@ -246,7 +246,7 @@ class Gpsd:
                 async with asyncio.timeout(_OPEN_LIMIT):
                     reader, writer = await asyncio.open_connection(self._host, self._port)
             except (OSError, TimeoutError) as error:
-                self._trouble = f"no connection ({str(error) or 'it takes too long'})"
+                self._trouble = f"no connection ({str(error) or 'timed out'})"
             else:
                 await self._listen(reader, writer)
                 backoff.reset()

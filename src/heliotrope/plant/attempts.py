@@ -62,7 +62,7 @@ class Retry:
     reason
         Why it failed last.
     left
-        Time until the next try, s; 0: at the next occasion; infinite: there is none by itself.
+        Time until the next try, s; 0: at the next opportunity; infinite: there is none by itself.
     given_up
         Whether it was given up.
     following

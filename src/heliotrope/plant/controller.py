@@ -456,7 +456,8 @@ class PlantController:
                 self._clusters.take_answer(message)
             case _:
                 raise ProtocolError(
-                    f"{type(message).__name__.lower()}: a cluster must not send this kind"
+                    f"{type(message).__name__.lower()}: clusters are not allowed to send this "
+                    f"message type"
                 )
 
     def _sent(
@@ -599,7 +600,7 @@ class PlantController:
             If this person's order was withdrawn repeatedly; see `Callers`.
         """
         if act not in (Act.DEFOCUS, Act.STOW):
-            raise InputError(f"emergency: {act.name} cannot be ordered; give DEFOCUS or STOW")
+            raise InputError(f"emergency: {act.name} cannot be ordered; order DEFOCUS or STOW")
         at = self.clock.utc().timestamp()
         return self.sentinel.call(who, act, reason or f"emergency order of {who}", at)
 
@@ -920,7 +921,7 @@ def _checked(design: Plant, links: Mapping[str, Link]) -> Mapping[str, Sequence[
     odd = sorted(set(members) ^ set(links))
     if odd:
         raise InputError(
-            f"plant: cluster {odd[0]} has heliostats or a link, but not both; correct the plant "
-            "file or the links"
+            f"plant: cluster {odd[0]} is in only one of the plant file and the links file; add it "
+            f"to the other file or remove it"
         )
     return members

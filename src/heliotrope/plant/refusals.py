@@ -47,7 +47,7 @@ def by_reason(reasons: Mapping[str, str], most: int = 3) -> str:
     ordered = sorted(groups.items(), key=lambda group: -len(group[1]))
     parts = [f"{_several(names)}: {text}" for text, names in ordered[:most]]
     if left := sum(len(names) for _, names in ordered[most:]):
-        parts.append(f"{left} more for other reasons")
+        parts.append(f"{left} more refused for other reasons")
     return "; ".join(parts)
 
 
@@ -83,298 +83,319 @@ class Refusal:
 
 ROLE_TOO_LOW = Refusal(
     "role too low",
-    "The person's role does not allow it.",
-    "{what}: {person} is {role}; it needs {needed}",
-    "Ask a person with that role. DEFOCUS, STOW and EMERGENCY need none.",
+    "The user's role does not allow the command.",
+    "{what}: {person} is {role}, but the command needs {needed}",
+    "Ask a user with that role. DEFOCUS, STOW and EMERGENCY need no role.",
 )
 NO_AUTHORITY = Refusal(
     "no command authority",
     "Nobody has the command authority, or it has expired.",
-    "command authority: nobody has it; {person} must take command first",
-    "Take command, then give the command again.",
+    "command authority: nobody has it, so {person} must take command first",
+    "Take command, then repeat the command.",
 )
 OTHER_AUTHORITY = Refusal(
-    "another's command authority",
-    "Another person has the command authority, or the token is of an earlier grant.",
-    "command authority: {holder} has it, so nothing was sent for {person}; take command first",
-    "Ask the holder to give it back, or break it with a reason.",
+    "command authority held by another user",
+    "Another user has the command authority, or the token belongs to an earlier grant.",
+    "command authority: {holder} has it, so the order of {person} was not sent; take command first",
+    "Ask the holder to release it, or break it and state a reason.",
 )
 AUTHORITY_HELD = Refusal(
     "command authority held",
-    "A person takes the command authority while another holds it.",
-    "command authority: {holder} has it and renewed it {age:.0f} s ago; ask for it, or break it",
-    "Ask the holder to give it back, or break it with a reason.",
+    "A user takes the command authority while another user holds it.",
+    "command authority: {holder} has it and renewed it {age:.0f} s ago; ask the holder to release "
+    "it, or break it",
+    "Ask the holder to release it, or break it and state a reason.",
 )
 HOLDER_OUTRANKS = Refusal(
     "holder's role higher",
-    "A person breaks the command authority of a holder with a higher role.",
-    "command authority: {holder} has it as {holder_role}; {person} as {role} cannot break it; "
+    "A user tries to break the command authority of a holder with a higher role.",
+    "command authority: {holder} has it as {holder_role}, so {person} as {role} cannot break it; "
     "DEFOCUS and STOW need no authority",
-    "Ask the holder. DEFOCUS, STOW and EMERGENCY remain open to everybody.",
+    "Ask the holder. Anyone can still order DEFOCUS, STOW and EMERGENCY.",
 )
 REASON_MISSING = Refusal(
     "reason missing",
-    "A command that needs a reason for the audit was given without one.",
-    "{what}: a reason is needed; give one",
-    "Give a reason.",
+    "A command that needs a reason for the audit was sent without a reason.",
+    "{what}: a reason is needed; enter one",
+    "Enter a reason.",
 )
 SECOND_PERSON = Refusal(
-    "second person needed",
-    "The author of a change approves or refuses it.",
-    "change {number} of {heliostat}: {person} asked for it, so another engineer must decide",
+    "second engineer needed",
+    "The author of a change tries to approve or refuse it.",
+    "change {number} of {heliostat}: {person} requested it, so another engineer must decide",
     "Ask another engineer with an account of their own, or withdraw the change.",
 )
 NOT_AUTHOR = Refusal(
     "not the author",
-    "A person withdraws a change that another has asked for.",
-    "change {number} of {heliostat}: {author} asked for it; {person} can refuse it",
-    "Refuse it with a reason, or ask its author.",
+    "A user tries to withdraw a change that another user requested.",
+    "change {number} of {heliostat}: {author} requested it, so {person} can only refuse it",
+    "Refuse it with a reason, or ask its author to withdraw it.",
 )
 CHANGE_WAITS = Refusal(
     "change waits",
-    "Another change of the same heliostat's parameters waits for its approval.",
-    "parameters {heliostat}: change {number} of {author} waits for approval; nothing was asked for",
-    "Have it approved or refused first, or let its author withdraw it.",
+    "Another change of the same heliostat's parameters is waiting for approval.",
+    "parameters {heliostat}: change {number} of {author} is waiting for approval, so no new change "
+    "was requested",
+    "Have that change approved, refused or withdrawn first.",
 )
 CHANGE_OVERTAKEN = Refusal(
     "change overtaken",
-    "The time of the change was over, or the heliostat has had new parameters since.",
-    "change {number} of {heliostat}: {reason}; it has ended",
-    "Compare the versions, and ask for the change again if it is still right.",
+    "The time limit for approval has passed, or the heliostat has received new parameters since.",
+    "change {number} of {heliostat}: {reason}, so it is no longer valid",
+    "Compare the versions, and request the change again if it is still right.",
 )
 NOT_NOW = Refusal(
     "not accepted now",
-    "An emergency holds, a row of the safety table refuses new motions, or a second plant runs.",
+    "An emergency is active, a condition of the safety table blocks new motions, or a second plant "
+    "is running.",
     "{what}: not accepted now: {reason}",
-    "Look up the alarm that the text names. LOCK, DEFOCUS and STOW are still accepted.",
+    "Look up the alarm named in the text. LOCK, DEFOCUS and STOW are still accepted.",
 )
 NOT_RECORDED = Refusal(
     "not recorded",
-    "The audit cannot write the record of the command.",
+    "The audit cannot record the command.",
     "{what}: not accepted, because it cannot be recorded: {problem}",
-    "Check the disk or the database. DEFOCUS and STOW are sent all the same.",
+    "Check the disk or the database. DEFOCUS and STOW are still sent.",
 )
 BEAM_REFUSED = Refusal(
     "beam",
     "A beam would enter a keep-out volume, shine into an eye, cross a receiver on its way from "
-    "stow, or it cannot reach the point.",
+    "stow, or cannot reach the point.",
     "{what} {heliostat}{more}: {reason}",
-    "Choose another point, or leave out the heliostat that the text names.",
+    "Choose another point, or leave out the heliostat named in the text.",
 )
 OUT_OF_SERVICE = Refusal(
     "out of service",
     "The heliostat is out of service, and the command would move it.",
     "{what} {heliostat}{more}: {reason}",
-    "Each owner makes sure that nobody is there, then returns their lock. DEFOCUS and STOW pass.",
+    "Each owner makes sure that nobody is at the heliostat, then returns their lock. DEFOCUS and "
+    "STOW are still sent.",
 )
 NOT_OWNER = Refusal(
     "not the owner",
-    "A person gives back what only others have locked.",
-    "{what}: {who} has no lock on {name}, which is locked: {text}",
-    "Each person returns their own lock; an engineer may remove another's by the owner's name.",
+    "A user tries to return a lock that belongs to someone else.",
+    "{what}: {who} has no lock on {name}, which others have locked: {text}",
+    "Each owner returns their own lock; an engineer can remove another owner's lock by naming the "
+    "owner.",
 )
 NOT_CALLER = Refusal(
-    "not the caller",
-    "A person withdraws an emergency order of theirs, and none stands.",
-    "withdraw: no emergency order of {who} stands; {calls}",
-    "Each person withdraws their own order; an engineer withdraws another's by the owner's name. "
+    "not the one who ordered it",
+    "A user tries to withdraw an emergency order, but has no active order.",
+    "withdraw: {who} has no active emergency order; {calls}",
+    "Each user withdraws their own order; an engineer can withdraw another user's order by name. "
     "Once every order is withdrawn, acknowledge `operator_emergency`.",
 )
 EMERGENCY_GOES_ON = Refusal(
-    "emergency goes on",
-    "A person resumes while an order of an emergency stands, or a row demands it.",
-    "resume: the emergency goes on: {causes}",
-    "Withdraw the order; remove the cause of each row that the text names, and acknowledge it.",
+    "emergency still active",
+    "An operator presses Resume while an emergency order is active, or while a safety condition "
+    "still requires the emergency.",
+    "resume: the emergency is still active: {causes}",
+    "Withdraw the order; remove the cause of each condition named in the text, and acknowledge the "
+    "condition.",
 )
 EMERGENCY_PAUSED = Refusal(
     "emergency paused",
-    "A person's emergency order was withdrawn while it was being repeated, or five times "
-    "by others within ten minutes. That person alone pauses: 30 s, then twice as long each time.",
-    "EMERGENCY: that of {who} was withdrawn again and again; the next one is taken in {wait} s",
-    "Let another person order it: nobody else pauses. If a program repeats it, disable the account "
-    "or revoke its token.",
+    "A user's emergency order was withdrawn while it was being repeated, or others withdrew it "
+    "five times within ten minutes. Only that user has to wait: 30 s, then twice as long each "
+    "time.",
+    "EMERGENCY: the order of {who} was withdrawn repeatedly; the next order is accepted in {wait} "
+    "s",
+    "Let another user order it; only this user has to wait. If a program repeats the order, "
+    "disable its account or revoke its token.",
 )
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",
-    "The row is not tripped, its cause has not gone, or it needs another role.",
+    "The condition is not tripped, its cause is not gone, or acknowledging it needs another role.",
     "{reason}",
-    "Remove the cause that the text names, then acknowledge again.",
+    "Remove the cause named in the text, then acknowledge again.",
 )
 ONE_HELIOSTAT = Refusal(
     "one heliostat",
-    "A command whose values are true of one heliostat only is given to several.",
-    "{what}: {count} heliostats; step counts differ from one to the next, give one heliostat",
+    "A command whose values apply to one heliostat only was sent to several.",
+    "{what}: got {count} heliostats, but step counts differ between heliostats; specify one "
+    "heliostat",
     "Repeat the command for each heliostat.",
 )
 NO_POSITION = Refusal(
-    "no position to lock",
-    "LOCK POSITION is given where the counts of the aim cannot be the mirror's.",
+    "no known position to lock",
+    "LOCK POSITION is ordered where the step counts of the aim cannot be those of the mirror.",
     "LOCK POSITION: {heliostat}: {why}",
-    "Bring the beam to its aim by JOG, lock the heliostat, and repeat the command; where its "
-    "counts are lost, give it counts by ZERO first.",
+    "Bring the beam to its aim with JOG, lock the heliostat, and repeat the command; if its step "
+    "counts are lost, set them with ZERO first.",
 )
 IN_VISIT = Refusal(
     "in a visit",
-    "Stepping (ROUGH) or the lock of the aim would change in the middle of a measurement.",
-    "it is in a visit to {where}; give the command again when the visit has ended",
-    "Wait until the page *Calibration* shows the visit no more. The other heliostats of the same "
-    "command have got it.",
+    "The stepping mode (ROUGH) or the aim lock would change during a measurement.",
+    "it is on a calibration visit to {where}; repeat the command when the visit has ended",
+    "Wait until the page *Calibration* no longer shows the visit. The command was sent to the "
+    "other heliostats.",
 )
 NO_CALIBRATION = Refusal(
     "no calibration now",
-    "A heliostat is to be calibrated while automatic control cannot do it.",
+    "A calibration is requested that automatic control cannot carry out now.",
     "calibration of {heliostat}: {why}",
     "Give the heliostat to automatic control (*Automatic*), release the command authority, switch "
     "calibration on, or wait for the sun, as the text says; then repeat the command.",
 )
 PARAMETERS_DIFFER = Refusal(
     "parameters differ",
-    "A motion is given to a heliostat that stores parameters other than the wanted ones.",
-    "it stores parameters that differ from the wanted ones ({items})",
-    "Stow the heliostat: the wanted ones are written there. Lock it at stow if the text names more "
-    "than armature, biases, location and defocus.",
+    "A motion is ordered for a heliostat whose stored parameters differ from the wanted ones.",
+    "its stored parameters differ from the wanted ones ({items})",
+    "Stow the heliostat; the wanted parameters are then written. If the text names more than "
+    "armature, biases, location and defocus, lock it at stow.",
 )
 NOT_COMPARED = Refusal(
     "not compared",
-    "A motion is given to a heliostat whose stored parameters have not been compared with the "
+    "A motion is ordered for a heliostat whose stored parameters have not been compared with the "
     "wanted ones since its cluster connected.",
     "its stored parameters have not been compared with the wanted ones yet",
-    "Wait some seconds; an answer that is lost is asked for again after 30 s. If it stays, see to "
-    "its cluster or its supply. DEFOCUS and STOW are still sent.",
+    "Wait a few seconds; a lost reply is requested again after 30 s. If the refusal persists, "
+    "check its cluster and its supply. DEFOCUS and STOW are still sent.",
 )
 OTHER_PARAMETERS = Refusal(
     "other parameters",
-    "A heliostat is moved, unlocked or written, and its address answers as another heliostat.",
-    "its address answers with the parameters of {other}",
+    "A command would move or unlock a heliostat or write its parameters, but another heliostat "
+    "replies at its address.",
+    "the board at its address holds the parameters of {other}",
     "Correct the addresses of both. LOCK, DEFOCUS and STOW are still sent.",
 )
 UNLISTED = Refusal(
     "unlisted",
-    "A heliostat is moved, unlocked or written, and its cluster does not list it.",
+    "A command would move or unlock a heliostat or write its parameters, but its cluster does not "
+    "list it.",
     "its cluster {cluster} does not list it",
     "Add it to the cluster's file and restart the cluster. EMERGENCY reaches it until then.",
 )
 NOT_HEARD = Refusal(
     "not heard",
-    "A heliostat is moved, unlocked or written before its board is known.",
-    "it has not been heard since its cluster connected, so its board is not known",
-    "Wait for its next status, a second at most. If none comes, see to its cluster or its supply.",
+    "A command would move or unlock a heliostat or write its parameters before its board is "
+    "identified.",
+    "it has sent nothing since its cluster connected, so its board is not identified",
+    "Wait for its next status, which takes a second at most. If none arrives, check its cluster "
+    "and its supply.",
 )
 COUNTS_DOUBTFUL = Refusal(
     "counts doubtful",
-    "A heliostat that lost its power in motion is sent to the receiver.",
-    "its step counts may be wrong since a power cut in motion, and nobody has confirmed them",
-    "Look where its mirror stands, then acknowledge the alarm `counts_doubtful`; or calibrate it.",
+    "A heliostat that lost power while moving is sent to the receiver.",
+    "its step counts may be wrong since a power cut during motion, and nobody has confirmed them",
+    "Check where its mirror points, then acknowledge the alarm `counts_doubtful`; or calibrate the "
+    "heliostat.",
 )
 DRIVE_STALLED = Refusal(
     "drive stalled",
     "A heliostat whose mirror did not follow its drives is sent to the receiver.",
-    "its drives made steps, and its mirror did not follow, so its step counts are wrong",
-    "Look for ice, a loose coupling or a driver without current; then give Diagnose again, or "
-    "acknowledge the alarm `drive_stalled` once you have seen the mirror follow, and give ZERO.",
+    "its drives made steps, but its mirror did not follow, so its step counts are wrong",
+    "Look for ice, a loose coupling or a driver without current; then order Diagnose again, or "
+    "acknowledge the alarm `drive_stalled` once you have seen the mirror follow, and order ZERO.",
 )
 NOT_VERIFIED = Refusal(
     "not verified",
-    "A heliostat is sent to the receiver while a calibration verifies its new parameters.",
+    "A heliostat is sent to the receiver while a calibration is verifying its new parameters.",
     "a calibration has yet to verify its new parameters by a photograph",
     "Wait until the visit has ended; DEFOCUS, STOW and LOCK end it at once.",
 )
 AIM_NOT_TAKEN = Refusal(
-    "aim not taken",
-    "A heliostat is sent to its aim, and its local controller did not take the last one.",
-    "its last aim was not taken ({reason}), so its beam would go to an earlier one",
-    "Give the aim again.",
+    "aim not accepted",
+    "A heliostat is sent to its aim, but its local controller did not accept the latest aim.",
+    "its latest aim was not accepted ({reason}), so its beam would go to an earlier aim",
+    "Send the aim again.",
 )
 STANDBY_NOT_TAKEN = Refusal(
-    "standby point not taken",
-    "A heliostat is sent to standby, and no standby point is known that its local controller has: "
-    "the plant's store was restored from a backup, or the first one was not taken.",
-    "its standby point was not taken ({reason}), so its beam would go to an unknown one",
-    "Give the standby point again; automatic control does so.",
+    "standby point not accepted",
+    "A heliostat is sent to standby, but the standby point in its local controller is unknown "
+    "because the plant's store was restored from a backup, or because the controller did not "
+    "accept the first one.",
+    "its standby point was not accepted ({reason}), so its beam would go to an unknown point",
+    "Send the standby point again; automatic control does so by itself.",
 )
 PLACE_UNKNOWN = Refusal(
     "place unknown",
-    "Where there are keep-out volumes: a heliostat is ordered to standby, moved by counts (JOG, "
-    "GOTO, DIAGNOSE) or given a standby point, and has reported nothing since the last order "
-    "that moved it; or is sent to its aim and has reported nothing since its DEFOCUS or STOW; or "
+    "Where there are keep-out volumes: a heliostat is ordered to standby, moved by step counts "
+    "(JOG, GOTO, DIAGNOSE) or assigned a standby point, but has not reported since the last order "
+    "that moved it; or it is sent to its aim but has not reported since its DEFOCUS or STOW; or it "
     "is silent.",
-    "no report shows where it is now, so its path is not proven",
-    "Try again in two seconds; if it stays silent, see to its cluster or its supply. DEFOCUS and "
+    "no report shows where it is now, so its path cannot be checked",
+    "Try again in two seconds; if it stays silent, check its cluster and its supply. DEFOCUS and "
     "STOW are accepted at once.",
 )
 STILL_MOVING = Refusal(
     "still moving",
-    "Where there are keep-out volumes: a heliostat on its way is ordered to standby, or given "
-    "another standby point on its way there.",
-    "it is still moving, so its path to standby is not proven",
-    "Wait until it stands, then order it again. DEFOCUS and STOW are accepted at once.",
+    "Where there are keep-out volumes: a moving heliostat is ordered to standby, or assigned "
+    "another standby point while it is moving there.",
+    "it is still moving, so its path to standby cannot be checked",
+    "Wait until it has stopped, then repeat the order. DEFOCUS and STOW are accepted at once.",
 )
 SEEN_ASTRAY = Refusal(
-    "seen astray from the air",
-    "A heliostat is sent to the receiver that a flight of a drone sees far from where its "
-    "parameters say.",
-    "a flight sees it far from where its parameters say, and no photograph has settled that yet",
-    "Let automatic control calibrate it: it goes to a target before all others.",
+    "pointing error seen from the air",
+    "A heliostat is sent to the receiver although a drone flight measured its mirror far from "
+    "where its parameters place it.",
+    "a drone flight measured its mirror far from where its parameters place it, and no photograph "
+    "has confirmed or refuted this yet",
+    "Let automatic control calibrate it; it goes to a target before all other heliostats.",
 )
 UNWITNESSED = Refusal(
     "sun not witnessed",
-    "A heliostat is sent to the receiver, or up from stow, and an independent witness contradicts "
-    "the sun of plant and clusters; or to the receiver, and none of those required has agreed "
-    "today.",
-    "no independent witness confirms the sun of this plant: {problem}",
-    "Follow the alarm `sun_contradicted` or `unwitnessed`. Raised heliostats may go to targets.",
+    "A heliostat is sent to the receiver or raised from stow while an independent witness "
+    "contradicts the sun position of the plant and the clusters; or it is sent to the receiver, "
+    "and none of the required witnesses has confirmed the sun position today.",
+    "no independent witness confirms this plant's sun position: {problem}",
+    "Follow the alarm `sun_contradicted` or `unwitnessed`. Raised heliostats may still go to "
+    "targets.",
 )
 PARAMETERS_NOT_HERE = Refusal(
-    "parameters not here",
-    "Parameters that change a pose are given where the beam would move or is not proven free.",
+    "parameters not in this position",
+    "Parameters that change the pose are sent where the beam would move or its path is not known "
+    "to be free.",
     "PARAMETERS {heliostat}: {reason}; stow it first",
-    "Stow the heliostat, or lock it at standby, then give the parameters again.",
+    "Stow the heliostat, or lock it at standby, then send the parameters again.",
 )
 STOW_UNPROVEN = Refusal(
     "stow unproven",
-    "A stow position is given from which the beam would light something at some time of the year.",
+    "A stow position is set from which the beam would illuminate something at some time of the "
+    "year.",
     "PARAMETERS {heliostat}: {reason}",
-    "Choose a stow position that `heliotrope field check` accepts; a mirror that looks to the "
-    "horizon, away from the tower, is one.",
+    "Choose a stow position that `heliotrope field check` accepts, such as a mirror that faces the "
+    "horizon away from the tower.",
 )
 CHANGE_TOO_LARGE = Refusal(
     "change too large",
     "Parameters would move the beam by more than the limit, and the change is not confirmed.",
-    "PARAMETERS {heliostat}: they would move its beam by {change:.1f} mrad, and {limit:.1f} are "
-    "allowed; are they its own? Confirm with a reason",
-    "Check that they belong to this heliostat. If so, confirm the change with a reason.",
+    "PARAMETERS {heliostat}: they would move its beam by {change:.1f} mrad, the limit is "
+    "{limit:.1f}; check that they belong to this heliostat, then confirm with a reason",
+    "Check that the parameters belong to this heliostat. If they do, confirm the change with a "
+    "reason.",
 )
 NO_ANSWER = Refusal(
     "no answer",
     "A local controller does not report its stored parameters.",
     "{heliostat}: its stored parameters cannot be read: {problem}",
-    "Check that the heliostat is live, and ask again.",
+    "Check that the heliostat is live, and try again.",
 )
 BUS_NOT_RECORDED = Refusal(
     "bus not recorded",
     "A cluster does not record the frames of its bus.",
     "cluster {cluster}: the frames of its bus were not recorded: {problem}",
-    "Check that the cluster is connected and nobody else records, then ask again.",
+    "Check that the cluster is connected and that nobody else is recording, then try again.",
 )
 FLIGHT_KNOWN = Refusal(
-    "flight taken before",
-    "The plant has taken a flight of that name already.",
-    "flight {name}: {person} gave it on {at}; its orientations count already",
-    "Give another flight; the same photographs evaluated again are no new measurement.",
+    "flight already imported",
+    "The plant has already imported a flight of that name.",
+    "flight {name}: {person} imported it on {at}, so its orientations are already in use",
+    "Import another flight; evaluating the same photographs again is not a new measurement.",
 )
 FLIGHT_CONTRADICTS = Refusal(
     "flight contradicts the field",
-    "The orientations of most mirrors of a flight cannot be theirs.",
-    "flight {name}: {wrong} of {all} mirrors cannot stand like that, first {first}; nothing was "
-    "taken",
-    "Check that the flight is of this field, its times and counts, and the position of the RTK "
-    "base.",
+    "Most mirrors in a flight cannot have the orientations that the flight reports.",
+    "flight {name}: {wrong} of {all} mirrors cannot have the reported orientation, first {first}; "
+    "nothing was imported",
+    "Check that the flight is of this field, and check its times, its step counts and the RTK base "
+    "position.",
 )
 FLIGHT_BUSY = Refusal(
-    "another flight is being fitted",
-    "The plant fits one flight at a time.",
-    "flight {name}: the plant is still fitting flight {other}",
-    "Give it again in a minute.",
+    "another flight is being evaluated",
+    "The plant evaluates one flight at a time.",
+    "flight {name}: the plant is still evaluating flight {other}",
+    "Import it again in a minute.",
 )
 
 #: Reasons that end by themselves within seconds.

@@ -92,21 +92,23 @@ TIME_WENT_BACK = AlarmKind(
     "time_went_back",
     _PLANT,
     Severity.EMERGENCY,
-    "The monotonic clock of the plant's or a cluster's machine went back or gave no number.",
+    "The monotonic clock of the plant's or a cluster's computer went backwards or returned no "
+    "number.",
     "the monotonic time went from {before:g} s to {now:g} s",
-    "DEFOCUS of the field; nothing ages or releases meanwhile.",
-    "Restart the controller and replace its machine.",
+    "The whole field is defocused; until the clock recovers, no reading ages and no condition "
+    "releases.",
+    "Restart the controller and replace its computer.",
     over="the monotonic time runs forwards again",
 )
 UNKNOWN_READING = AlarmKind(
     "unknown_reading",
     _PLANT,
     Severity.WARNING,
-    "A reading arrives that no row of the safety table uses.",
-    "reading {reading!r} is in no row of the safety table, so nothing watches it",
+    "A reading arrives that no condition of the safety table uses.",
+    "reading {reading!r} is not used by any condition of the safety table, so nothing monitors it",
     "The reading is ignored.",
     "Correct the name of the reading.",
-    over="every reading belongs to a row again",
+    over="every reading belongs to a condition again",
 )
 PARAMETERS_DIFFER = AlarmKind(
     "parameters_differ",
@@ -114,32 +116,36 @@ PARAMETERS_DIFFER = AlarmKind(
     Severity.WARNING,
     "A local controller stores parameters that differ from the wanted ones.",
     "{subject}: stored parameters differ from the wanted ones: {items}",
-    "No motion but DEFOCUS and STOW is accepted; they are written as soon as there is a command "
-    "authority and the heliostat stands where its beam is safe.",
-    "Stow it; lock it at stow if more than armature, biases, location and defocus differ. If it "
-    "returns, replace the controller's flash memory.",
+    "No motion except DEFOCUS and STOW is accepted; the wanted parameters are written as soon as "
+    "someone has the command authority and the heliostat is where its beam is safe.",
+    "Stow the heliostat; if more than armature, biases, location and defocus differ, lock it at "
+    "stow. If the alarm returns, replace the controller's flash memory.",
 )
 IDENTITY = AlarmKind(
     "identity",
     _PLANT,
     Severity.ALARM,
-    "A local controller reports the armature of another heliostat, or another one reports its own.",
+    "A local controller reports another heliostat's armature, or another controller reports this "
+    "heliostat's armature.",
     "{subject}: {problem}",
-    "It is sent to stow, and neither moved nor written; DEFOCUS and STOW still go to its address.",
-    "See that both stand at stow; then correct their addresses, or write the parameters of the "
-    "mirror that is there.",
-    over="{subject}: its own parameters answer again",
+    "The heliostat is sent to stow; no other motion and no parameters are sent. DEFOCUS and STOW "
+    "still go to its address.",
+    "Make sure that both heliostats are at stow; then correct their addresses, or write the "
+    "parameters of the heliostat that is there.",
+    over="{subject}: its address reports its own parameters again",
 )
 UNLISTED = AlarmKind(
     "heliostat_unlisted",
     _PLANT,
     Severity.ALARM,
-    "A cluster's status has no row for a heliostat of the plant: its file does not list it.",
+    "A cluster's status does not contain a heliostat of the plant because the cluster file does "
+    "not list it.",
     "{subject}: cluster {cluster} does not list it, so nothing shows its state",
-    "Its mirror stays as it is while the cluster sends the sun, and no command by name reaches it. "
-    "DEFOCUS and STOW of the whole cluster do, and so does EMERGENCY, which cannot prove it off.",
-    "Send EMERGENCY if its beam may be out; then add it to the cluster's file and restart the "
-    "cluster.",
+    "The mirror stays as it is while the cluster sends sun vectors, and no command by name reaches "
+    "the heliostat. DEFOCUS and STOW of the whole cluster do reach it, and so does EMERGENCY, but "
+    "nothing can prove that its beam is off.",
+    "Send EMERGENCY if its beam may be out; then add it to the cluster's file and "
+    "restart the cluster.",
     over="{subject}: cluster {cluster} lists it again",
 )
 SECOND_PLANT = AlarmKind(
@@ -148,9 +154,10 @@ SECOND_PLANT = AlarmKind(
     Severity.ALARM,
     "Clusters belong to another plant with the same keys, which was there before this one.",
     "this plant (run {run}) is the second one with its keys: {clusters} belong to run {holder}",
-    "They take only DEFOCUS, STOW and EMERGENCY from this plant, until it is restarted.",
-    "Switch one of the two plants off; if the other is off, restart this one.",
-    over="the clusters belong to no other plant any more",
+    "These clusters accept only DEFOCUS, STOW and EMERGENCY from this plant until this plant is "
+    "restarted.",
+    "Shut down one of the two plants; if the other plant is already off, restart this one.",
+    over="the clusters no longer belong to another plant",
 )
 SETTINGS_DIFFER = AlarmKind(
     "cluster_settings_differ",
@@ -159,7 +166,7 @@ SETTINGS_DIFFER = AlarmKind(
     "For 5 s, periods or safety thresholds of a cluster have differed from those that the plant "
     "expects, or where it expects none, from those of most other clusters.",
     "cluster {subject}: its settings differ from those of {others}",
-    "It goes on with its own settings.",
+    "The cluster continues with its own settings.",
     "Compare [polling] of its cluster file with that of the plant's links file, delta_t_s and "
     "[safety] with those of the plant file, and the versions of the two programs; correct the "
     "wrong one and restart its program.",
@@ -169,10 +176,11 @@ FIRMWARE_DIFFERS = AlarmKind(
     "firmware_differs",
     _PLANT,
     Severity.WARNING,
-    "Boards on the bus of a cluster have another firmware version than the plant expects.",
+    "Boards on a cluster's bus have a firmware version that differs from the one that the plant "
+    "expects.",
     "cluster {subject}: {boards} have other firmware than version {expected}, which this plant "
     "expects",
-    "They go on with their own.",
+    "The boards continue with their present firmware.",
     "Install the expected version on them, or correct firmware in the links file. The bus is "
     "searched when the cluster connects.",
     over="cluster {subject}: all boards that answer have the expected firmware",
@@ -184,7 +192,8 @@ SUN_CONTRADICTED = AlarmKind(
     "An independent witness sees the sun elsewhere than the plant computes it: the time or site "
     "that plant and clusters share is wrong.",
     "{problem}, at {at} UTC by the plant's clock",
-    "No heliostat leaves stow or joins a receiver; those that track go on, beside their aims.",
+    "No heliostat leaves stow or joins a receiver; tracking heliostats continue, but their beams "
+    "are off their aims.",
     "Defocus the field. Compare the plant's clock with another one, and its site with a map; then "
     "correct them.",
     over="{subject} sees the sun where the plant computes it",
@@ -208,11 +217,11 @@ UNWITNESSED = AlarmKind(
     _PLANT,
     Severity.WARNING,
     "No independent witness has agreed with the plant's sun today; worse where one is required.",
-    "nothing independent has seen today's sun where the plant computes it: {problem}",
-    "Where a witness is required, no heliostat joins a receiver; else a time or site that is wrong "
-    "in plant and clusters stays unseen.",
-    "Let a heliostat that was calibrated before today visit a target, or see to the witness; name "
-    "witnesses in the table witness of the links file, or accept there that there is none.",
+    "no independent witness has seen the sun today where the plant computes it: {problem}",
+    "Where a witness is required, no heliostat joins a receiver. Where none is required, a wrong "
+    "time or site that the plant and the clusters share goes undetected.",
+    "Let a heliostat that was calibrated before today visit a target, or check the witness; name "
+    "witnesses in the table witness of the links file, or declare there that there is none.",
     over="a witness sees the sun where the plant computes it",
     worse=Severity.ALARM,
 )
@@ -220,69 +229,73 @@ CONSOLE = AlarmKind(
     "console",
     _PLANT,
     Severity.WARNING,
-    "The console's process has ended, or gives no sign of life.",
+    "The console's process has ended, or does not respond.",
     "the console {problem}",
-    "The plant goes on without it, and starts it again after a pause.",
-    "Use heliotrope ctl on the plant's computer meanwhile; if it returns, look at its messages.",
-    over="the console answers again",
+    "The plant continues without the console, and restarts it after a pause.",
+    "Use heliotrope ctl on the plant's computer until the console is back; if the alarm returns, "
+    "read the console's messages.",
+    over="the console responds again",
 )
 EMERGENCY_WAY = AlarmKind(
     "emergency_way",
     _PLANT,
     Severity.WARNING,
-    "The process of the page's second way for EMERGENCY has ended, or gives no sign of life.",
-    "the second way for EMERGENCY {problem}",
-    "EMERGENCY goes on by the console alone; the process is started again after a pause.",
-    "Use heliotrope ctl on the plant's computer if the console does not answer either.",
-    over="the second way for EMERGENCY answers again",
+    "The process of the page's second path for EMERGENCY has ended, or does not respond.",
+    "the second path for EMERGENCY {problem}",
+    "EMERGENCY still works through the console alone; the process is restarted after a pause.",
+    "Use heliotrope ctl on the plant's computer if the console does not respond either.",
+    over="the second path for EMERGENCY responds again",
 )
 COUNTS_DOUBTFUL = AlarmKind(
     "counts_doubtful",
     _PLANT,
     Severity.WARNING,
-    "A local controller lost its power in motion, so its step counts may be wrong.",
-    "{subject}: its step counts may be wrong since a power cut in motion",
-    "It does not join the receiver; targets, standby, DEFOCUS and STOW go on as before.",
-    "Look where its mirror stands. If that is right, acknowledge; if not, an engineer locks it and "
-    "gives its step counts (ZERO). A calibration visit confirms it too.",
-    over="{subject}: its step counts are confirmed, or have been given again",
+    "A local controller lost power during motion, so its step counts may be wrong.",
+    "{subject}: its step counts may be wrong since a power cut during motion",
+    "The heliostat does not join the receiver; targets, standby, DEFOCUS and STOW remain possible.",
+    "Check where its mirror points. If the position is right, acknowledge; if not, an engineer "
+    "locks the heliostat and sets its step counts (ZERO). A calibration visit also confirms the "
+    "step counts.",
+    over="{subject}: its step counts are confirmed, or have been set again",
 )
 DRIVE_STALLED = AlarmKind(
     "drive_stalled",
     _PLANT,
     Severity.ALARM,
-    "The drives of a heliostat made steps, and its mirror did not follow: ice, a loose coupling, "
+    "The drives of a heliostat made steps, but its mirror did not follow: ice, a loose coupling, "
     "or a driver without current.",
-    "{subject}: {drives} made steps, and its mirror did not follow",
-    "It joins no receiver, automatic control leaves it at stow, and nothing that it reports proves "
-    "an emergency: its beam may be anywhere that its drives have been since.",
-    "Look where its beam is from a safe place. Remove the cause, clear the fault, and give "
-    "Diagnose again; or acknowledge once you have seen the mirror follow. Its step counts need "
-    "ZERO.",
+    "{subject}: {drives} made steps, but its mirror did not follow",
+    "It joins no receiver, automatic control leaves it at stow, and its reports cannot prove that "
+    "it obeyed an emergency order, because its beam may be anywhere that its drives have been "
+    "since.",
+    "From a safe place, find out where its beam is. Remove the cause, clear the fault, and order "
+    "Diagnose again; or acknowledge once you have seen the mirror follow. Then set its step counts "
+    "with ZERO.",
     over="{subject}: its mirror follows its drives",
 )
 DIAGNOSIS_FAILS = AlarmKind(
     "diagnosis_fails",
     _PLANT,
     Severity.WARNING,
-    "Diagnoses of a heliostat's movement did not come to their end five times in a row.",
-    "{subject}: {count} diagnoses of its movement in a row failed; the last time {reason}",
-    "It stays at stow, and is diagnosed again after an hour.",
-    "Find the cause (tab Logs): its cluster, its supply, or orders that interrupt it; then give "
+    "Movement diagnoses of a heliostat failed to finish five times in a row.",
+    "{subject}: {count} movement diagnoses failed in a row; the last failure: {reason}",
+    "It stays at stow, and the diagnosis is repeated after an hour.",
+    "Find the cause (tab Logs): its cluster, its supply, or orders that interrupt it; then order "
     "Diagnose by hand. If it has no tilt sensor, correct tilt_sensor in the plant file.",
-    over="{subject}: a diagnosis of its movement has come to its end",
+    over="{subject}: a movement diagnosis has finished",
 )
 TILT_SENSOR_SILENT = AlarmKind(
     "tilt_sensor_silent",
     _PLANT,
     Severity.WARNING,
-    "A heliostat has a tilt sensor by the plant file, and its board gets no reading from it.",
-    "{subject}: its tilt sensor gives no reading, so a drive that stalls is not seen",
-    "It goes on as a heliostat without such a sensor; a photograph on a target still shows whether "
-    "its mirror follows.",
-    "Check the sensor's wires and its pins in the settings of the board; or correct tilt_sensor in "
-    "the plant file.",
-    over="{subject}: its tilt sensor gives readings",
+    "According to the plant file a heliostat has a tilt sensor, but its board gets no reading from "
+    "the sensor.",
+    "{subject}: its tilt sensor delivers no reading, so a stalled drive is not detected",
+    "The heliostat is treated as one without a tilt sensor; a photograph on a target still shows "
+    "whether its mirror follows.",
+    "Check the sensor's wiring and its pins in the board's settings; or correct tilt_sensor in the "
+    "plant file.",
+    over="{subject}: its tilt sensor delivers readings",
 )
 AIMS = AlarmKind(
     "aims",
@@ -311,7 +324,7 @@ RECORDS = AlarmKind(
     Severity.ALARM,
     "Telemetry, events or results cannot be stored.",
     "records are not stored: {problem}",
-    "The plant goes on without them.",
+    "The plant continues without these records.",
     "Check the disk or the database.",
     over="records are stored again",
 )
@@ -321,8 +334,9 @@ LOCKOUT = AlarmKind(
     Severity.WARNING,
     "Sign-ins for one name or from one address have failed too often.",
     "sign-ins as {who} from {address} are refused after too many failures",
-    "Open sessions go on; the refusal ends by itself, after an hour at most.",
-    "Ask that person; if nobody tried, find who uses that address, and read the security events.",
+    "Open sessions continue; the block ends by itself after an hour at most.",
+    "Ask that user; if they did not try to sign in, find out who uses that address, and read the "
+    "security events.",
     over="no sign-in was refused for ten minutes",
 )
 ORDERS_REFUSED = AlarmKind(
@@ -331,41 +345,44 @@ ORDERS_REFUSED = AlarmKind(
     Severity.WARNING,
     "Five orders within five minutes were refused because the caller's role is too low.",
     "orders are refused again and again: {who} from {address} has too low a role",
-    "Nothing was sent; EMERGENCY stays open to everybody who is signed in.",
-    "Ask that person; revoke the token or disable the account if it is not them.",
+    "Nothing was sent; everyone who is signed in can still order EMERGENCY.",
+    "Ask that user; if the orders are not theirs, revoke the token or disable the account.",
     over="no order was refused for ten minutes",
 )
 CERTIFICATE = AlarmKind(
     "certificate",
     _PLANT,
     Severity.WARNING,
-    "A certificate ends within 30 days, or its end is unknown; an alarm once it has ended. It "
-    "comes again each day.",
+    "A certificate expires within 30 days, or its expiry date is unknown; an alarm once it has "
+    "expired. It is repeated each day.",
     "{problem}",
-    "Standing connections go on; once it has ended, no new one with TLS is made.",
-    "Renew it, and put the new files in its place; they are taken within seconds.",
-    over="{subject}: this certificate was renewed, or a new day begins",
+    "Existing connections continue; after the certificate expires, no new TLS connection is "
+    "possible.",
+    "Renew the certificate and replace the old files; the new files are loaded within seconds.",
+    over="{subject}: this certificate was renewed, or a new day has begun",
     worse=Severity.ALARM,
 )
 RENEWAL = AlarmKind(
     "renewal",
     _PLANT,
     Severity.WARNING,
-    "A key file or a certificate was changed while the program runs, and cannot be used.",
+    "A key file or a certificate was changed while the program was running, and cannot be used.",
     "the changed {subject} cannot be used: {problem}",
     "The keys or certificates that were read before stay in force.",
-    "Correct the file: it is read again every two seconds. A restart with it as it is fails.",
+    "Correct the file; it is read again every two seconds. With the file as it is, a restart would "
+    "fail.",
     over="the {subject} was read again and is in force",
 )
 SYSLOG = AlarmKind(
     "syslog",
     _PLANT,
     Severity.WARNING,
-    "Security events and alarms cannot be sent on to the receiver of syslog, or some were lost.",
-    "security events and alarms are not sent on: {problem}",
-    "They are in the store; up to 10,000 wait for the receiver, and those beyond are lost to it.",
+    "Security events and alarms cannot be forwarded to the syslog receiver, or some were lost.",
+    "security events and alarms are not being forwarded: {problem}",
+    "The store keeps them; up to 10,000 wait for the receiver, and any beyond that number never "
+    "reach it.",
     "Check the receiver, its certificate and the network between.",
-    over="security events and alarms are sent on again; {count} were lost since the start",
+    over="security events and alarms are being forwarded again; {count} were lost since the start",
 )
 HEADS = AlarmKind(
     "heads",
@@ -373,7 +390,7 @@ HEADS = AlarmKind(
     Severity.WARNING,
     "The heads of the hash chains cannot be exported.",
     "the heads of the records' chains are not exported: {problem}",
-    "The records are kept; it is tried again at the next interval.",
+    "The records are kept; the export is repeated at the next interval.",
     "Check the folder given by --heads, and the store.",
     over="the heads of the records' chains are exported again",
 )
@@ -381,7 +398,7 @@ RECORD_REFUSED = AlarmKind(
     "record_refused",
     _PLANT,
     Severity.WARNING,
-    "The store refuses a record for its content; the disk and the database are well.",
+    "The store refuses a record because of its content; the disk and the database work.",
     "a record was refused: {problem}",
     "This record is lost; all others are stored.",
     "Report the text.",
@@ -393,8 +410,8 @@ WORK = AlarmKind(
     Severity.ALARM,
     "A part of automatic control failed.",
     "automatic control, part {subject}, failed: {reason}",
-    "It is tried again after 5 s.",
-    "Report the text; without this part, command the field by hand.",
+    "This part is restarted after 5 s.",
+    "Report the text; until this part works again, command the field by hand.",
     over="automatic control, part {subject}, works again",
 )
 RESUME_NEEDED = AlarmKind(
@@ -404,7 +421,7 @@ RESUME_NEEDED = AlarmKind(
     "More heliostats than `losses` or `losses_share` allow left the receiver within 30 s without "
     "an order, or an emergency held when the last program ended.",
     "{what} at {since} UTC",
-    "Automatic control waits and raises nothing.",
+    "Automatic control waits and raises no heliostat.",
     "Find the cause, make sure that nobody is in the field, then press Resume.",
     over="automatic control was resumed",
 )
@@ -417,17 +434,17 @@ BEAM_BLOCKED = AlarmKind(
     "{subject}: {reason}",
     "Automatic control stows it if it is defocused, since the path from stow may be free; else it "
     "leaves it where it is and tries again every five minutes.",
-    "Wait where a receiver is in the way: the sun moves on. Else give it another aim point, or "
-    "correct the volume in the plant file.",
+    "If a receiver is in the way, wait until the sun has moved on. Otherwise set another aim "
+    "point, or correct the volume in the plant file.",
     over="{subject}: it has left the blocked position",
 )
 CAMERA = AlarmKind(
     "camera",
     _PLANT,
     Severity.WARNING,
-    "A target's camera delivers no frame.",
+    "A target's camera delivers no frames.",
     "target {subject}: {problem}",
-    "Nothing is calibrated on this target meanwhile.",
+    "Nothing is calibrated on this target until frames arrive again.",
     "Check the camera, its network and its clock.",
     over="target {subject}: frames arrive again",
 )
@@ -435,13 +452,13 @@ BEAM_DISPROVED = AlarmKind(
     "beam_disproved",
     _PLANT,
     Severity.WARNING,
-    "In a joint visit the light of a heliostat did not move with its aim, moved at the place of "
-    "another one, or was far from where it was expected.",
+    "In a joint visit a heliostat's beam did not move with its aim, moved where another "
+    "heliostat's beam should be, or was far from its expected position.",
     "{subject}: in a joint visit, {problem}",
-    "Nothing is learnt from that visit; it goes alone to its next one.",
-    "Look at its drives and couplings if it does not move; at addresses and the wiring of its bus "
-    "if it is exchanged with another one.",
-    over="{subject}: a photograph has shown its own beam at its place",
+    "The results of that visit are not used for this heliostat; its next visit is alone.",
+    "If the beam does not move, check the drives and couplings; if it is exchanged with another "
+    "heliostat's, check the addresses and the bus wiring.",
+    over="{subject}: a photograph has shown its own beam at the expected position",
 )
 CALIBRATION_GIVEN_UP = AlarmKind(
     "calibration_given_up",
@@ -449,23 +466,23 @@ CALIBRATION_GIVEN_UP = AlarmKind(
     Severity.WARNING,
     "A heliostat was not calibrated in several visits to targets, the last of them alone with a "
     "search for its beam.",
-    "{subject}: {count} visits to targets have not calibrated it; the last: {reason}",
-    "It keeps the parameters that it has, and takes no target time from others for 16 hours; then "
-    "it gets one visit a day. New parameters and a flight of a drone give it new visits.",
-    "Look at its photographs (tab Heliostat), at its mirror and its drives; then press Calibrate "
-    "now, or Out of service.",
+    "{subject}: {count} visits to targets failed to calibrate it; the last visit: {reason}",
+    "It keeps its parameters and gets no target time for 16 hours; then it gets one visit a day. "
+    "New parameters or a drone flight entitle it to new visits.",
+    "Check its photographs (tab Heliostat), its mirror and its drives; then press Calibrate now, "
+    "or Out of service.",
     over="{subject}: it is calibrated, or gets new visits for new parameters",
 )
 RAISING_GIVEN_UP = AlarmKind(
     "raising_given_up",
     _PLANT,
     Severity.WARNING,
-    "Within half an hour each a heliostat has left the receiver without an order, or could not go "
-    "on from where it was, five times in a row.",
-    "{subject}: it was raised {count} times in a row in vain; the last time it {reason}",
-    "Automatic control does not raise it any more; after 16 hours it is raised once.",
-    "Find the cause (tab Heliostat, tab Logs): its supply, its cluster or a fault; then give it "
-    "back with Automatic.",
+    "Within half an hour each a heliostat has left the receiver without an order, or could not "
+    "continue from its position, five times in a row.",
+    "{subject}: {count} attempts in a row to raise it failed; the last time it {reason}",
+    "Automatic control no longer raises it; after 16 hours there is one more attempt.",
+    "Find the cause (tab Heliostat, tab Logs): its supply, its cluster or a fault; then press "
+    "Automatic.",
     over="{subject}: it is up, or a person has given it to automatic control again",
 )
 NOT_PARKED = AlarmKind(
@@ -475,30 +492,30 @@ NOT_PARKED = AlarmKind(
     "A heliostat was taken out of service, and was not seen in stow within five minutes.",
     "{subject}: it is out of service and not in stow: {reason}",
     "STOW is sent to it once a minute until it is seen in stow.",
-    "Nobody may go to its mirror: its beam is where its state says, or unknown. Check its fault, "
-    "its supply and its cable.",
+    "Nobody may go to its mirror; its beam is where its state says, or its position is unknown. "
+    "Check its fault, its supply and its cable.",
     over="{subject}: it is in stow, or was given back to service",
 )
 VISITS_FAIL = AlarmKind(
     "visits_fail",
     _PLANT,
     Severity.WARNING,
-    "Visits to a target or receiver have come to nothing several times in a row, through no fault "
-    "of one heliostat.",
-    "{subject}: {count} visits in a row have come to nothing; the last: {reason}",
-    "Nothing is calibrated there but what a person asks for; each hour there is one more visit.",
+    "Several visits to a target or receiver in a row have had no result, and no single heliostat "
+    "was at fault.",
+    "{subject}: {count} visits in a row have had no result; the last visit: {reason}",
+    "Only calibrations that a user requests take place there, and one automatic visit an hour.",
     "Check its camera, the light on it and its view; then press Calibrate now.",
-    over="{subject}: a visit has brought a result",
+    over="{subject}: a visit has had a result",
 )
 SENSOR = AlarmKind(
     "sensor",
     _PLANT,
     Severity.ALARM,
-    "A sensor gives no reading.",
+    "A sensor delivers no reading.",
     "sensor {subject}: {problem}",
-    "Once its last reading is stale, the safety table counts the worst case.",
+    "Once its last reading is stale, the safety table assumes the worst case.",
     "Check the program that writes its file, or the camera of the receiver.",
-    over="sensor {subject}: its readings come again",
+    over="sensor {subject}: its readings arrive again",
 )
 ORDER_UNACKNOWLEDGED = AlarmKind(
     "order_unacknowledged",
@@ -514,8 +531,9 @@ NODE_SILENT = AlarmKind(
     "node_silent",
     _CLUSTER,
     Severity.WARNING,
-    "A local controller does not answer; an alarm if its beam was out when it was last heard.",
-    "{subject}: no answer for {silence:g} s; {last}",
+    "A local controller does not reply; an alarm if it was approaching, at standby, tracking or "
+    "searching when it last reported.",
+    "{subject}: no reply for {silence:g} s; {last}",
     "The cluster keeps polling it.",
     "Assume that its beam has not moved; check its supply and its cable.",
     over="{subject}: it answers again",
@@ -537,19 +555,21 @@ NODE_UNINTELLIGIBLE = AlarmKind(
     Severity.ALARM,
     "A local controller reports a state that the cluster does not know.",
     "{subject}: state {state} is not known",
-    "Its reports are ignored, so it counts as silent.",
-    "Install the same firmware version on heliostat and cluster.",
+    "Its reports are ignored, so the heliostat counts as silent.",
+    "Install matching firmware and cluster versions.",
     over="{subject}: its state is known again",
 )
 SUN_JUMPED = AlarmKind(
     "sun_jumped",
     _CLUSTER,
     Severity.WARNING,
-    "A local controller was sent a sun that cannot follow from the one before.",
-    "{subject}: its cluster sent a sun that cannot follow from the one before",
-    "It refused that sun, or took it after a lapse; if it was tracking, it has turned away.",
+    "A local controller was sent a sun vector that is impossible after the previous one.",
+    "{subject}: its cluster sent a sun vector that is impossible after the previous one",
+    "It refused that sun vector, or accepted it after a gap; if it was tracking, it has turned "
+    "away.",
     "Check the clock, the time source and the site of the cluster.",
-    over="{subject}: no jump for a minute; another shows only once its local controller restarts",
+    over="{subject}: no jump for a minute; another jump is reported only after its local "
+    "controller restarts",
 )
 PLANT_UNINTELLIGIBLE = AlarmKind(
     "plant_unintelligible",
@@ -576,49 +596,50 @@ TWO_PLANTS = AlarmKind(
     Severity.ALARM,
     "A second plant with the same keys asks for the lease while the first one renews it.",
     "a second plant with the same keys is running: run {runs}; the cluster belongs to run {holder}",
-    "The cluster obeys the plant that it belongs to; of the other it takes only DEFOCUS, STOW and "
-    "EMERGENCY.",
-    "Switch the second plant off; a run is named after the UTC time at which its plant started.",
+    "The cluster obeys the plant that it belongs to; from the other plant it accepts only DEFOCUS, "
+    "STOW and EMERGENCY.",
+    "Shut down the second plant; a run is named after the UTC time at which its plant started.",
     over="the second plant has not asked for a minute",
 )
 BUS_KEY_MISSING = AlarmKind(
     "bus_key_missing",
     _CLUSTER,
     Severity.ALARM,
-    "Local controllers have a key of the bus, and their cluster has none.",
-    "cluster {cluster} has no key of its bus, and {heliostats} obey signed frames only",
-    "They get no sun from it: they defocus and stow by themselves. DEFOCUS and STOW still reach "
-    "them.",
-    "Name the file of the key in the cluster file (bus_key), and start the cluster again; to give "
-    "signed frames up, name one that heliotrope keys bus off has made.",
+    "Local controllers have a bus key, but their cluster has none.",
+    "cluster {cluster} has no bus key, but {heliostats} obey only signed frames",
+    "They accept no sun vectors from the cluster, so they defocus and stow by themselves. DEFOCUS "
+    "and STOW still reach them.",
+    "Name the key file in the cluster file (bus_key), and restart the cluster; to stop signing "
+    "frames, name a key file made by heliotrope keys bus off.",
     over="cluster {cluster}: no local controller obeys signed frames only",
 )
 BUS_UNSIGNED = AlarmKind(
     "bus_unsigned",
     _CLUSTER,
     Severity.WARNING,
-    "A cluster signs its frames, and local controllers have not the key of the bus.",
-    "cluster {cluster} signs its frames, and {heliostats} have not the key of its bus: {why}",
-    "The cluster gives them the key as soon as it can. Until then they obey a stranger on the wire "
-    "too, or, with another key or older firmware, get no sun.",
+    "A cluster signs its frames, but some local controllers do not have the bus key.",
+    "cluster {cluster} signs its frames, but {heliostats} do not have its bus key: {why}",
+    "The cluster sends them the key as soon as it can. Until then they also obey unsigned frames "
+    "from anyone on the bus or, with another key or older firmware, accept no sun vectors.",
     "Stow them; if the alarm stays, check their keys in the cluster's key file and their firmware.",
-    over="cluster {cluster}: all local controllers that answer have the key of the bus",
+    over="cluster {cluster}: all local controllers that reply have the bus key",
 )
 TIME_SOURCE = AlarmKind(
     "time_source",
     _CLUSTER,
     Severity.WARNING,
-    "Nothing keeps the cluster's clock, or its receiver and its clock contradict each other.",
+    "The cluster's clock is not synchronised, or its time receiver and its clock contradict each "
+    "other.",
     "{problem}",
-    "The cluster goes on; it defocuses when the error of its time passes 1 s.",
+    "The cluster continues; it defocuses when its time error exceeds 1 s.",
     "Run chronyc sources on that computer, and check antenna and receiver.",
-    over="the cluster's clock is kept again",
+    over="the cluster's clock is synchronised again",
 )
 AUTONOMY_LIMITED = AlarmKind(
     "autonomy_limited",
     _CLUSTER,
     Severity.WARNING,
-    "The plant grants more autonomy than the cluster is configured for.",
+    "The plant grants more autonomy than the cluster's configuration allows.",
     "the plant grants {granted:g} s of autonomy; cluster {cluster} is configured for {longest:g} s",
     "The cluster keeps to its own limit.",
     "Set longest_autonomy_s of the cluster, or lower the plant's setting autonomy.",
@@ -630,7 +651,7 @@ STATE_UNWRITABLE = AlarmKind(
     Severity.ALARM,
     "The cluster cannot store its epoch.",
     "the cluster's epoch cannot be stored: {problem}",
-    "The cluster goes on; after a restart without a known time, local controllers may refuse its "
+    "The cluster continues; after a restart without a known time, local controllers may refuse its "
     "commands.",
     "Check the cluster's disk.",
     over="the cluster's epoch is stored again",

@@ -27,7 +27,8 @@ class Act(IntEnum):
 
 _ACT_TEXTS = {
     Act.ALARM: "the operator is alerted; no motion starts or stops",
-    Act.REFUSE_NEW: "new motions are refused, except DEFOCUS, STOW and LOCK; running motions go on",
+    Act.REFUSE_NEW: "new motions are refused, except DEFOCUS, STOW and LOCK; running motions "
+    "continue",
     Act.HOLD: "heliostats stop where they are, and new motions are refused as by REFUSE_NEW",
     Act.DEFOCUS: "beams leave the receiver now; pre-empts every motion except stowing",
     Act.STOW: "heliostats go to the stow position; pre-empts everything",

@@ -40,7 +40,7 @@ def conditions(autonomy: float = 0.0) -> tuple[Condition, ...]:
         If ``autonomy`` is negative or not finite.
     """
     if not (math.isfinite(autonomy) and autonomy >= 0.0):
-        raise InputError(f"autonomy {autonomy} s must be 0 or more and finite")
+        raise InputError(f"autonomy is {autonomy} s; it must be finite and 0 or more")
     return (
         *_orders(),
         *_receiver(),
@@ -56,7 +56,7 @@ def _orders() -> tuple[Condition, ...]:
     return (
         Condition(
             "operator_emergency", _PLANT, "emergency_order", "yes/no", "emergency order",
-            "an emergency order of a person stands",
+            "a user's emergency order is active",
             0.5, 0.4, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE,
             role=_OPERATOR, release="the order is withdrawn",
             remedy="Keep people away from the receiver and the beams; find the cause, then withdraw"
@@ -67,7 +67,7 @@ def _orders() -> tuple[Condition, ...]:
             "current in the emergency line", "the emergency line carries no current",
             0.5, 0.6, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE, stale_after=1.0,
             role=_SUPERVISOR, release="the line is closed again",
-            remedy="Find out who pressed the button; if nobody did, check the line.",
+            remedy="Find out who pressed the emergency button; if nobody did, check the line.",
         ),
         Condition(
             "nodes_unacknowledged", _PLANT, "nodes_unacknowledged", "count",
@@ -89,19 +89,20 @@ def _orders() -> tuple[Condition, ...]:
         ),
         Condition(
             "unproven_after_emergency", _PLANT, "unproven", "yes/no",
-            "missing proof that it has carried out an emergency order",
-            "an emergency has ended, and nothing shows that it has carried out the order", 0.5, 0.4,
+            "missing confirmation that it has carried out an emergency order",
+            "an emergency has ended, but nothing shows that it has carried out the order", 0.5, 0.4,
             _DEFOCUS, _HELIOSTAT, _SERIOUS, 30.0, waiver=_SUPERVISOR,
             release="its reports show that it has carried out the order",
-            remedy="Assume that its beam has not moved: inspect it from a safe place. An engineer"
-            " who has seen that it is off acknowledges it by name.",
+            remedy="Assume that its beam has not moved, and inspect the heliostat from a safe "
+                "place. An engineer who has seen that the beam is off acknowledges the alarm for "
+                "this heliostat.",
         ),
         Condition(
             "authority_lost", _PLANT, "authority_silence", "s",
             "time since the command authority was renewed",
             "nobody has renewed the command authority for {value}",
             10.0, 5.0, _REFUSE, _FIELD, _WARNING, 15.0, ages=True,
-            release="somebody holds the command authority again",
+            release="someone has the command authority again",
             remedy="Take the command authority, or switch automatic control on.",
         ),
     )  # fmt: skip
@@ -171,12 +172,12 @@ def _weather() -> tuple[Condition, ...]:
             site=(3.0, 20.0),
         ),
         Condition(
-            "cold", _PLANT, "temperature", "°C", "temperature of the air",
+            "cold", _PLANT, "temperature", "°C", "air temperature",
             "the air is at {value}: ice may hold drives, and a stalled drive reports steps that the"
             " mirror has not made", 1.0, 4.0, _REFUSE, _FIELD, _WARNING, 65.0, clear_for=1800.0,
             stale_after=60.0, release="the air is warm again",
-            remedy="Wait until it is warmer; look whether mirrors carry ice before the field goes"
-            " up.", site=(-20.0, 20.0),
+            remedy="Wait until it is warmer; check the mirrors for ice before heliostats leave "
+                "stow.", site=(-20.0, 20.0),
         ),
         Condition(
             "sun_below_horizon", _PLANT, "sun_elevation", "rad", "elevation of the sun",
@@ -209,14 +210,15 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             "no heartbeat back from the broker for {value}",
             PLANT_LEASE, 2.0, _REFUSE, _FIELD, _SERIOUS, 10.0, ages=True, clear_for=5.0,
             release="heartbeats come back from the broker",
-            remedy="Check Mosquitto and the machine it runs on.",
+            remedy="Check Mosquitto and the computer on which it runs.",
         ),
         Condition(
             "bus_errors", _CLUSTER, "bus_errors", "share", "bad frames on the bus within 10 s",
             "{value} of the frames on the bus are bad",
             0.2, 0.05, _REFUSE, _BUS, _WARNING, 20.0, delay=5.0, clear_for=30.0,
             release="the bus is sound again",
-            remedy="Check cable and termination; look for one controller that talks out of turn.",
+            remedy="Check the cable and the termination; look for a controller that transmits out "
+                "of turn.",
             site=(0.02, 0.5),
         ),
         Condition(
@@ -231,7 +233,7 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             "sun_stale", _NODE, "sun_age", "s", "age of the sun vector",
             "no sun vector for {value}", SUN_LEASE, 3.0, _DEFOCUS, _HELIOSTAT, _SERIOUS, 30.0,
             then_stow=_PATIENCE, ages=True,
-            release="fresh sun vectors arrive; tracking needs a fresh command",
+            release="new sun vectors arrive; tracking needs a new command",
             remedy="Check its cluster; then command it to track again.",
         ),
     )  # fmt: skip
@@ -245,15 +247,15 @@ def _time() -> tuple[Condition, ...]:
             "the cluster's time differs from the plant's by {value}",
             2.0, 1.0, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0,
             clear_for=10.0, release="the two times agree again",
-            remedy="Check the clocks of both machines; if every cluster differs, the plant's is"
-            " wrong.", site=(0.2, 2.0),
+            remedy="Check the clocks of both computers; if every cluster differs, the plant's "
+                "clock is wrong.", site=(0.2, 2.0),
         ),
         Condition(
             "cluster_site_differs", _PLANT, "cluster_sun_off", "rad",
-            "angle between the suns of the cluster's site and of the plant's",
-            "the sun of the cluster's site is {value} off that of the plant's",
+            "angle between the sun vectors of the cluster's site and the plant's site",
+            "the sun vector of the cluster's site is {value} off that of the plant's site",
             1e-3, 5e-4, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0,
-            clear_for=10.0, release="the two sites have the same sun",
+            clear_for=10.0, release="the sun vectors of the two sites agree",
             remedy="Correct the table [site] of the cluster file, or the site in the plant file.",
             site=(1e-4, 1e-3),
         ),
@@ -327,7 +329,7 @@ def _mirrors() -> tuple[Condition, ...]:
         Condition(
             "beam_unsent", _PLANT, "beam_unsent", "yes/no",
             "beam on a receiver that was not sent there",
-            "its beam is on a receiver, and nobody sent it there", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
+            "its beam is on a receiver, but it was not sent there", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
             _SERIOUS, 30.0, then_stow=10.0, or_stow=True, delay=5.0,
             release="the beam is off the receiver",
             remedy="If it stays, inspect the heliostat; to hold it, lock it at stow.",
@@ -335,8 +337,9 @@ def _mirrors() -> tuple[Condition, ...]:
         ),
         Condition(
             "pointing_disagrees", _PLANT, "pointing_error", "rad",
-            "angle between its beam, by its step counts, and its aim or standby point",
-            "its step counts send its beam {value} beside where it was sent", 3e-3, 2e-3, _DEFOCUS,
+            "angle between its beam (by its step counts) and its aim or standby point",
+            "by its step counts its beam is {value} away from where it was sent",
+            3e-3, 2e-3, _DEFOCUS,
             _HELIOSTAT, _SERIOUS, 30.0, delay=3.0, role=_OPERATOR,
             release="its step counts agree with its aim or standby point, or its beam is off",
             remedy="Check the parameters and the address of its local controller, and the time and"
@@ -345,10 +348,12 @@ def _mirrors() -> tuple[Condition, ...]:
         Condition(
             "pointing_disagrees_many", _PLANT, "pointing_errors", "count",
             "number of heliostats whose step counts disagree with their aims or standby points",
-            "the step counts of {value} heliostats or more send their beams astray", 100.0, 20.0,
+            "by their step counts the beams of at least {value} heliostats are not where they were "
+            "sent", 100.0, 20.0,
             _DEFOCUS, _FIELD, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0, role=_OPERATOR,
-            release="few heliostats disagree",
-            remedy="Check the clock of the plant's machine and its site first, then the clusters.",
+            release="fewer heliostats disagree",
+            remedy="Check the plant computer's clock and the plant's site first, then the "
+                "clusters.",
             site=(1.0, 200.0),
         ),
         Condition(

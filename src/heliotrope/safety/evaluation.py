@@ -147,7 +147,7 @@ def start(
     names = [row.name for row in rows]
     for name in names:
         if names.count(name) > 1:
-            raise InputError(f"condition {name}: it stands twice in the table")
+            raise InputError(f"condition {name}: it is in the table twice; remove one of the two")
     subjects_of = dict(subjects or {})
     for name in subjects_of:
         if name not in names:
@@ -307,7 +307,9 @@ def _action(
         Act.REFUSE_NEW: f"new motions of {place} are refused",
     }.get(act, f"{row.ordered(act)} of {place}")
     if waits and row.role is not None:
-        doing = f"the cause has gone; {doing} holds until an {row.role.title} acknowledges"
+        doing = (
+            f"the cause is gone; {doing} remains in force until an {row.role.title} acknowledges"
+        )
     text += f"; {doing}"
     return Action(
         act,
@@ -332,9 +334,13 @@ def _said(row: Condition, track: Track, now: float) -> str:
     """Return, in words, the value that the row is judged by."""
     counts = _counting(row, track.value, track.seen, now)
     if track.value is None and not row.ages and now - track.seen <= row.stale_after:
-        return f"tripped when the plant's program ended, and {row.what} has not been read since"
+        return (
+            f"it was tripped when the plant's program ended, and {row.what} has not been read since"
+        )
     if math.isinf(counts):
-        return f"no reading of {row.what} for {now - track.seen:.1f} s, so the worst case counts"
+        return (
+            f"no reading of {row.what} for {now - track.seen:.1f} s, so the worst case is assumed"
+        )
     if row.beyond(counts):
         return row.wrong.format(value=row.shown(counts)) + row.limit
     back = row.shown(row.releases)
@@ -382,14 +388,14 @@ def acknowledge(
     row, track = rows.get(condition), state.tracks.get((condition, subject))
     label = f"{condition} {subject}".strip()
     if row is None or track is None:
-        return state, f"{label}: there is no such condition here"
+        return state, f"{label}: no such condition is in this table"
     if track.tripped_at is None:
         return state, f"{label}: it is not tripped; there is nothing to acknowledge"
     needed = row.waiver if row.role is None else row.role
     if needed is None:
         return state, f"{label}: it releases by itself and needs no acknowledgement"
     if not who.strip():
-        return state, f"{label}: an acknowledgement needs a person's name"
+        return state, f"{label}: an acknowledgement needs the user's name"
     if role < needed:
         return state, f"{label}: {needed.title} must acknowledge, not {role.title}"
     if not track.cleared and row.waiver is None:
@@ -403,7 +409,7 @@ def acknowledge(
 def _remains(row: Condition, track: Track, now: float) -> str:
     """Return the refusal to acknowledge a row before its safe time is over."""
     if not row.safe(_counting(row, track.value, track.seen, now)):
-        return f"the cause has not gone: {_said(row, track, now)}. {row.remedy}"
+        return f"the cause is not gone: {_said(row, track, now)}. {row.remedy}"
     safe = 0.0 if track.safe_since is None else track.seen - track.safe_since
     return (
         f"{row.release}, and must stay so for {row.clear_for:g} s; acknowledge again in "

@@ -29,9 +29,13 @@ class JoinLimiter:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate >= 0.0):
-            raise InputError(f"joining rate {self.rate} mirrors/s must be 0 or more and finite")
+            raise InputError(
+                f"joining rate is {self.rate} heliostats/s; it must be finite and 0 or more"
+            )
         if self.burst < 1:
-            raise InputError(f"joining burst {self.burst} must be a whole number from 1")
+            raise InputError(
+                f"joining burst is {self.burst}; it must be a whole number of at least 1"
+            )
 
     def admit(self, wanted: int, now: float) -> tuple["JoinLimiter", int]:
         """Return the updated limiter, and how many of ``wanted`` heliostats may join now.

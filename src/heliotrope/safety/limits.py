@@ -156,11 +156,11 @@ def _schema_of(row: Condition, setting: Setting) -> dict[str, Any]:
 def _known(rows: Mapping[str, Condition], name: str) -> Condition:
     row = rows.get(name)
     if row is None:
-        raise InputError(f"{name}: there is no such condition here{_near(name, rows)}")
+        raise InputError(f"{name}: no such condition is in this table{_near(name, rows)}")
     if row.site is None:
         raise InputError(
-            f"{name}: no plant sets its numbers, because leases or people's orders rest on them; "
-            "remove it"
+            f"{name}: its limits cannot be set in a plant file, because leases or users' orders "
+            f"depend on them; remove it"
         )
     return row
 

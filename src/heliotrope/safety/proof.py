@@ -29,7 +29,7 @@ class FluxProof(Enum):
     """What is known about the flux on the receiver; the value is the display text."""
 
     #: No sensor feeds it: the proof rests on what each heliostat reports.
-    NOT_MEASURED = "flux on the receiver not measured"
+    NOT_MEASURED = "the flux on the receiver is not measured"
     #: There is still time for a reading.
     AWAITED = "flux not proven yet"
     #: A fresh reading, taken after the order, shows it below its limit.
@@ -79,7 +79,7 @@ class ProofReport:
     def text(self) -> str:
         """One line for the operator."""
         if self.complete:
-            return f"every heliostat has acknowledged and is done, as it reports; {self.basis}"
+            return f"every heliostat has acknowledged and reports that it is done; {self.basis}"
         parts = []
         for names, what in ((self.unacknowledged, "not acknowledged"), (self.not_done, "not done")):
             if names:
@@ -91,7 +91,7 @@ class ProofReport:
         """The measured and the reported parts of the confirmation, in one line."""
         parts = [self.flux.value]
         if self.flux is not FluxProof.BELOW and (self.complete or self.believed or self.followed):
-            parts[0] += ", so this is believed: a stalled drive reports the same"
+            parts[0] += ", so this is not proven, because a stalled drive reports the same"
         parts += [
             f"{count} seen to move today by {by}" for by, count in sorted(self.followed.items())
         ]

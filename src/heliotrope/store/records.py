@@ -439,7 +439,7 @@ class JournalQuery:
     person, heliostat, text
         Person, heliostat, and a text in any case; "" for any.
     but
-        Whose commands are left out.
+        Users whose commands are left out.
     limit
         Most entries.
     """

@@ -216,7 +216,7 @@ class Telemetry:
             self.problem = ""
         except (OSError, pa.ArrowException) as error:
             why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-            self.problem = f"telemetry {self.folder}: cannot be written ({why}); see to its disk"
+            self.problem = f"telemetry {self.folder}: cannot be written ({why}); check the disk"
             # Nothing behind a torn batch is readable, and rows are missing now.
             self._lost = True
             self._drop_segment()

@@ -88,7 +88,7 @@ class Writer:
             return ""
         return (
             f"store {self._database.name}: {len(self._queue)} records are waiting to be written, "
-            f"and no more are accepted ({self.problem or 'the disk is too slow'}); see to its disk"
+            f"and no more are accepted ({self.problem or 'the disk is too slow'}); check the disk"
         )
 
     def put(self, work: Work[Any]) -> None:
@@ -285,7 +285,7 @@ class Writer:
     def _fail(self, entries: list[_Entry], error: Exception) -> None:
         """Tell the waiting callers, whose work is dropped; kept work stays in order."""
         why = str(error) if isinstance(error, StoreError) else cause(error)
-        self.problem = f"store {self._database.name}: cannot be written ({why}); see to its disk"
+        self.problem = f"store {self._database.name}: cannot be written ({why}); check the disk"
         with self._news:
             dropped = {id(e) for e in entries if not e.kept}
             kept = [e for e in self._queue if id(e) not in dropped and not _cancelled(e)]

@@ -178,7 +178,7 @@ class SimulatedAudit:
         self._check()
         known = self._disk.records.get(identity)
         if known is None or known.result:
-            raise InputError(f"audit: no record {identity} waits for a result")
+            raise InputError(f"audit: no record {identity} is waiting for a result")
         self._disk.records[identity] = replace(known, result=result, finished=at)
 
     def confirm(self) -> None:

@@ -457,7 +457,7 @@ const stateOf = (name) => h("span", { className: store.stateName(store.index.get
 // What is locked: a heliostat by its bare name, else with its kind.
 const lockedName = (one) => (one.kind === "tower" ? t("tower") : one.kind === "heliostat" ? one.name : `${t(one.kind)} ${one.name}`);
 const places = (kind, name) => (kind === "tower" ? { tower: true } : { [`${kind}s`]: [name] });
-// Each person returns their own lock; an engineer may remove another's by the owner's name.
+// Each owner returns their own lock; an engineer can remove another owner's lock by naming the owner.
 async function giveBack(one) {
   const own = one.who === me.name, name = lockedName(one);
   const v = own ? await ask(t("Return your lock on {name} ({reason})? Make sure that you and your tools are away.", { name, reason: one.reason }), [], t("Return lock"))

@@ -274,7 +274,9 @@ class Sentinel(Part):
         else:
             order = self.order
             if new:
-                self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
+                self._orders.note(
+                    who, "anybody", act.name, f"{reason}; this act is already in force"
+                )
         if first:  # its row trips now, even if the order is withdrawn before the next beat
             self._news += self._evaluate(self._clock.monotonic())
         self._keep(order.at)
@@ -433,12 +435,12 @@ class Sentinel(Part):
                 order.unknown[name] = self._last_of(row, now)
             elif switched_off(self._field.rows["flags"][row]):
                 order.unknown[name] = (
-                    f"{name}: its drives are switched off at the mirror, so it is not proven to be "
-                    "off; it was not at stow"
+                    f"{name}: its drives were switched off at the heliostat while it was not at "
+                    f"stow, so its beam is not proven to be off the receiver"
                 )
             elif not order.is_done(name) and (text := self._doubted(name)):
                 order.unknown[name] = (
-                    f"{name}: {text}, so nothing that it reports proves that it is off"
+                    f"{name}: {text}, so its reports cannot prove that its beam is off the receiver"
                 )
             elif shines:
                 order.unknown[name] = (
@@ -462,14 +464,19 @@ class Sentinel(Part):
         index = np.array([self._field.index[name] for name in names], dtype=np.intp)
         back = order.take_back(names, self._field.rows[index], self._field.heard[index])
         if back:
-            self.send_safe(_TABLE, order.act, back, "it has come back while an emergency holds")
+            self.send_safe(
+                _TABLE, order.act, back, "the heliostat came back online during an emergency"
+            )
 
     def _last_of(self, row: int, now: float) -> str:
         """Return, in words, where a heliostat with unknown step counts was last."""
         field, points = self._field, self._watch.proofs.points
-        text = f"{field.names[row]}: step counts unknown, so it is not proven to be off; "
+        text = (
+            f"{field.names[row]}: its step counts are unknown, so its beam is not proven to be "
+            f"off the receiver; "
+        )
         if not math.isfinite(field.posed_at[row]):
-            return text + "nothing is known of its beam"
+            return text + "the position of its beam is unknown"
         state = int(field.posed_state[row])
         on_aim = state in states.ON_AIM
         place = (points.aims if on_aim else points.standbys)[row]
@@ -480,7 +487,7 @@ class Sentinel(Part):
     def refusal(self, clusters: Iterable[str]) -> str | None:
         """Return the reason that forbids new motion in some clusters, None if it is allowed."""
         if self.on and self.order is not None:
-            return f"an emergency holds ({self.order.act.name}; {_said(self.causes())})"
+            return f"an emergency is active ({self.order.act.name}; {_said(self.causes())})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
         return next((text for text in texts if text), None)
 

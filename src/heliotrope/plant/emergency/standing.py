@@ -99,7 +99,7 @@ class Standing:
     def continued(self) -> str:
         """The reason, in words, of the order that continues this emergency."""
         reason = "; ".join(call.reason for call in self.calls) or self.reason
-        text = f"{reason}; it held when the plant's program ended"
+        text = f"{reason}; it was active when the plant's program ended"
         if not self.unproven:
             return text
         more = f" and {len(self.unproven) - 8} more" if len(self.unproven) > 8 else ""

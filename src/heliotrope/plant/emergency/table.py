@@ -185,8 +185,8 @@ class TableWatch:
         known = {row.reading for row in table} - OWN_READINGS | _IN_NO_ROW
         for name in sorted(self._sensors - known):
             raise InputError(
-                f"sensor {name}: no row of the safety table that the plant watches takes it from a "
-                f"sensor; known: {', '.join(sorted(known))}"
+                f"sensor {name}: no row of the plant's safety table reads this sensor; known "
+                f"sensors: {', '.join(sorted(known))}"
             )
         self._fed = {n for n in readings.names if DERIVED.get(n) in self._sensors | {None}}
         able = tuple(row for row in table if row.reading in self._sensors | self._fed)
@@ -355,6 +355,6 @@ class TableWatch:
         if row is None or row.role is None or all(a.condition != ORDERED for a in self._demands()):
             return ""
         return (
-            f"every order is withdrawn; it ends when an {row.role.title} acknowledges {ORDERED}, "
-            f"{row.clear_for:g} s after the last withdrawal"
+            f"all orders are withdrawn; the emergency ends when an {row.role.title} acknowledges "
+            f"{ORDERED}, which is possible {row.clear_for:g} s after the last withdrawal"
         )

@@ -53,7 +53,10 @@ def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
     places = np.atleast_2d(as_vectors(vertices, "vertices"))
     targets = np.atleast_2d(as_vectors(points, "aim points"))
     if not len(targets) or not np.isfinite(targets).all():
-        raise InputError(f"aim points: {len(targets)} of them; give at least one, finite, in ENU m")
+        raise InputError(
+            f"aim points: got {len(targets)}; specify at least one finite point in "
+            f"ENU coordinates (m)"
+        )
     away = places - targets.mean(axis=0)
     order = np.lexsort((np.linalg.norm(away, axis=-1), np.arctan2(away[:, 0], away[:, 1])))
     aims = np.empty((len(places), 3))
@@ -89,7 +92,10 @@ def default_aims(
         own = centre if group.aim is None else group.aim[row]
         aims[name] = own = own if np.isfinite(own).all() else centre
         if not np.isfinite(own).all():
-            raise InputError(f"heliostat {name}: no aim and no receiver; give aim points")
+            raise InputError(
+                f"heliostat {name}: no aim point is set and the plant has no "
+                f"receiver; specify aim points"
+            )
     return aims
 
 
@@ -212,9 +218,9 @@ class BeamCheck:
         axis = int(np.maximum(wanted - high, low - wanted).argmax())
         stop = high[axis] if wanted[axis] > high[axis] else low[axis]
         return (
-            f"axis {axis + 1} would have to turn to {np.degrees(wanted[axis]):.1f}°, and its stop "
-            f"is at {np.degrees(stop):.1f}°; move the stop in the plant file, or give other points "
-            "as way_m"
+            f"axis {axis + 1} would have to turn to {np.degrees(wanted[axis]):.1f}°, beyond its "
+            f"stop at {np.degrees(stop):.1f}°; move the stop in the plant file, or set other "
+            f"points in way_m"
         )
 
     def problems(
@@ -302,9 +308,9 @@ class BeamCheck:
             for row in np.unique(rows[shining]):
                 reasons.setdefault(
                     self.names[row],
-                    f"at rest its beam shines on the place {point_text(self.eyes[eye])} m, where "
-                    f"the light of all beams together is {total[eye]:.2f} suns (limit "
-                    f"{MOST_SUNS:g}); choose another standby point",
+                    f"at rest its beam shines on the point {point_text(self.eyes[eye])} m, where "
+                    f"the sum of all beams is {total[eye]:.2f} suns (limit {MOST_SUNS:g}); choose "
+                    f"another standby point",
                 )
         return reasons
 
@@ -374,7 +380,7 @@ class BeamCheck:
             )
             hit = np.flatnonzero(rest.entered.any(axis=-1))[:1]
             same = np.repeat(rows[k : k + 1], len(hit))
-            self._tell(reasons, same, rest.entered[hit], rest.first[hit], "while it searches")
+            self._tell(reasons, same, rest.entered[hit], rest.first[hit], "during the beam search")
         return reasons
 
     def moving(
@@ -462,9 +468,9 @@ class BeamCheck:
         allowed = np.array([m is not None and m.stow_lights for m in machines], dtype=np.bool_)
         entered[:, : len(volumes) - len(self.volumes)] &= ~allowed[:, None]
         return {
-            self.names[rows[i]]: f"at stow its beam would come within reach of "
-            f"{volumes[int(entered[i].argmax())].name} at some time of the year; choose another "
-            "stow position"
+            self.names[rows[i]]: f"at stow its beam would reach "
+            f"{volumes[int(entered[i].argmax())].name} at some time of the year; choose "
+            f"another stow position"
             for i in np.flatnonzero(entered.any(axis=-1))
         }
 

@@ -94,11 +94,13 @@ class AssignedFile:
             return {}
         except ValueError:
             raise FormatError(
-                self.path, "holds no assigned points; remove it, then assign the aims again"
+                self.path,
+                "the file contains no assigned points; delete it, then assign the aims again",
             ) from None
         if not isinstance(document, dict) or document.get("version") != VERSION:
             raise FormatError(
-                self.path, f"holds no assigned points of version {VERSION}; remove it"
+                self.path,
+                f"the file is not an assigned-points file of version {VERSION}; delete it",
             )
         others = (*(kind for kinds in EARLIER.values() for kind in kinds), *HELD)
         found = (*KINDS, *(kind for kind in others if kind in document))
@@ -107,13 +109,15 @@ class AssignedFile:
     def _places(self, kind: str, rows: object) -> Places:
         if not isinstance(rows, dict):
             raise FormatError(
-                self.path, f"{kind}: no points by name; remove the file, then assign the aims again"
+                self.path,
+                f"{kind}: the points are not listed by heliostat name; delete the file, "
+                f"then assign the aims again",
             )
         for name, point in rows.items():
             good = isinstance(point, list) and len(point) == 3
             if not good or not all(isinstance(x, float) and math.isfinite(x) for x in point):
                 raise FormatError(
-                    self.path, f"{kind} of {name}: {point!r} is not a point in ENU, m"
+                    self.path, f"{kind} of {name}: {point!r} is not a point in ENU coordinates (m)"
                 )
         return {name: tuple(point) for name, point in rows.items()}
 
@@ -140,7 +144,7 @@ class AssignedFile:
                 os.close(folder)
         except OSError as error:
             raise AssignedError(
-                f"assigned points {self.path}: {error.strerror}; see to its disk"
+                f"assigned points {self.path}: {error.strerror}; check the disk"
             ) from None
 
 
@@ -380,11 +384,13 @@ def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
         No points, one that is not finite, or one beyond the range of the wire.
     """
     if not points:
-        raise InputError(f"{kind}: no points; give one for each heliostat")
+        raise InputError(f"{kind}: no points; specify one for each heliostat")
     vectors = [as_vectors(point, f"{name}: point") for name, point in points.items()]
     stacked = as_vectors(np.stack(vectors), "points")
     if np.abs(stacked).max() > FAR:
-        raise InputError(f"{kind}: a point {np.abs(stacked).max():g} m away; at most {FAR:g} m")
+        raise InputError(
+            f"{kind}: a point is {np.abs(stacked).max():g} m away, the limit is {FAR:g} m"
+        )
     return stacked
 
 

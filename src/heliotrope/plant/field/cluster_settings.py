@@ -73,5 +73,5 @@ class ClusterSettings(Part):
         if others == 1:
             return next(name for name in self._known if name != cluster)
         if len(self._counts) == 2 and own == 1:
-            return f"the {others} other clusters, which agree among themselves"
-        return f"{differ} of the {others} other clusters, which do not all agree among themselves"
+            return f"the {others} other clusters, which all have the same settings"
+        return f"{differ} of the {others} other clusters, whose settings are not all the same"

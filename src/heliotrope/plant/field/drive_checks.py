@@ -131,7 +131,7 @@ class DriveChecks(Part):
         self._diagnosed[name] = self._today()
         self._shown.pop(name, None)
         if name not in self.stalled:
-            self.stalled[name] = f"{text} made steps, and its mirror did not follow"
+            self.stalled[name] = f"{text} made steps, but its mirror did not follow"
             self._tell(alarms.DRIVE_STALLED.raised(name, drives=text))
 
     def observed(self, heliostat: str, by: str) -> None:

@@ -23,7 +23,7 @@ from heliotrope.plant.field.state import FieldState
 from heliotrope.safety import Act, Alarm, alarms
 
 #: Why a board proves nothing that stores an armature which the plant has never known.
-_UNKNOWN = "its local controller stores parameters that this plant does not know"
+_UNKNOWN = "its local controller stores parameters that are unknown to this plant"
 
 
 class Identities(Part):
@@ -128,7 +128,7 @@ class Identities(Part):
             reasons.setdefault(names[row], text)
         for row, other in pairs:
             if not self._own[other]:
-                text = f"its parameters answer at the address of {names[row]}"
+                text = f"its parameters are stored at the address of {names[row]}"
                 reasons.setdefault(names[other], text)
         new = tuple(name for name, text in reasons.items() if self.mismatched.get(name) != text)
         for name in new:

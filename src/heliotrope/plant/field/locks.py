@@ -91,20 +91,27 @@ class Locks:
         """
         lock = self._locked.get(heliostat)
         if lock is None:
-            return "locked by an order; it stays locked until a person gives UNLOCK"
+            return "locked by an order; it stays locked until someone sends UNLOCK"
         since = f"since {datetime.fromtimestamp(lock.at, UTC):%H:%M:%S} UTC"
         if lock.uncertain:
             return (
-                f"a visit locked it before the plant's program started ({since}), so long ago that "
-                "a person may have locked it meanwhile; ask, then give UNLOCK"
+                f"a calibration visit locked it before the plant's program started ({since}), so "
+                f"long ago that someone may have locked it since; ask, then send UNLOCK"
             )
         if visit:
-            return f"{visit} has locked it {since}, until its parameters are written and read back"
-        holder = "a visit that the plant's program did not survive" if lock.recalled else "a visit"
+            return (
+                f"{visit} locked it {since}; it stays locked until its parameters are written "
+                f"and read back"
+            )
+        holder = (
+            "a calibration visit that was cut off when the plant's program ended"
+            if lock.recalled
+            else "a visit"
+        )
         place = "at stow, " if self._off(heliostat, lock) else ""
         return (
             f"{holder} has left it locked ({since}); the plant unlocks it {place}as soon as "
-            "motions are accepted and somebody has the command authority"
+            "motions are accepted and someone has the command authority"
             f"{held and f'; now they are not: {held}'}"
         )
 

@@ -46,6 +46,6 @@ class SecondPlant(Part):
         if not lost:
             return None
         return (
-            f"{', '.join(lost)} belong to another plant with the same keys "
-            f"(alarm {alarms.SECOND_PLANT.name}); switch one of the two off"
+            f"{', '.join(lost)} belong to another plant with the same keys (alarm "
+            f"{alarms.SECOND_PLANT.name}); shut down one of the two plants"
         )

@@ -127,9 +127,9 @@ class FieldState:
         if len(self.index) != len(pairs) or not pairs:
             twice = sorted({name for name in self.names if self.names.count(name) > 1})
             raise InputError(
-                f"field: heliostat {twice[0]} is in two clusters; a name stands once"
+                f"field: heliostat {twice[0]} is in two clusters; list it in one cluster only"
                 if twice
-                else "field: no cluster has a heliostat; give at least one"
+                else "field: no cluster has a heliostat; add at least one heliostat"
             )
         self.cluster = np.array([c for _, c in pairs], dtype=np.intp)
         self.limit = limit
@@ -162,13 +162,21 @@ class FieldState:
             self.learn_order(cluster, status.names)
         known = self._places.get(cluster)
         if known is None:
-            return [f"cluster {cluster}: status without names, so its rows are not known"]
+            return [
+                (
+                    f"cluster {cluster}: its status arrived before its list of names, so the "
+                    f"records cannot be assigned to heliostats"
+                )
+            ]
         reported, places = known
         if len(nodes) != len(reported):
-            return [f"cluster {cluster}: {len(nodes)} rows for {len(reported)} names"]
+            return [
+                f"cluster {cluster}: its status has {len(nodes)} records for {len(reported)} names"
+            ]
         self.status_at[cluster] = at
         problems = [
-            f"cluster {cluster}: it reports {name}, which is not its own; correct its configuration"
+            f"cluster {cluster}: it reports heliostat {name}, which belongs to another cluster; "
+            f"correct its configuration"
             for name, place in zip(reported, places, strict=True)
             if place < 0 and status.names
         ]

@@ -172,7 +172,11 @@ class Witnesses(Part):
         if self._contradicting:
             problem = "; ".join(self._contradicting.values())
         elif self._names and self._agreed_on != self._day(self._utc()):
-            problem = f"none of its witnesses ({', '.join(sorted(self._names))}) has agreed today"
+            problem = (
+                f"none of its witnesses ({', '.join(sorted(self._names))}) has confirmed "
+                f"the "
+                f"sun position today"
+            )
         else:
             return None
         return refusals.UNWITNESSED.text.format(problem=problem)
@@ -243,7 +247,7 @@ class Witnesses(Part):
             return
         self._told_on = day
         listed = ", ".join(sorted(self._names))
-        problem = f"none of {listed} has agreed" if listed else "this plant has none"
+        problem = f"none of {listed} has confirmed it" if listed else "this plant has none"
         kind = alarms.UNWITNESSED
         self._tell(kind.ended())
         self._tell(kind.raised(problem=problem, worse=bool(listed)))
@@ -263,8 +267,8 @@ class Witnesses(Part):
         late = 60.0 * float(offset @ rate) / float(rate @ rate)
         text = (
             f"{name} sees the sun {1e3 * float(np.linalg.norm(offset)):.1f} mrad from where the "
-            f"plant computes it, as a clock that is {abs(late):.0f} s "
-            f"{'slow' if late > 0.0 else 'fast'} would show it"
+            f"plant computes it, which corresponds to a clock that is {abs(late):.0f} s "
+            f"{'slow' if late > 0.0 else 'fast'}"
         )
         known = name in self._contradicting
         self._contradicting[name] = text

@@ -49,9 +49,9 @@ class Admission:
         """
         whose, wait = f"of {person.name}", self._own.take(person.name)
         if wait == 0.0:
-            whose, wait = "of all persons", self._all.take("")
+            whose, wait = "of all users", self._all.take("")
         if wait > 0.0:
             raise BusyError(
-                f"{call}: too many orders {whose}, nothing was sent; try again in "
-                f"{math.ceil(wait)} s; EMERGENCY, DEFOCUS and STOW are accepted at once"
+                f"{call}: too many orders {whose}, so nothing was sent; try again in "
+                f"{math.ceil(wait)} s; EMERGENCY, DEFOCUS and STOW are still accepted"
             )

@@ -436,7 +436,10 @@ def command(desk: Desk, who: Person, order: orders.CommandOrder) -> Later[Ticket
     ticket: Ticket
     if order.command == "LOCK_POSITION":
         if order.values:
-            raise InputError("LOCK_POSITION: it takes no values; they are those of the aim")
+            raise InputError(
+                "LOCK_POSITION: it takes no values, because it uses the step counts "
+                "of the aim; remove the values"
+            )
         ticket, text = lock_position(here.plant, who, token, order.heliostats)
         here.logbook.event("command", who.name, text)
     elif order.command == "ZERO":
@@ -466,7 +469,7 @@ def aim(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> Late
     `right` and `up`: a point on the unrolled receiver, m from its middle as seen from outside.
     """
     if bool(order.where) == bool(order.points):
-        raise InputError("aim: give either where (a receiver or target) or points")
+        raise InputError("aim: specify either where (a receiver or target) or points, not both")
     here, token = desk.operations, desk.token_of(who)
     placed = order.right is not None or order.up is not None
     place = (order.right or 0.0, order.up or 0.0) if placed else None
@@ -638,7 +641,7 @@ async def set_parameters(desk: Desk, who: Person, order: orders.ParameterOrder) 
     """
     typed, approvals = desk.operations.parameters, desk.operations.approvals
     if bool(order.values) == bool(order.version):
-        raise InputError("parameters: give either values or a version")
+        raise InputError("parameters: specify either values or a version, not both")
     if approvals.needed:
         return desk.tickets.put(await approvals.ask(who, **order.model_dump()))
     token = desk.token_of(who)
@@ -805,4 +808,4 @@ def asked(request: str) -> tuple[str, dict[str, Any]]:
         if (found := pattern.fullmatch(place)) is not None:
             named = {key: unquote(value) for key, value in found.groupdict().items()}
             return name, {**named, **dict(parse_qsl(query))}
-    raise InputError(f"{place[:100]} is only known to the console; leave out --data")
+    raise InputError(f"{place[:100]} is known only to the console; omit --data")

@@ -178,9 +178,9 @@ class ConsoleProcess:
             if heard >= begun:
                 self._well()
                 if now - heard > self._patience.silent:
-                    return f"gives no sign of life for {now - heard:.0f} s"
+                    return f"has not responded for {now - heard:.0f} s"
             elif now - begun > self._patience.begin:
-                return f"does not begin within {self._patience.begin:g} s"
+                return f"did not start within {self._patience.begin:g} s"
 
     def _well(self) -> None:
         """Note a sign of life."""

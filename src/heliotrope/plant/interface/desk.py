@@ -284,7 +284,7 @@ class Desk:
             If no camera of the plant takes pictures.
         """
         if self.operations.marking is None:
-            raise InputError("mark corners: this plant has no camera of its targets")
+            raise InputError("mark corners: this plant has no target camera")
         return self.operations.marking
 
     # -- views -----------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def points_like(given: Any) -> Any:
     for name, point in given.items() if isinstance(given, dict) else ():
         numbers = isinstance(point, list) and len(point) == 3 and all(map(_bounded, point))
         if not numbers or not 0 < len(name) <= 64:
-            raise ValueError(f"{name[:64]}: give east, north and up, m")
+            raise ValueError(f"{name[:64]}: specify east, north and up in m")
     return given
 
 
@@ -55,7 +55,8 @@ _LETTER = r"[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]"
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=f"^{_LETTER}+$")]
 #: The first wrong one is named: an error for each of 200,000 would take a second and 200 MB.
 Names = Annotated[
-    list[Name], Field(max_length=200_000, fail_fast=True, description="Names; [] for all.")
+    list[Name],
+    Field(max_length=200_000, fail_fast=True, description="Names; [] for all heliostats."),
 ]
 Words = Annotated[str, Field(max_length=500, pattern=f"^{_LETTER}*$")]
 Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR, allow_inf_nan=False)]
@@ -102,7 +103,7 @@ class Journal(Some):
     person: Annotated[str, Field(max_length=64)] = ""
     heliostat: Annotated[str, Field(max_length=64)] = ""
     text: Annotated[str, Field(max_length=100)] = ""
-    but: Annotated[str, Field(max_length=64, description="Whose commands are left out.")] = ""
+    but: Annotated[str, Field(max_length=64, description="Users whose commands are left out.")] = ""
 
 
 class Period(Strict):
@@ -173,12 +174,14 @@ class TimetableOrderEntry(Strict):
     target: Annotated[str, Field(max_length=64)] = ""
     at: Annotated[
         list[Annotated[str, Field(max_length=20)]],
-        Field(max_length=MOST_TIMES, description="Times of day with their zone, as 08:30Z."),
+        Field(
+            max_length=MOST_TIMES, description="Times of day with their time zone, such as 08:30Z."
+        ),
     ] = []
     every_s: Annotated[float, Field(ge=LEAST_INTERVAL, le=DAY)] | None = None
     rule: Annotated[
         Literal["", "first", "never"],
-        Field(description="Instead of times: automatic control takes them first, or never."),
+        Field(description="Instead of times: automatic control calibrates them first, or never."),
     ] = ""
 
 
@@ -350,7 +353,12 @@ class EmergencyCall(Strict):
     act: Annotated[str, Field(pattern="^(DEFOCUS|STOW)$")] = "DEFOCUS"
     reason: Words = ""
     call: Annotated[
-        str, Field(max_length=64, description="A random word: one order, however often it is sent.")
+        str,
+        Field(
+            max_length=64,
+            description="A random identifier; if the same order is sent "
+            "again, it is carried out only once.",
+        ),
     ] = ""
 
 
@@ -377,7 +385,7 @@ class _Places(SomeHeliostats):
     @model_validator(mode="after")
     def _named(self) -> Self:
         if not (self.heliostats or self.targets or self.receivers or self.tower):
-            raise ValueError("names nothing; give heliostats, targets, receivers or the tower")
+            raise ValueError("names nothing; name heliostats, targets, receivers or the tower")
         return self
 
 

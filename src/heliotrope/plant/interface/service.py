@@ -374,7 +374,7 @@ def _called(head: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """
     name, given = head.get("call"), head.get("arguments")
     if not isinstance(name, str) or not isinstance(given, dict):
-        raise InputError("local interface: a request needs a call and its arguments")
+        raise InputError("local interface: a request must contain a call and its arguments")
     if " " not in name:
         return name, given
     name, named = asked(name)
@@ -429,4 +429,4 @@ def _on_behalf(given: Any) -> Person:
     try:
         return Person(str(given["name"]), Role[str(given["role"]).upper()])
     except (KeyError, TypeError):
-        raise InputError("local interface: for needs a name and a role") from None
+        raise InputError("local interface: for must contain a name and a role") from None

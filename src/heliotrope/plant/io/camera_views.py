@@ -22,7 +22,7 @@ from heliotrope.plant.visits.target_light import TargetLight
 #: JPEG quality (0 to 100) and gamma of the pictures for people.
 _JPEG, _GAMMA = 80, 0.45
 #: What people read under a photograph of a joint visit.
-SEVERAL = "joint visit: several beams, told apart by their movements over many photographs"
+SEVERAL = "joint visit: several beams, distinguished by their movements over many photographs"
 
 
 class Views:

@@ -68,14 +68,16 @@ def source_of(camera: Camera, folder: Path, stop: threading.Event) -> Source:
     who = f"camera {camera.name}"
     if not camera.source:
         raise InputError(
-            f"{who}: the plant file names no source of its frames; add source, as rtsp://…, "
-            "http://…/now.jpg, usb:0, or a folder that the camera writes into"
+            f"{who}: the plant file does not say where its frames come from; add source, such as "
+            f"rtsp://…, http://…/now.jpg, usb:0, or a folder into which the camera writes"
         )
     found = open_source(camera.source, folder=folder, size=camera.size, watch=True, stop=stop)
     if isinstance(found, VideoSource):
-        raise InputError(f"{who}: {camera.source} is a recording; give a source of live frames")
+        raise InputError(f"{who}: {camera.source} is a recording; specify a source of live frames")
     if isinstance(found, FolderSource) and not Path(found.path).exists():
-        raise InputError(f"{who}: there is no folder {found.path}; make it, or correct source")
+        raise InputError(
+            f"{who}: the folder {found.path} does not exist; create it, or correct source"
+        )
     return found
 
 
@@ -241,8 +243,8 @@ class RealCameras:
         """Return the newest frame that shows a target; see `plant.ports.Cameras`."""
         eye = self._eye(target)
         if eye.feed.newest is None:
-            why = eye.feed.problem or "look at the camera and its network"
-            raise FetchError(f"camera {eye.camera.name}: it has given no frame yet; {why}")
+            why = eye.feed.problem or "check the camera and its network"
+            raise FetchError(f"camera {eye.camera.name}: it has not delivered a frame yet; {why}")
         return eye.feed.newest
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
@@ -299,7 +301,7 @@ class RealCameras:
         shot = shot_of(seen, target, self._clock.monotonic() - age)
         if frame.time_deviation > _UNSURE:
             known = f"{frame.time_deviation:.2g} s only, the limit is {_UNSURE:g} s"
-            text = f"time: known within {known}; let the camera write its time with a zone"
+            text = f"time: known within {known}; set the camera to write its time with a time zone"
             shot = replace(shot, reasons=(*shot.reasons, text))
         return shot
 
@@ -316,8 +318,8 @@ class RealCameras:
         if frame.time_deviation > _UNSURE:
             known = f"{frame.time_deviation:.2g} s only, the limit is {_UNSURE:g} s"
             raise FetchError(
-                f"camera {eye.camera.name}: the time of its frames is known within {known}; let "
-                "the camera write its time with a zone"
+                f"camera {eye.camera.name}: the time of its frames is known within {known}; "
+                f"set the camera to write its time with a time zone"
             )
         assert frame.time is not None
         taken = frame.time.timestamp()
@@ -344,7 +346,7 @@ class RealCameras:
                     self._tell(target)
                 return frame
             await asyncio.sleep(_LOOK)
-        why = eye.feed.problem or "look at the camera, its network and its clock"
+        why = eye.feed.problem or "check the camera, its network and its clock"
         text = f"camera {eye.camera.name}: no frame for {self._patience:g} s; {why}"
         self._tell(target, text)
         raise FetchError(text)
@@ -397,8 +399,8 @@ def dated(frame: Frame, camera: Camera) -> datetime:
     """Return the earliest instant at which a frame may have been exposed."""
     if frame.time is None:
         raise InputError(
-            f"camera {camera.name}: {frame.name} has no time with a zone; let the camera write "
-            "one, as its name (2026-06-21T10-00-00Z) or in EXIF"
+            f"camera {camera.name}: {frame.name} has no time with a time zone; set the camera to "
+            f"write one in the file name (2026-06-21T10-00-00Z) or in EXIF"
         )
     unsure = _LATE if math.isnan(frame.time_deviation) else frame.time_deviation
     return frame.time - timedelta(seconds=unsure)

@@ -135,7 +135,7 @@ class ClockReader:
                 return bytes(answer.read())
         except (OSError, URLError) as error:
             raise FetchError(
-                f"simulated field: no answer ({error}); start it again with heliotrope twin"
+                f"simulated field: no reply ({error}); restart it with heliotrope twin"
             ) from None
 
     def _first(self) -> ClockState:

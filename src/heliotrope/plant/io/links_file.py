@@ -202,8 +202,8 @@ class LinksFile:
             if name not in self.document.clusters:
                 raise FormatError(
                     self.path,
-                    f"the plant has a cluster {name} of {len(homes[name])} heliostats, "
-                    "and no line says how it is reached; add one",
+                    f"the plant has a cluster {name} of {len(homes[name])} heliostats, but no line "
+                    "says how to connect to it; add one",
                     "clusters",
                 )
         for name in self.document.clusters:
@@ -274,7 +274,9 @@ class LinksFile:
         found = _keys_of(path, self.document)
         for name in self.keys:
             if name not in found.members:
-                raise FormatError(path, "its key is gone; the links need it", f"clusters.{name}")
+                raise FormatError(
+                    path, "its key is missing, but the links need it", f"clusters.{name}"
+                )
         for name, ring in self.keys.items():
             ring.keys = found.members[name]
         self.password.word = found.password
@@ -409,34 +411,45 @@ def _check(found: LinksFile) -> None:
     for name in seen:
         if name != FLUX_READING:
             raise FormatError(
-                path, f"a camera gives {FLUX_READING} only; name a file", f"sensors.{name}"
+                path,
+                f"a camera supplies {FLUX_READING} only; name a file instead",
+                f"sensors.{name}",
             )
     if bool(seen) != bool(document.receiver_light):
         raise FormatError(
             path,
-            f'{FLUX_READING} = "camera" and receiver_light, the reference of that camera, go '
-            "together; take one with heliotrope camera receiver",
+            f'{FLUX_READING} = "camera" and receiver_light, the reference of that camera, must '
+            "be set together; record a reference with heliotrope camera receiver",
             "receiver_light",
         )
     seen_by = document.witness
     if seen_by.none and (seen_by.gpsd or seen_by.sun_sensor or seen_by.photographs):
-        raise FormatError(path, "it names a witness, and accepts that there is none", "witness")
+        raise FormatError(
+            path,
+            "it names a witness, but none = true says that there is no witness; "
+            "remove one of the two",
+            "witness",
+        )
     if document.twin:
         _check_simulated(path, document)
     ways = set(document.clusters.values())
     for way, table in (("tcp", document.tcp), ("mqtt", document.mqtt)):
         if way in ways and table is None:
-            raise FormatError(path, f"clusters are reached by {way}; add a table [{way}]", way)
+            raise FormatError(
+                path, f"some clusters are connected by {way}; add a table [{way}]", way
+            )
     for name, how in document.clusters.items():
         if not name.strip() or not how.strip():
-            raise FormatError(path, "a cluster without a name or a way; give both", "clusters")
+            raise FormatError(
+                path, "a cluster has no name or no connection; specify both", "clusters"
+            )
         if how == "tcp" and name not in found.keys:
             raise _keyless(path, name)
         if how not in ("tcp", "mqtt") and not (path.parent / how).is_file():
             raise FormatError(
                 path,
-                f'{how!r}: give "tcp", "mqtt", or the cluster file of a bus at this machine '
-                "(no such file)",
+                f'{how!r}: not a connection, and no such file; specify "tcp", "mqtt", or the '
+                "cluster file of a bus on this computer",
                 f"clusters.{name}",
             )
     if document.tcp is not None:
@@ -444,11 +457,11 @@ def _check(found: LinksFile) -> None:
         encrypted = document.tcp.certificate is not None
         check_encryption(path, host, "tcp.listen", encrypted or document.tcp.unencrypted)
         if (document.tcp.certificate is None) != (document.tcp.key is None):
-            raise FormatError(path, "TLS needs both, certificate and key", "tcp")
+            raise FormatError(path, "TLS needs both certificate and key; specify both", "tcp")
     if document.mqtt is not None:
         scheme, host, _, _ = url_parts(path, document.mqtt.url, "mqtt.url")
         if scheme == "tcp":
-            raise FormatError(path, "give mqtt://host/prefix or mqtts://host/prefix", "mqtt.url")
+            raise FormatError(path, "specify mqtt://host/prefix or mqtts://host/prefix", "mqtt.url")
         encrypted = scheme == "mqtts"
         check_encryption(path, host, "mqtt.url", encrypted or document.mqtt.unencrypted)
 
@@ -459,20 +472,20 @@ def _check_simulated(path: Path, document: LinksDocument) -> None:
         if how != "tcp":
             raise FormatError(
                 path,
-                f"{how!r} beside twin: a plant that follows the clock of a simulated field leads "
-                'no real heliostats; remove twin, or give "tcp"',
+                f"{how!r} together with twin: a plant that follows the clock of a simulated field "
+                'must not command real heliostats; remove twin, or specify "tcp"',
                 f"clusters.{name}",
             )
     if not document.witness.none:
         raise FormatError(
-            path, "no witness sees the sun of a simulated field; give none = true", "witness"
+            path, "a witness cannot see the sun of a simulated field; set none = true", "witness"
         )
 
 
 def _keyless(path: Path, name: str) -> FormatError:
     return FormatError(
         path,
-        "a cluster and its plant prove themselves to each other by a key; make one with "
+        "a cluster and its plant authenticate each other with a key; create one with "
         "heliotrope keys new",
         f"clusters.{name}",
     )
@@ -486,5 +499,7 @@ def _listen(path: Path, text: str) -> tuple[str, int]:
     except ValueError:
         host = port = None
     if not host or port is None:
-        raise FormatError(path, f"{text!r}: give address:port, as 0.0.0.0:4840", "tcp.listen")
+        raise FormatError(
+            path, f"{text!r}: specify address:port, such as 0.0.0.0:4840", "tcp.listen"
+        )
     return host, port

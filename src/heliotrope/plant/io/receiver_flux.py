@@ -51,8 +51,8 @@ def check_reference(design: Plant, reference: ReceiverReference) -> None:
     if names != [sight.receiver]:
         have = ", ".join(names) or "none"
         raise InputError(
-            f"{who}; the plant's receivers: {have}; this reading comes from a camera only where "
-            "the plant has one receiver"
+            f"{who}; the plant's receivers: {have}; a camera can supply this reading only if the "
+            f"plant has exactly one receiver"
         )
     camera = next((each for each in design.cameras if each.name == sight.camera), None)
     if camera is None:
@@ -60,13 +60,14 @@ def check_reference(design: Plant, reference: ReceiverReference) -> None:
         raise InputError(f"{who}; the plant's cameras: {have}; add it to the plant file")
     if camera.size != sight.size:
         raise InputError(
-            f"{who} of {sight.size[0]} × {sight.size[1]} px; the plant file says "
-            f"{camera.size[0]} × {camera.size[1]} px; take the reference again"
+            f"{who} of {sight.size[0]} × {sight.size[1]} px, but the plant file says "
+            f"{camera.size[0]} × {camera.size[1]} px; record the reference again"
         )
     visits = design.receiver_visits
     if visits is not None and visits.receiver == sight.receiver and visits.camera != sight.camera:
         raise InputError(
-            f"{who}; receiver visits see it by camera {visits.camera}; take the reference by that"
+            f"{who}, but receiver visits use camera {visits.camera}; record the reference with "
+            f"that camera"
         )
 
 
@@ -171,7 +172,9 @@ class ReceiverFlux:
         light = await asyncio.to_thread(self._measure, frame)
         self._seen = made, frame.pixels
         if light is None:
-            return f"{who}: its frames repeat themselves to the last pixel; it has frozen"
+            return (
+                f"{who}: successive frames are identical in every pixel, so the camera has frozen"
+            )
         # Light needs no proof that the camera sees all of it.
         if light.doubt and not light.share >= FLUX_LIMIT:
             return f"{who}: {light.doubt}"

@@ -136,7 +136,7 @@ class SensorFiles:
             except OSError as error:
                 problem = f"{path}: cannot be read ({error.strerror})"
             except ValueError:
-                problem = f"{path}: holds no number; write one, in the unit of the safety table"
+                problem = f"{path}: contains no number; write one, in the unit of the safety table"
             if problem != self._problems.get(name, ""):
                 found.problems[name] = problem
             self._problems[name] = problem

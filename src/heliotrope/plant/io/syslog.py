@@ -71,12 +71,14 @@ class Receiver:
             host = port = None
         if not host or parts.scheme not in _PORTS or parts.path.strip("/") or port == 0:
             raise InputError(
-                f"syslog {url!r}: give udp://host, tcp://host or tls://host, with :port unless it "
-                "is 514, 601 or 6514"
+                f"syslog {url!r}: specify udp://host, tcp://host or tls://host, with :port unless "
+                f"it is 514, 601 or 6514"
             )
         if authority is not None:
             if parts.scheme != "tls":
-                raise InputError(f"syslog {url}: an authority belongs to tls://")
+                raise InputError(
+                    f"syslog {url}: a certificate authority can be used only with tls://"
+                )
             client_tls(authority)
         return cls(parts.scheme, host, port or _PORTS[parts.scheme], authority)
 
@@ -190,7 +192,9 @@ class Syslog:
         """
         if self.lost > self._told and self._waiting.qsize() <= self._waiting.maxsize // 2:
             count, self._told = self.lost - self._told, self.lost
-            text = f"{count} messages were lost: more than {self._waiting.maxsize} waited"
+            text = (
+                f"{count} messages were lost because more than {self._waiting.maxsize} were waiting"
+            )
             return _Message(8 * _LOCAL + 4, self._now(), "LOST", text)
         while not self._ending.is_set():
             with contextlib.suppress(queue.Empty):

@@ -230,8 +230,8 @@ class PathProofs:
         """Return the heliostats whose standby points are known, and why the others do not go."""
         known = np.isfinite(self.points.standbys[rows]).all(axis=-1)
         return rows[known], {
-            self.field.names[row]: "its standby point is not known here; give it one "
-            "(STANDBY) first, or stow it"
+            self.field.names[row]: "the plant does not know its standby point; set one (STANDBY) "
+            "first, or stow the heliostat"
             for row in rows[~known]
         }
 
@@ -357,7 +357,7 @@ class PathProofs:
         aims = np.tile(values, (len(rows), 1)) if new else self.points.aims[rows]
         unknown = ~np.isfinite(aims).all(axis=-1)
         reasons = {
-            heliostats[i]: f"{name}: its aim is not known here; give it one (AIM) first"
+            heliostats[i]: f"{name}: the plant does not know its aim; set one (AIM) first"
             for i in np.flatnonzero(unknown)
         }
         if not unknown.all():

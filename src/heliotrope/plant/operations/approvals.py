@@ -82,7 +82,7 @@ class WaitingChange:
     def text(self) -> str:
         """What it changes, and why, in words."""
         what = ", ".join(f"{parameter.name} {parameter.asked:g}" for parameter in self.parameters)
-        again = f"version {self.version} again: " if self.version else ""
+        again = f"back to version {self.version}: " if self.version else ""
         return f"PARAMETERS {self.heliostat}: {again}{what} ({self.reason})"
 
 
@@ -159,18 +159,18 @@ class Approvals:
             self._log.take_alarm(alarms.RECORDS.raised(problem=error))
             return
         except (ValueError, KeyError, TypeError) as error:
-            text = f"changes that waited for approval cannot be read ({error}); ask for them again"
+            text = f"the changes waiting for approval cannot be read ({error}); request them again"
             self._log.event("command", "", text)
             return
         for change in kept:
             self._courses[change.number] = _Course(change)
             self._last = max(self._last, change.number)
         if not self.needed:
-            self._end_all("the plant file asks for no second approval any more")
+            self._end_all("the plant file no longer requires a second approval")
         names = self._plant.field.names
         for change in self.waiting:
             if change.heliostat not in names:
-                self._end(change, "the plant file has no such heliostat any more")
+                self._end(change, "the heliostat is no longer in the plant file")
 
     def step(self) -> None:
         """End the changes whose time is over, or that have been overtaken."""
@@ -337,9 +337,9 @@ class Approvals:
     def _over(self, change: WaitingChange) -> str:
         """Return the reason why a change can wait no longer, or an empty text."""
         if self._now() >= change.until:
-            return f"nobody approved it until {_utc(change.until)}"
+            return f"nobody approved it by {_utc(change.until)}"
         if (version := self._version(change.heliostat)) != change.based_on:
-            return f"the heliostat has had version {version} since it was asked for"
+            return f"the heliostat has received version {version} since the request"
         return ""
 
     def _grant(self, change: WaitingChange, person: Person) -> Grant:

@@ -57,7 +57,7 @@ PARTS = RetryLaw(
     "part of automatic control",
     1,
     5.0,
-    "it is repeated; a person commands by hand what it does not do",
+    "automatic control repeats it; command by hand what it does not do",
     rest=5.0,
     alarm=alarms.WORK,
 )
@@ -130,22 +130,25 @@ class AutomaticSettings:
     def __post_init__(self) -> None:
         if not (0.0 < self.rate <= 100.0 and 0.0 < self.beat <= 60.0 and self.margin >= 0.0):
             raise InputError(
-                f"automatic control: {self.rate} heliostats a second, a beat of {self.beat} s, a "
-                f"margin of {self.margin}; give above 0 to 100, above 0 to 60 s, 0 or more"
+                f"automatic control: {self.rate} heliostats per second, a cycle of {self.beat} s, "
+                f"a margin of {self.margin}; the ranges are above 0 to 100, above 0 to 60 s, and 0 "
+                f"or more"
             )
         if self.losses < 0:
-            raise InputError(f"automatic control: {self.losses} losses; give 0 or more")
+            raise InputError(f"automatic control: losses is {self.losses}; it must be 0 or more")
         if not 0.0 <= self.losses_share <= 1.0:
             raise InputError(
-                f"automatic control: losses of {self.losses_share:g} of the field; give 0 to 1"
+                f"automatic control: losses_share is {self.losses_share:g}; it must be 0 to 1"
             )
         if not 0.0 <= self.foresee < math.inf:
             raise InputError(
-                f"automatic control: a prediction every {self.foresee} s; give 0 (none) or more"
+                f"automatic control: a prediction every {self.foresee} s; the interval must be 0 "
+                f"(none) or more"
             )
         if not self.events > 0.0:
             raise InputError(
-                f"automatic control: events are kept for {self.events} days; give above 0"
+                f"automatic control: events are kept for {self.events} days; the time must be "
+                f"above 0"
             )
 
 
@@ -263,14 +266,17 @@ class AutomaticControl:
         """Put heliostats under automatic control, or remove them; see `Raising.want`."""
         self._raising.want(heliostats, wanted=wanted, by_person=by_person)
         if not wanted:
-            self._withdraw(heliostats or self._plant.field.names, "a person has taken it away")
+            self._withdraw(
+                heliostats or self._plant.field.names,
+                "an operator has taken it out of automatic control",
+            )
 
     def hold(
         self, person: Person, places: Sequence[tuple[Kind, str]], reason: str, hours: float
     ) -> tuple[str, ...]:
         """Lock objects for a person; return the heliostats that stow. See `Operations.hold`."""
         names = self.service.take(person, places, reason, hours)
-        self._withdraw(names, f"{person.name} has taken it out of service")
+        self._withdraw(names, f"{person.name} took it out of service")
         return names
 
     def drop(self, heliostats: Sequence[str], why: str) -> None:
@@ -306,9 +312,14 @@ class AutomaticControl:
         if self._calibrating is None:
             return
         if receiver:
-            why = "" if self._calibrating.receiver else "the plant file names no camera for that"
             why = (
-                "on the receiver no beam is searched for or sent to a target"
+                ""
+                if self._calibrating.receiver
+                else ("the plant file does not name a camera for it")
+            )
+            why = (
+                "the visit takes place on the receiver, where no beam is searched for or sent to a "
+                "target"
                 if search or target
                 else why
             )
@@ -317,7 +328,7 @@ class AutomaticControl:
             self._calibrating.ask_together(names, self._calibrating.receiver)
         elif len(names) > 1:
             if not self._calibrating.joint:
-                why = "the plant file allows no joint visits; ask for one heliostat at a time"
+                why = "the plant file does not allow joint visits; request one heliostat at a time"
                 raise refusals.NO_CALIBRATION.error(heliostat=heliostat, why=why)
             self._calibrating.ask_together(names, target)
         else:
@@ -329,7 +340,7 @@ class AutomaticControl:
         for name in heliostats:
             why = "" if idle == _STARTING else idle
             if not why and not wanted[self._plant.field.place(name)]:
-                why = "automatic control does not have it"
+                why = "it is not under automatic control"
             if why:
                 raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
 
@@ -365,15 +376,15 @@ class AutomaticControl:
             if text := out[name]:
                 steps[name] = Step(text, Stage.REFUSED)
             elif not self._raising.wanted[field.place(name)]:
-                text = "automatic control does not have it any more"
+                text = "it is no longer under automatic control"
                 steps[name] = Step(text, Stage.REFUSED)
             elif idle == _STARTING:
                 steps[name] = Step(idle)
             elif idle:
-                text = f"automatic control has it, but moves nothing: {idle}"
+                text = f"it is under automatic control, which moves nothing: {idle}"
                 steps[name] = Step(text, Stage.FAILED)
             elif name in visiting:
-                steps[name] = Step("automatic control has it: it is calibrated", Stage.DONE)
+                steps[name] = Step("it is under automatic control and being calibrated", Stage.DONE)
             else:
                 row = field.place(name)
                 why, ready = waits.get(name, ""), bool(able[row])
@@ -393,9 +404,11 @@ class AutomaticControl:
         if why := self._raising.why_not(name):
             return Step(why, Stage.FAILED)
         if state == states.APPROACHING or (state in states.AVAILABLE and able):
-            text = f"automatic control has it: {shown.condition}"
-            return Step(f"{text}; it waits: {waits}" if waits else text, Stage.DONE)
-        return Step(f"it waits: {waits}" if waits else f"it waits for its turn: {shown.condition}")
+            text = f"it is under automatic control: {shown.condition}"
+            return Step(f"{text}; it is waiting: {waits}" if waits else text, Stage.DONE)
+        return Step(
+            f"it is waiting: {waits}" if waits else f"it is waiting its turn: {shown.condition}"
+        )
 
     def calibrating(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
         """Return the progress of calibrations that operators requested at a given time, POSIX s."""
@@ -414,7 +427,7 @@ class AutomaticControl:
         assert self._calibrating is not None
         run = self.visit_of(name)
         if name in self._calibrating.asked:
-            return Step(f"it waits: {self._why_waiting(name, run is not None)}")
+            return Step(f"it is waiting: {self._why_waiting(name, run is not None)}")
         if run is not None:
             return Step(f"at {run.target}: {run.stage}", Stage.ACKNOWLEDGED)
         found = self._calibrating.result(name, since)
@@ -430,12 +443,12 @@ class AutomaticControl:
         if why := self._why_not():
             return why
         if visits:
-            return "another visit of it has to end first"
+            return "another visit of the same heliostat must end first"
         if not self._ready()[row]:
             return f"it is not ready: {self._plant.field.of(name, self._plant.now()).condition}"
         assert self._calibrating is not None
         busy = [f"{run.heliostat} ({run.stage})" for run in self._calibrating.running.values()]
-        return f"its turn comes after {', '.join(busy)}" if busy else "its turn comes next"
+        return f"it is next after {', '.join(busy)}" if busy else "it is next"
 
     def retries(self) -> tuple[Retry, ...]:
         """Return the tasks that are being retried or were given up, with the reasons."""
@@ -457,7 +470,7 @@ class AutomaticControl:
     def to_resume(self) -> str:
         """What an operator's Resume would do, empty if nothing waits for it."""
         left = 0 if self._plant.sentinel.on else int(self._raising.left.sum())
-        after = f"The emergency is over: {left:,} heliostats wait for a person's Resume."
+        after = f"The emergency is over: {left:,} heliostats wait until an operator presses Resume."
         return self.waits or (after if left else "")
 
     def left_by_emergency(self, heliostat: str) -> bool:
@@ -634,7 +647,9 @@ class AutomaticControl:
             grant = self._plant.authority.grant
             return f"{grant.holder.name} has the command authority" if grant else _STARTING
         if not self._raising.wanted.any():
-            return "no heliostat is given to automatic control; select some, then Automatic"
+            return (
+                "no heliostat is under automatic control; select heliostats, then press Automatic"
+            )
         return None
 
     async def _govern(self) -> None:
@@ -663,7 +678,9 @@ class AutomaticControl:
             # while a person has the command authority.
             if falls or self._plant.authority.grant is None or self._has_authority():
                 self._stow_up(told=falls)
-            self._withdraw(self._plant.field.names, "the sun is too low; ask again tomorrow")
+            self._withdraw(
+                self._plant.field.names, "the sun is too low; repeat the request tomorrow"
+            )
         elif not self._day and elevation > lowest + math.radians(1.0):
             self._day = True
             self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
@@ -675,7 +692,7 @@ class AutomaticControl:
         if names:
             self._plant.stow(AUTOMATIC.name, names)
         if told or names:
-            text = f"the sun is low: {len(names)} heliostats go to stow"
+            text = f"the sun is low, so {len(names)} heliostats go to stow"
             self._log.event("plant", AUTOMATIC.name, text, heliostats=names)
 
     # -- parts of the work -----------------------------------------------------------------
@@ -707,7 +724,9 @@ class AutomaticControl:
         if len(rows):
             names = tuple(self._plant.field.names[row] for row in rows)
             self._plant.stow(AUTOMATIC.name, names)
-            text = "cannot go on from where it is: it goes to stow, and is raised again"
+            text = (
+                "cannot continue from its present position, so it goes to stow and is raised again"
+            )
             for name in names:
                 self._log.event("plant", name, text)
 

@@ -31,14 +31,17 @@ async def record(plant: PlantController, cluster: str) -> tuple[BusFrame, ...]:
     """
     answer = await plant.ask_cluster(cluster, "frames", PATIENCE)
     if answer is None:
-        problem = f"it has not answered within {PATIENCE:g} s; check that it is connected"
+        problem = f"the cluster did not reply within {PATIENCE:g} s; check that it is connected"
         raise refusals.BUS_NOT_RECORDED.error(cluster=cluster, problem=problem)
     if "error" in answer.data:
         raise refusals.BUS_NOT_RECORDED.error(cluster=cluster, problem=answer.data["error"])
     try:
         return await asyncio.to_thread(decoded, answer)
     except (struct.error, TypeError, ValueError, AttributeError):
-        problem = "its answer cannot be read; check that it has the release of the plant"
+        problem = (
+            "the cluster's reply cannot be read; check that the cluster and the plant run "
+            "the same release"
+        )
         raise refusals.BUS_NOT_RECORDED.error(cluster=cluster, problem=problem) from None
 
 

@@ -34,7 +34,7 @@ PLACES = RetryLaw(
     "visits to this target",
     5,
     10.0,
-    "a person looks at its camera and its light; one visit an hour until then",
+    "an operator must check its camera and the light on it; until then there is one visit an hour",
     longest=600.0,
     rest=3600.0,
     alarm=alarms.VISITS_FAIL,
@@ -267,7 +267,7 @@ class Calibrating:
         found, why = self._last.get(heliostat), self._withdrawn.get(heliostat)
         if why is None and found is not None and found.at >= since:
             return found
-        return f"withdrawn: {why or 'the visit was broken off'}"
+        return f"withdrawn: {why or 'the visit was aborted'}"
 
     def retries(self) -> tuple[Retry, ...]:
         """Return the visits that are tried again, or were given up."""
@@ -433,7 +433,7 @@ class Calibrating:
         if self._pictures is not None:
             self._pictures.conclude_coded(place, entries)
         proven = sum(result.new > 0 for result in results)
-        text = f"{proven} of {len(names)} heliostats proven together"
+        text = f"the beams of {proven} of {len(names)} heliostats were identified together"
         said = f"{cycle.kind}: {text}{said and f'; {said}'}"
         self._log.event("calibration", place, said, heliostats=names)
         return results

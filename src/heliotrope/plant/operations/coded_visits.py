@@ -39,7 +39,7 @@ RECEIVER = RetryLaw(
     "visits on this receiver",
     5,
     600.0,
-    "a person looks at its camera and its light; one visit an hour until then",
+    "an operator must check its camera and the light on it; until then there is one visit an hour",
     growth=1.5,
     longest=3600.0,
     rest=3600.0,
@@ -51,7 +51,7 @@ MIRROR = RetryLaw(
     "receiver visit",
     3,
     0.0,
-    "it goes to a target alone; one receiver visit a day until then",
+    "it visits a target alone; until then it has one receiver visit a day",
     rest=16.0 * 3600.0,
 )
 _BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)

@@ -101,7 +101,7 @@ class Errands:
             ticket.step(texts, stage)
         if late and (left := ticket.waiting(ticket.heliostats)):
             spent = math.floor(self._clock.monotonic() - ticket.accepted_at)
-            texts = {name: f"not ended within {spent} s: {ticket.steps[name]}" for name in left}
+            texts = {name: f"not finished within {spent} s: {ticket.steps[name]}" for name in left}
             ticket.step(texts, Stage.FAILED)
             if errand.dropped is not None:
-                errand.dropped(left, f"not begun within {spent} s")
+                errand.dropped(left, f"not started within {spent} s")

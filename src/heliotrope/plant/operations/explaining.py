@@ -63,23 +63,29 @@ def _case(
     if held := plant.lockouts.text(Kind.HELIOSTAT, name):
         return (
             f"it is out of service: {held}",
-            "Nobody moves it until each owner has returned their lock.",
-            "When nobody is at it any more, return the lock, then give it to automatic control.",
+            "It does not move until each owner has returned their lock.",
+            "When nobody is at the heliostat any longer, return the lock, then press Automatic.",
             Button.RETURN_LOCK,
         )
     if not shown.live:
         return (
-            f"its cluster {shown.cluster} has not heard it, or is not heard itself",
-            "The cluster asks again and again; a board without messages turns away by itself.",
-            f"Check cluster {shown.cluster} (tab Clusters), the supply and the bus of the board.",
+            (
+                f"its cluster {shown.cluster} receives no reply from it, or the plant receives "
+                f"nothing from the cluster"
+            ),
+            (
+                "The cluster keeps polling it; a board that receives no messages turns the mirror "
+                "away by itself."
+            ),
+            f"Check cluster {shown.cluster} (tab Clusters), and the board's supply and bus.",
             Button.NONE,
         )
     if plant.sentinel.on:
         causes = "; ".join(f"{who}: {text}" for who, text in plant.sentinel.causes().items())
         return (
             f"an emergency holds ({causes})",
-            "It stays away from the receiver; after the emergency, nothing moves by itself.",
-            "When the cause has gone: withdraw the order, then press Resume.",
+            "Its beam stays off the receiver; after the emergency, nothing moves by itself.",
+            "When the cause is gone, withdraw the order, then press Resume.",
             Button.WITHDRAW if plant.sentinel.calls else Button.RESUME,
         )
     if shown.state == "LOCKED":
@@ -87,14 +93,14 @@ def _case(
         return plant.locked_for(name), "It does not move while it is locked.", "", button
     if shown.state == "FAULT":
         return (
-            f"its board has found a fault: {shown.fault}",
+            f"its board has detected a fault: {shown.fault}",
             "It does not move until the fault is cleared.",
-            "Find the cause at the mirror, then clear the fault.",
+            "Find the cause at the heliostat, then clear the fault.",
             Button.CLEAR_FAULT,
         )
     if (run := automatic.visit_of(name)) is not None:
-        follows = "It comes back to the receiver when the visit has ended."
-        return f"it is calibrated at {run.target}: {run.stage}", follows, "", Button.NONE
+        follows = "It returns to the receiver when the visit has ended."
+        return f"it is being calibrated at {run.target}: {run.stage}", follows, "", Button.NONE
     return _automatic_case(plant, automatic, name, tracks=tracks)
 
 
@@ -113,34 +119,37 @@ def _automatic_case(
         return (
             "an emergency has taken it out of automatic control",
             "It stays where it is.",
-            "Resume brings back all that automatic control had; Automatic gives it this one alone.",
+            (
+                "Press Resume to return all heliostats to automatic control, or Automatic to "
+                "return only this one."
+            ),
             Button.RESUME,
         )
     if not automatic.wants(name):
         return (
-            "it is not given to automatic control",
-            "It stays as it is, and is stowed before the night only by a person.",
-            "Give it to automatic control, or command it yourself.",
+            "it is not under automatic control",
+            "It stays as it is; nothing stows it before the night unless an operator does.",
+            "Press Automatic, or command it yourself.",
             Button.AUTOMATIC,
         )
     if automatic.waits:
         return (
             automatic.waits,
-            "Automatic control raises nothing until a person presses Resume.",
+            "Automatic control raises no heliostat until an operator presses Resume.",
             "Make sure that nobody is in the field, then resume.",
             Button.RESUME,
         )
     step = automatic.following(-float("inf"), (name,))[name]
     tried = next((retry for retry in automatic.retries() if retry.subject == name), None)
     if tried is not None:
-        again = "at the next occasion" if tried.left == 0.0 else f"in {tried.left:.0f} s"
+        again = "at the next opportunity" if tried.left == 0.0 else f"in {tried.left:.0f} s"
         again = "not by itself" if tried.left == float("inf") else again
         follows = (
-            f"{tried.work}: {tried.count} of {tried.most} tries have failed ({tried.reason}); the "
-            f"next is {again}; after the last, {tried.following}."
+            f"{tried.work}: {tried.count} of {tried.most} attempts have failed ({tried.reason}); "
+            f"the next attempt is {again}; after the last, {tried.following}."
         )
     if not follows and step.stage is not Stage.FAILED:
-        follows = "It goes on by itself."
+        follows = "It continues by itself."
     state = plant.field.rows["state"][plant.field.place(name)]
     remedy = "Store its parameters." if state == states.UNCONFIGURED else ""
     return step.text, follows, remedy, Button.NONE
@@ -153,7 +162,7 @@ def _last_order(plant: PlantController, name: str) -> LastOrder | None:
     record, ticket = found
     stage = ticket.stage(name)
     text = ticket.refusals.get(name, "") or ticket.steps.get(name, "")
-    result = "waiting in the plant" if stage is None else stage.value
+    result = "waiting in the plant's queue" if stage is None else stage.value
     at = datetime.fromisoformat(record.at).timestamp()
     note = f" ({record.note})" if record.note else ""
     return LastOrder(at, record.who, f"{record.what}{note}", f"{result}{text and f': {text}'}")

@@ -145,14 +145,14 @@ class FlightIntake:
             drives = len(group.mechanism.driven)
             if drives != flight.sightings.counts.shape[1]:
                 raise InputError(
-                    f"flight {flight.name}: {flight.sightings.counts.shape[1]} counts a row; "
-                    f"{name} has {drives} drives"
+                    f"flight {flight.name}: each record has {flight.sightings.counts.shape[1]} "
+                    f"step counts, but {name} has {drives} drives"
                 )
         latest = float(flight.sightings.time.max())
         if latest > self._utc() + _LATE:
             raise InputError(
-                f"flight {flight.name}: a photograph is of {_day(latest)}, and it is now "
-                f"{_day(self._utc())}; set the clock of the drone"
+                f"flight {flight.name}: a photograph is dated {_day(latest)}, but it is now "
+                f"{_day(self._utc())}; set the drone's clock"
             )
         return flight
 

@@ -63,27 +63,29 @@ class GivenReadings:
         if name not in names:
             raise UnknownNameError("reading that programs give at this plant", name, sorted(names))
         if not (math.isfinite(value) and math.isfinite(at)):
-            raise InputError(f"{name}: {value} at {at} is not a reading; give finite numbers")
+            raise InputError(f"{name}: {value} at {at} is not a reading; send finite numbers")
         age, now = self._plant.clock.utc().timestamp() - at, self._plant.now()
         if age > OLDEST:
             raise InputError(
-                f"{name}: the reading is {age:.1f} s old, the limit is {OLDEST:g} s; give it at "
-                "once, and compare the clocks of both machines"
+                f"{name}: the reading is {age:.1f} s old, the limit is {OLDEST:g} s; send readings "
+                f"at once, and compare the clocks of both computers"
             )
         if age < -AHEAD:
             raise InputError(
                 f"{name}: the reading is {-age:.1f} s ahead of the plant's clock, the limit is "
-                f"{AHEAD:g} s; compare the clocks of both machines"
+                f"{AHEAD:g} s; compare the clocks of both computers"
             )
         last, taken = self._last.get(name, (-math.inf, -math.inf))
         # A copy is refused by its age afterwards; a clock that was set back must not bar for long.
         if at <= last and now - taken <= OLDEST + AHEAD:
             raise InputError(
-                f"{name}: the reading is {last - at:.1f} s older than the last one; give each "
-                "reading once, in order"
+                f"{name}: the reading is {last - at:.1f} s older than the last reading; send each "
+                f"reading once, in order"
             )
         self._plant.put(name, value, made=min(now - age, now))
         self._last[name] = at, now
         if now - self._given.get((person.name, name), -math.inf) >= _SILENT:
-            self._logbook.event("command", person.name, f"gives {name}; the first is {value:g}")
+            self._logbook.event(
+                "command", person.name, f"sends {name}; the first value is {value:g}"
+            )
         self._given[person.name, name] = now

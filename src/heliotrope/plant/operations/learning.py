@@ -53,7 +53,7 @@ class _Group:
     """What is in force for one group (version 0: the defaults), and how the last attempt ended."""
 
     entry: LearningEntry
-    said: str = "the defaults are in force: nothing was learnt yet"
+    said: str = "the default values are in force because nothing has been learnt yet"
     #: Sightings known at the last attempt.
     known: int = -1
 
@@ -110,7 +110,7 @@ class Learning:
             raise UnknownNameError("group", group, self._groups)
         if self._learner is None:
             raise InputError(
-                "learn: this plant was started without a learner; what is in force stays"
+                "learn: this plant was started without a learner, so the values in force stay"
             )
         wanted = (group,) if group else tuple(self._groups)
         self._asked |= dict.fromkeys(wanted, person)
@@ -124,9 +124,9 @@ class Learning:
         entry = group.entry
         said = group.said
         if name == self._running:
-            said = f"learning now; {said}"
+            said = f"learning is running; {said}"
         elif name in self._asked:
-            said = f"waits to be learnt; {said}"
+            said = f"learning is queued; {said}"
         return LearningView(
             name,
             entry.version,
@@ -176,7 +176,7 @@ class Learning:
         except HeliotropeError as error:
             version = group.entry.version
             kept = f"version {version} stays" if version else "the defaults stay"
-            group.said = f"nothing new: {error}; {kept} in force"
+            group.said = f"nothing new was learnt: {error}; {kept} in force"
         else:
             group.said = self._judged(name, group, person, found)
         if group.said != before:
@@ -186,7 +186,7 @@ class Learning:
         """Put what was learnt in force if it foretells photographs better; return what to say."""
         origin = f"{found.sightings:,} photographs of {found.heliostats} heliostats"
         if not found.gain > 0.0:
-            return f"{origin} are foretold no better by anything new; nothing changed"
+            return f"{origin}: new values would not predict them better, so nothing changed"
         document = {"model": self._names_of(name), "hyper": document_of(found.hyper)}
         entry = LearningEntry(
             name,
@@ -226,7 +226,8 @@ class Learning:
                     raise InputError("its parameters are not those of the mechanism")
             except (ValueError, KeyError, TypeError, InputError) as error:
                 text = (
-                    f"version {entry.version} cannot be used ({error}); the defaults are in force"
+                    f"version {entry.version} cannot be used ({error}), so the default values are "
+                    f"in force"
                 )
                 self._groups[entry.group].said = text
                 self._log.event("calibration", "", f"group {entry.group}: {text}")

@@ -95,7 +95,9 @@ class Losses:
             since = float(self._live_at[lost].min())
             together = int((self._lost_at > since - SPAN).sum())
             if together > self._most:
-                self._wait_for(f"{together} heliostats left the receiver without an order, seen")
+                self._wait_for(
+                    f"{together} heliostats left the receiver without an order, first detected"
+                )
         self._live_at[live] = now
         return lost
 
@@ -136,7 +138,7 @@ def _standing(records: Records | None) -> list[str]:
     ended = [a for a in standing if a.severity is Severity.EMERGENCY and not a.subject]
     texts = [
         alarms.RESUME_NEEDED.line(
-            what=f"{alarm.condition} held when the last program ended; raised",
+            what=f"{alarm.condition} was active when the plant's program last ended; it was raised",
             since=f"{datetime.fromtimestamp(alarm.raised, UTC):%H:%M:%S}",
         )
         for alarm in ended

@@ -192,7 +192,7 @@ class Marking:
         for target in kept.targets:
             camera = self._camera_of(target.name)
             if camera is None or not self._fits(before, camera, target.name):
-                text = "corners marked earlier are left out: the plant file has changed since"
+                text = "corners marked earlier are ignored because the plant file has changed since"
                 self._log.event("calibration", target.name, text)
                 continue
             # Others lie beside the plant's own file, and the cameras have them.
@@ -258,8 +258,14 @@ class Marking:
 
     def _keeps(self) -> str:
         if self._file is None:
-            return "in use until the plant's program ends: it was started without --data"
-        return "kept in the data folder over a restart, with a dated copy of the old view"
+            return (
+                "in use only until the plant's program ends, because it was started without --data"
+            )
+        return (
+            "saved in the data folder, so a restart keeps them; a dated copy of the old view "
+            "is "
+            "kept too"
+        )
 
     async def picture(self, number: int) -> bytes:
         """Return a held picture as JPEG, as bright as possible.
@@ -315,14 +321,18 @@ class Marking:
             self._plant.authority.check(person, token, "MARKS")
         about, frame = self._of(number)
         if about != target:
-            raise InputError(f"target {target}: picture {number} is one of {about}; open it again")
+            raise InputError(
+                f"target {target}: picture {number} belongs to {about}; open the target again"
+            )
         before = self._design
         taught = await asyncio.to_thread(self._taught, target, frame, points)
         view = await asyncio.to_thread(_view_of, taught, frame, self._keeps())
         if token is None:
             return view
         if before is not self._design:
-            raise InputError(f"target {target}: other marks were saved meanwhile; open it again")
+            raise InputError(
+                f"target {target}: someone else saved marks in the meantime; open the target again"
+            )
         self._plant.authority.check(person, token, "MARKS")
         text = f"{len(points)} points, residuals {view.residual:.2f} px"
         self._plant.note(person, "MARKS", f"{target}, camera {taught.camera}: {text}")
@@ -353,9 +363,9 @@ class Marking:
         off = _rms(taught.fit.residuals)
         if not off <= _MOST_OFF:
             raise InputError(
-                f"target {target}: the points are {off:.1f} px off what the lens of camera "
-                f"{known.name} can show, the limit is {_MOST_OFF:g} px; look for a point that is "
-                "clicked wrongly, or find the lens anew (heliotrope camera teach --anew)"
+                f"target {target}: the points deviate by {off:.1f} px from the lens model of "
+                f"camera {known.name}, the limit is {_MOST_OFF:g} px; look for a wrongly clicked "
+                f"point, or calibrate the lens again (heliotrope camera teach --anew)"
             )
         return taught
 
@@ -376,8 +386,8 @@ class Marking:
         except OSError as error:
             raise InputError(
                 f"target {target.name}: {self._file} cannot be written "
-                f"({error.strerror or error}); nothing was changed: let the plant's program write "
-                "there, or use heliotrope camera teach and start it again"
+                f"({error.strerror or error}), so nothing was changed; give the plant's program "
+                f"write access, or use heliotrope camera teach and restart the program"
             ) from None
 
 
@@ -433,7 +443,10 @@ def _view_of(taught: Taught, frame: Frame, kept: str) -> MarksView:
         for p, off in zip(taught.points, fit.residuals, strict=True)
     )
     residual = _rms(fit.residuals)
-    said = f"residuals {residual:.2f} px, places good to {1e3 * fit.plane_sigma:.1f} mm; {kept}"
+    said = (
+        f"residuals {residual:.2f} px, positions known within {1e3 * fit.plane_sigma:.1f} mm; "
+        f"{kept}"
+    )
     return MarksView(
         target.name,
         taught.camera,

@@ -31,7 +31,7 @@ CHECKING = RetryLaw(
     "diagnosis of movement",
     5,
     60.0,
-    "it stays at stow; give Diagnose by hand, or correct tilt_sensor in the plant file",
+    "it stays at stow; order Diagnose by hand, or correct tilt_sensor in the plant file",
     rest=3600.0,
     memory=3600.0,
     alarm=alarms.DIAGNOSIS_FAILS,
@@ -111,7 +111,7 @@ class MovementChecks:
             self._running = frozenset()
             for name in names:
                 if name in plant.drive_checks.due:
-                    self.attempts.failed(name, "its diagnosis did not end", plant.now())
+                    self.attempts.failed(name, "its diagnosis did not finish", plant.now())
                 else:
                     self.attempts.done(name)
 

@@ -341,7 +341,7 @@ class Operations:
         """
         _operator(person, "note")
         if not text.strip():
-            raise InputError("note: it is empty; write what the next shift has to know")
+            raise InputError("note: the text is empty; write what the next shift has to know")
         self._tell(person, text.strip(), NOTE)
 
     async def _read(self, what: str, read: Callable[[Records], T]) -> T:
@@ -429,7 +429,7 @@ class Operations:
         what = "joint visit" if together else what
         what = "receiver visit" if receiver else what
         names = tuple(dict.fromkeys((heliostat, *together)))
-        self._tell(person, f"asked for a {what} of {', '.join(names)}{target and f' on {target}'}")
+        self._tell(person, f"requested a {what} of {', '.join(names)}{target and f' on {target}'}")
         since = self.plant.clock.utc().timestamp()
         return self.errands.begin(
             "SEARCH_BEAM" if search else "CALIBRATE",
@@ -463,7 +463,7 @@ class Operations:
     def learn(self, person: Person, group: str = "") -> None:
         """Learn a heliostat group ("": all) now; see `Learning.order`."""
         self.automatic.learning.order(person, group)
-        self._tell(person, f"asked to learn {group or 'all groups'}")
+        self._tell(person, f"requested learning for {group or 'all groups'}")
 
     def camera(self, target: str) -> CameraView:
         """Return the latest photograph of a target.
@@ -563,7 +563,10 @@ class Operations:
             text = f"{_named(back)} back in service"
             self._tell(person, text, "command", [_named([place]) for place in back])
         for kind, name in still:
-            text = f"{person.name} has returned a lock; it stays locked: {locks.text(kind, name)}"
+            text = (
+                f"{person.name} has returned a lock, but other locks remain: "
+                f"{locks.text(kind, name)}"
+            )
             self._tell(person, f"{_named([(kind, name)])}: {text}", "command")
 
     def _places(
@@ -586,7 +589,9 @@ class Operations:
         places += [(Kind.RECEIVER, name) for name in dict.fromkeys(receivers)]
         places += [(Kind.TOWER, TOWER)] if tower else []
         if not places:
-            raise InputError("no heliostat, target, receiver or tower is named; name one")
+            raise InputError(
+                "the order names no heliostat, target, receiver or tower; name at least one"
+            )
         return places
 
     # -- the authority ---------------------------------------------------------------------
@@ -686,7 +691,9 @@ class Operations:
         points: Mapping[str, npt.ArrayLike]
         if place is not None:
             if where not in self.receivers:
-                raise InputError(f"aim: right and up are of a receiver, and {where!r} is none")
+                raise InputError(
+                    f"aim: right and up refer to a receiver, but {where!r} is not a receiver"
+                )
             points = dict.fromkeys(names, self.plant.design.receiver(where).point(*place))
         elif where in self.receivers[:1]:
             points = self._aiming.points(names)
@@ -735,7 +742,7 @@ class Operations:
         before = self.plant.sentinel.calls
         order = self.plant.raise_emergency(person.name, _act(act), reason)
         if self.plant.sentinel.calls != before:
-            self.automatic.give_up("an emergency has taken it away")
+            self.automatic.give_up("an emergency took it out of automatic control")
             self.logbook.event("command", person.name, f"EMERGENCY {act}: {reason or 'no reason'}")
         return order
 
@@ -781,7 +788,7 @@ class Operations:
         names = tuple(dict.fromkeys(heliostats)) or self.names
         self.automatic.want(names, wanted=True)
         self._aiming.by_person(names, aimed=False)
-        self._tell(person, f"{len(names)} heliostats given to automatic control", "command", names)
+        self._tell(person, f"put {len(names)} heliostats under automatic control", "command", names)
         progress = partial(self.automatic.following, self.plant.now())
         return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)
 
@@ -804,7 +811,7 @@ class Operations:
                 causes = "; ".join(f"{who}: {text}" for who, text in sentinel.causes().items())
                 raise refusals.EMERGENCY_GOES_ON.error(causes=causes)
         count = self.automatic.resume()
-        back = f": {count} heliostats given back to it" if count else ""
+        back = f": {count} heliostats are under it again" if count else ""
         self._tell(person, f"automatic control resumed{back}", "command")
 
     # -- notes -----------------------------------------------------------------------------

@@ -93,8 +93,8 @@ class PictureSettings:
         if not (0.0 < self.whole <= self.last and self.most > 0.0):
             raise InputError(
                 f"pictures: all are kept for {self.whole:g} days, some for {self.last:g} days, in "
-                f"{self.most / 1e9:g} GB; give days above 0, no more for all than for some, and a "
-                "size above 0"
+                f"{self.most / 1e9:g} GB; the days must be above 0, no more for all than for some, "
+                f"and the size must be above 0"
             )
 
 
@@ -168,7 +168,7 @@ class Pictures:
         if not views or not entries:
             return
         proven = sum(entry.new > 0 for entry in entries)
-        text = f"{proven} of {len(entries)} heliostats proven together"
+        text = f"the beams of {proven} of {len(entries)} heliostats were identified together"
         members = [
             (entry.heliostat, entry.new > 0, entry.outcome.name.lower(), entry.text)
             for entry in entries
@@ -179,7 +179,7 @@ class Pictures:
 
     def keep(self, view: CameraView, shot: Shot, who: str) -> None:
         """Keep a photograph that a person has asked for, under no heliostat."""
-        self._put([_Taken(view, shot)], "", "asked for", f"asked for by {who}", view.at)
+        self._put([_Taken(view, shot)], "", "asked for", f"requested by {who}", view.at)
 
     def _put(
         self,

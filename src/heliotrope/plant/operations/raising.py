@@ -30,7 +30,8 @@ RAISING = RetryLaw(
     "raising",
     5,
     0.0,
-    "a person finds the cause and gives it back with Automatic; else it is raised once next day",
+    "an operator must find the cause and then press Automatic; otherwise it is raised once the "
+    "next day",
     rest=16.0 * 3600.0,
     memory=1800.0,
     alarm=alarms.RAISING_GIVEN_UP,
@@ -149,9 +150,9 @@ class Raising:
         if why := self._plant.drive_checks.stalled.get(heliostat):
             return f"{why}: see the alarm {alarms.DRIVE_STALLED.name}"
         if heliostat in self._blocked:
-            return f"its beam has no free path: {self._blocked[heliostat]}"
+            return f"there is no free path for its beam: {self._blocked[heliostat]}"
         if not self.attempts.due(heliostat, self._plant.now()):
-            return f"it was raised in vain too often: {alarms.RAISING_GIVEN_UP.name}"
+            return f"too many attempts to raise it failed: {alarms.RAISING_GIVEN_UP.name}"
         return None
 
     def waits(self, heliostats: Sequence[str]) -> dict[str, str]:
@@ -252,7 +253,7 @@ class Raising:
         self._halted_at = np.where(halted, np.minimum(self._halted_at, now), math.inf)
         found = now - self._halted_at >= _HALTED
         self._halted_at[found] = math.inf
-        self._failed(np.flatnonzero(found), "could not go on from where it was")
+        self._failed(np.flatnonzero(found), "could not continue from its position")
         return np.flatnonzero(found)
 
     def able(self) -> Mask:

@@ -123,8 +123,8 @@ def period(since: float, until: float, now: float) -> tuple[float, float]:
     since = since or until - SHIFT
     if not 0.0 < until - since <= LONGEST:
         raise InputError(
-            f"report: its time is {(until - since) / 3600.0:.1f} h; give a beginning before the "
-            f"end and before now, at most {LONGEST / 86_400.0:.0f} days"
+            f"report: it covers {(until - since) / 3600.0:.1f} h; the start must be before the end "
+            f"and before now, and the report can cover at most {LONGEST / 86_400.0:.0f} days"
         )
     return since, until
 

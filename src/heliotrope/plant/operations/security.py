@@ -18,7 +18,7 @@ from heliotrope.safety import AlarmKind, Severity, alarms
 KIND = "security"
 #: Most events of one kind and person that are recorded singly in a span.
 MOST = 30
-#: The same of all persons together.
+#: The same of all users together.
 MOST_OF_ALL = 300
 #: That span, s.
 SPAN = 60.0
@@ -39,13 +39,13 @@ class SecurityEvent(Enum):
     SESSION_ENDED = ("session expired", Severity.INFO)
     TOKEN_ENDED = ("token expired", Severity.INFO)
     PASSWORD_CHANGED = ("changed their own password", Severity.INFO)
-    PASSWORD_RESET = ("made a new password", Severity.WARNING)
-    ACCOUNT_MADE = ("made an account", Severity.WARNING)
+    PASSWORD_RESET = ("created a new password", Severity.WARNING)
+    ACCOUNT_MADE = ("created an account", Severity.WARNING)
     ACCOUNT_CHANGED = ("changed an account", Severity.WARNING)
-    TOKEN_MADE = ("made a token", Severity.INFO)
+    TOKEN_MADE = ("created a token", Severity.INFO)
     TOKEN_REVOKED = ("revoked a token", Severity.INFO)
     TOKEN_REFUSED = ("a token was refused", Severity.WARNING)
-    CONFIRMATION_FAILED = ("gave a wrong password for a change of accounts", Severity.WARNING)
+    CONFIRMATION_FAILED = ("entered a wrong password for an account change", Severity.WARNING)
     FACTOR_CHANGED = ("changed a second factor", Severity.WARNING)
     ORDER_REFUSED = ("order refused: the role is too low", Severity.WARNING)
     HOST_REFUSED = ("request for an unknown host name refused", Severity.WARNING)
@@ -55,7 +55,7 @@ class SecurityEvent(Enum):
     EXPORTED = ("exported calibrations", Severity.INFO)
     QUERIED = ("queried the telemetry", Severity.INFO)
     KEYS_RENEWED = ("keys or certificates renewed", Severity.WARNING)
-    CHAIN_HEAD = ("head of the records' chains", Severity.INFO)
+    CHAIN_HEAD = ("head of the records' hash chains", Severity.INFO)
 
     @property
     def words(self) -> str:

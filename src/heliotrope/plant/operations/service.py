@@ -25,7 +25,7 @@ PARKING = RetryLaw(
     "stow of a heliostat out of service",
     30,
     10.0,
-    "STOW is repeated once a minute; a person inspects it",
+    "STOW is repeated once a minute; an operator must inspect the heliostat",
     growth=1.0,
     rest=60.0,
     alarm=alarms.NOT_PARKED,
@@ -198,16 +198,23 @@ class Service:
         field, now = self._plant.field, self._plant.now()
         if name in self._unparked:
             if self._plant.waits_to_stow(name):
-                return Step("it waits for its turn to go to stow")
+                return Step("it is waiting its turn to go to stow")
             return Step(f"on its way to stow: {field.of(name, now).condition}", Stage.ACKNOWLEDGED)
         if kept[field.place(name)]:
             off = int(field.rows["flags"][field.place(name)]) & meanings.LOCAL_SWITCH
-            more = "its drives are off at the mirror" if off else "switch its drives off there"
+            more = (
+                "its drives are switched off at the heliostat"
+                if off
+                else ("switch its drives off there")
+            )
             return Step(f"parked in stow and locked out; {more}", Stage.DONE)
         if stands:
-            text = "parked in stow; it may go up again, since its aim is on nothing that is locked"
+            text = (
+                "parked in stow; it may be raised again because its aim is not on a locked "
+                "target or receiver"
+            )
             return Step(text, Stage.DONE)
-        return Step("it was given back to service", Stage.REFUSED)
+        return Step("it was returned to service", Stage.REFUSED)
 
     def _utc(self) -> float:
         return self._plant.clock.utc().timestamp()

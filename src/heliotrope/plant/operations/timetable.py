@@ -62,7 +62,10 @@ class Timetable:
             entries = tuple(TimetableEntry.of(one) for one in json.loads(kept.document))
             self._check(entries)
         except (ValueError, KeyError, TypeError, HeliotropeError) as error:
-            text = f"timetable of {kept.person}: {error}; that of the plant file is in force"
+            text = (
+                f"timetable of {kept.person}: {error}; the plant file's timetable is in force "
+                f"instead"
+            )
             self._log.event("calibration", "", text)
         else:
             self._entries = entries
@@ -129,7 +132,7 @@ class Timetable:
             except RefusedError as error:
                 refused[name] = str(error)
         asked = len(entry.heliostats) - len(refused)
-        text = f"{asked} of {len(entry.heliostats)} heliostats asked for"
+        text = f"requested {asked} of {len(entry.heliostats)} heliostats"
         text += f"; not {by_reason(refused)}" if refused else ""
         before = self._turns.get(entry.name, _Turn())
         # By night each turn ends alike, and one event says so.

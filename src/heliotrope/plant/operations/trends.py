@@ -103,8 +103,8 @@ def trend(
     """
     if not 0.0 < until - since <= LONGEST:
         raise InputError(
-            f"trend: its time is {(until - since) / 3600.0:.1f} h; give a beginning before the "
-            f"end, at most {LONGEST / 86_400.0:.0f} days"
+            f"trend: it covers {(until - since) / 3600.0:.1f} h; the start must be before the end, "
+            f"and the trend can cover at most {LONGEST / 86_400.0:.0f} days"
         )
     if not heliostat:
         if quantity.partition(".")[0] not in UNITS:
@@ -145,7 +145,9 @@ def _archived(
 ) -> tuple[FloatArray, FloatArray]:
     """Return times and values of a heliostat's telemetry, oldest first."""
     if archive is None:
-        raise InputError(f"trend {quantity}: this plant archives no telemetry; run it with --data")
+        raise InputError(
+            f"trend {quantity}: this plant does not archive telemetry; run it with --data"
+        )
     from heliotrope.store.telemetry_query import query  # DuckDB takes long to import
 
     times: Sequence[datetime] = [

@@ -117,7 +117,7 @@ class SecondPerson:
     @property
     def text(self) -> str:
         """Both, for audit and event."""
-        return f"asked for by {self.author}, approved by {self.approver}"
+        return f"requested by {self.author}, approved by {self.approver}"
 
 
 class TypedParameters:
@@ -240,7 +240,7 @@ class TypedParameters:
             return self._plant.compared(heliostat)
         if wait := self._asked.take(who.name):
             known = self._plant.compared(heliostat)
-            return f"{known} (at the last comparison; it can be asked again in {ceil(wait)} s)"
+            return f"{known} (at the last comparison; they can be queried again in {ceil(wait)} s)"
         try:
             sums = await self._plant.stored(heliostat, _PATIENCE)
         except RefusedError as error:
@@ -323,9 +323,9 @@ class TypedParameters:
             prior = mechanism.parameter(name).prior
             if not abs(value) <= self._most * prior:
                 raise InputError(
-                    f"{heliostat}: {name} {value:g} is beyond {self._most:g} standard deviations "
-                    f"of an installation ({prior:g} {mechanism.parameter(name).unit}); check the "
-                    "unit and the installation"
+                    f"{heliostat}: {name} {value:g} is more than {self._most:g} standard "
+                    f"deviations of the installation tolerance ({prior:g} "
+                    f"{mechanism.parameter(name).unit}) away; check the unit and the installation"
                 )
         last = self._plant.beliefs.record(heliostat)
         record = self._typed(heliostat, mechanism, {**self.in_use(heliostat), **values}, values)
@@ -340,7 +340,7 @@ class TypedParameters:
         known = {one.version: one for one in await self._history(heliostat)}
         if version not in known:
             raise UnknownNameError(f"version of {heliostat}", str(version), map(str, known))
-        note = f"version {version} again: {reason.strip()}"
+        note = f"back to version {version}: {reason.strip()}"
         old = replace(known[version], growth=self._plant.beliefs.growth(heliostat))
         record = replace(old, covariance=old.covariance_at(self._utc()), note=note, pushed=())
         return self._prepared(record, f"version {version} again", reason)
@@ -369,12 +369,14 @@ class TypedParameters:
     def _prepared(self, record: HeliostatCalibration, shown: str, reason: str) -> PreparedChange:
         name, beliefs = record.heliostat, self._plant.beliefs
         if not reason.strip():
-            raise InputError(f"{name}: give the reason for other parameters; the audit keeps it")
+            raise InputError(
+                f"{name}: a reason is needed for changing parameters; enter one for the audit"
+            )
         before = items_of(beliefs.present(name)[0])
         after = items_of(record.mechanism(beliefs.nominal(name))[0])
         items = {item: data for item, data in after.items() if before[item] != data}
         if not items:
-            raise InputError(f"{name}: it has these parameters already; nothing was changed")
+            raise InputError(f"{name}: it already has these parameters, so nothing was changed")
         return PreparedChange(record, items, shown, reason.strip())
 
     def write(

@@ -95,10 +95,10 @@ def lock_position(
     row = plant.field.place(name)
     refused = functools.partial(refusals.NO_POSITION.error, heliostat=name)
     if not plant.field.among((states.LOCKED,), plant.now())[row]:
-        raise refused(why="it is not locked, or has not reported lately")
+        raise refused(why="it is not locked, or has sent no recent report")
     aim, sun = plant.aims[row], plant.sun_vector()
     if not np.isfinite(aim).all():
-        raise refused(why="it has no aim")
+        raise refused(why="it has no aim point")
     if sun[2] <= 0.0:
         raise refused(why="the sun is below the horizon")
     here = plant.field.rows[row]
@@ -111,8 +111,9 @@ def lock_position(
     turn = float(angle_between(mechanism.pose(counts).normal, mechanism.pose(wanted).normal))
     if turn > MOST_TURN:
         raise refused(
-            why=f"its counts would change by {1e3 * turn:.0f} mrad of the mirror, above "
-            f"{1e3 * MOST_TURN:.0f} mrad: is it this heliostat's beam, and this its aim?",
+            why=f"its step counts would change by {1e3 * turn:.0f} mrad of mirror rotation, the "
+            f"limit is {1e3 * MOST_TURN:.0f} mrad; check that the beam and the aim are this "
+            f"heliostat's",
         )
     ticket = plant.commands.zero(person, token, name, wanted.tolist())
     places = ", ".join(f"{x:.2f}" for x in aim)

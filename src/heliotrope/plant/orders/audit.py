@@ -31,7 +31,7 @@ from heliotrope.store.digests import AUDIT, GENESIS, Head, digest_of
 #: A disk with less free space than this (bytes) counts as full: no record may end half-way.
 LEAST_FREE = 1 << 20
 #: Result of a record that was open when the plant stopped.
-STOPPED = "unknown: the plant stopped before the result was known"
+STOPPED = "unknown, because the plant stopped before the result arrived"
 
 
 class AuditError(HeliotropeError):
@@ -134,14 +134,17 @@ class JsonLines:
         try:
             self._file = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o600)
         except OSError as error:
-            raise AuditError(f"audit {self.path}: {error.strerror}; give a writable file") from None
+            raise AuditError(
+                f"audit {self.path}: {error.strerror}; specify a writable file"
+            ) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             records, torn = read(self.path)
         except BlockingIOError:
             os.close(self._file)
             raise AuditError(
-                f"audit {self.path}: another process writes to it; only one plant may run"
+                f"audit {self.path}: another process is writing to it; only one plant may run at a "
+                f"time"
             ) from None
         except BaseException:
             os.close(self._file)
@@ -168,7 +171,9 @@ class JsonLines:
             If another record has the same identity.
         """
         if record.identity in self._known:
-            raise InputError(f"audit: a record {record.identity} exists; identities are unique")
+            raise InputError(
+                f"audit: record {record.identity} already exists; each identity must be unique"
+            )
         fields = asdict(record)
         del fields["result"], fields["finished"]
         self._append({"event": "accepted", **fields})
@@ -186,7 +191,7 @@ class JsonLines:
             If the record was not begun, or has a result.
         """
         if identity not in self._open:
-            raise InputError(f"audit: no record {identity} waits for a result")
+            raise InputError(f"audit: no record {identity} is waiting for a result")
         line = {"event": "result", "identity": identity, "result": result, "finished": at}
         self._append(line)
         self._open.discard(identity)
@@ -207,7 +212,7 @@ class JsonLines:
         if disk.f_bavail * disk.f_frsize < LEAST_FREE:
             raise AuditError(
                 f"audit {self.path}: {disk.f_bavail * disk.f_frsize} bytes are left on its disk, "
-                f"below {LEAST_FREE}; make room"
+                f"the minimum is {LEAST_FREE}; make room"
             )
 
     def close(self) -> None:
@@ -229,7 +234,7 @@ class JsonLines:
             os.fsync(self._file)
         except OSError as error:
             self._torn = True
-            raise AuditError(f"audit {self.path}: {error.strerror}; see to its disk") from None
+            raise AuditError(f"audit {self.path}: {error.strerror}; check the disk") from None
         self._torn = written != len(data)
         if self._torn:
             raise AuditError(f"audit {self.path}: only {written} of {len(data)} bytes written")
@@ -336,7 +341,7 @@ def verify(path: str | Path, known: Iterable[Head] = ()) -> Head:
         if digest is None:
             if digests and fields is not None:
                 raise FormatError(
-                    path, "it has no digest: it was altered or added", f"line {number}"
+                    path, "it has no digest, so it was altered or added", f"line {number}"
                 )
         else:
             if not digests:
@@ -346,12 +351,13 @@ def verify(path: str | Path, known: Iterable[Head] = ()) -> Head:
                 who = (fields or {}).get("identity", "")
                 raise FormatError(
                     path,
-                    f"record {who} does not fit: it was altered, or lines before it were",
+                    f"record {who} does not match the hash chain; this record or an earlier one "
+                    f"was altered",
                     f"line {number}",
                 )
             digests.append(last)
         place += len(line) + 1
     for head in known:
         if head.chain != AUDIT or (head.number and digests[head.number - 1 :][:1] != [head.digest]):
-            raise FormatError(path, f"head {head} is not in it: records were removed or made anew")
+            raise FormatError(path, f"head {head} is missing, so records were removed or rewritten")
     return Head(AUDIT, len(digests), last)

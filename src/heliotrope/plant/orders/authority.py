@@ -93,7 +93,10 @@ class Person:
 
     def __post_init__(self) -> None:
         if not self.name.strip():
-            raise InputError("person: the name is empty; the audit must record who commands")
+            raise InputError(
+                "person: the name is empty; enter a name, because the audit must "
+                "record who commands"
+            )
 
     def must_be(self, needed: Role, what: str) -> None:
         """Refuse a command if the person's role is too low; ``what`` names the command.
@@ -169,7 +172,7 @@ class Mandate:
         """
         names = tuple(name for name in heliostats if name in self.heliostats)
         self.heliostats.difference_update(names)
-        self.taken.update(dict.fromkeys(names, f"it left the visit: {why}"))
+        self.taken.update(dict.fromkeys(names, f"it dropped out of the visit: {why}"))
         if not fault:
             self.blameless.update(names)
         return names
@@ -219,7 +222,9 @@ class Authority:
         entropy: Callable[[int], bytes] = secrets.token_bytes,
     ) -> None:
         if not 0.0 < lifetime <= 3600.0:
-            raise InputError(f"authority: a lifetime of {lifetime} s; give above 0 to 3600 s")
+            raise InputError(
+                f"authority: a lifetime of {lifetime} s; it must be above 0 and at most 3600 s"
+            )
         self.lifetime = lifetime
         self._clock = clock
         self._entropy = entropy

@@ -135,10 +135,10 @@ class GivingBack(Part):
             aimed, moved = self._commands.aimed, self._movements.names
             # While the record was written.
             if elsewhere := [n for n in some if n in aimed or n not in moved]:
-                raise BeamError("AIM", dict.fromkeys(elsewhere, "it has another aim now"))
+                raise BeamError("AIM", dict.fromkeys(elsewhere, "its aim has changed since"))
 
         def accept(store: tuple[Work, Work] | None) -> Ticket:
-            note = f"{len(names)} beams go back to their aims"
+            note = f"{len(names)} beams return to their aims"
             ticket = self._orders.accept((*_PLANT, "AIM"), (), names, note, store=store)
             self._movements.sent(ticket, now)
             return ticket

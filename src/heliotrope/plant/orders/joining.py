@@ -98,9 +98,9 @@ class JoinQueue:
         """
         for job in self._jobs:
             if gone := lost(job.token, job.waiting):
-                self._fail(job, "the command authority changed while it waited its turn", gone)
+                self._fail(job, "the command authority changed while it was waiting", gone)
             if now >= job.until:
-                self._fail(job, "it waited too long for its turn; command it again")
+                self._fail(job, "it waited too long in the queue; repeat the command")
         self._jobs = deque(job for job in self._jobs if job.waiting)
         if held:
             return []

@@ -105,7 +105,7 @@ class KeptAudit:
         if now - self._heard_at > SILENCE:
             raise AuditError(
                 f"audit: store {self._keeper.database.name} has written nothing for "
-                f"{now - self._heard_at:.0f} s; see to its disk"
+                f"{now - self._heard_at:.0f} s; check the disk"
             )
 
     def _hear(self, now: float) -> None:
@@ -188,8 +188,10 @@ def _room(keeper: Keeper) -> str | None:
     try:
         disk = os.statvfs(file.parent)
     except OSError as error:
-        return f"store {file}: {error.strerror}; see to its disk"
+        return f"store {file}: {error.strerror}; check the disk"
     free = disk.f_bavail * disk.f_frsize
     if free >= LEAST_FREE:
         return None
-    return f"store {file}: {free} bytes are left on its disk, below {LEAST_FREE}; make room"
+    return (
+        f"store {file}: {free} bytes are left on its disk, the minimum is {LEAST_FREE}; make room"
+    )

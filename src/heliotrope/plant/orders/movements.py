@@ -109,11 +109,11 @@ class Movements:
             if not tracking[i]:
                 blocked[name] = "it does not track the receiver"
             elif not on[i]:
-                blocked[name] = "its aim, or the point beside it, is not on a planar receiver"
+                blocked[name] = "its aim or the displaced point is not on a flat receiver"
             elif not away[i] <= MOST * slant[i]:
                 blocked[name] = (
-                    f"{1e3 * away[i] / slant[i]:.1f} mrad beside its aim; a movement has "
-                    f"{1e3 * MOST:g} mrad at most"
+                    f"{1e3 * away[i] / slant[i]:.1f} mrad from its aim; a movement is limited to "
+                    f"{1e3 * MOST:g} mrad"
                 )
         if blocked:
             raise BeamError("AIM", blocked)

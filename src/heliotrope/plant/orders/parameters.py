@@ -92,9 +92,13 @@ def stored_items(answer: Answer) -> dict[str, bytes]:
     if "error" in answer.data:
         return {}
     if not (isinstance(names, list) and isinstance(sizes, list)) or len(names) != len(sizes):
-        raise ProtocolError(f"answer {answer.identity}: it lacks the names and sizes of items")
+        raise ProtocolError(
+            f"answer {answer.identity}: the names and sizes of the items are missing"
+        )
     if not all(isinstance(size, int) for size in sizes) or sum(sizes) != len(answer.block):
-        raise ProtocolError(f"answer {answer.identity}: names, sizes and block do not fit together")
+        raise ProtocolError(
+            f"answer {answer.identity}: the names, the sizes and the block do not match"
+        )
     found, place = {}, 0
     for name, size in zip(names, sizes, strict=True):
         found[str(name)] = answer.block[place : place + size]
@@ -189,7 +193,7 @@ class ParameterSync(Part):
     def compared(self, heliostat: str) -> str:
         """Return in words how the last comparison of a heliostat ended; nothing is sent."""
         if heliostat not in self._wanted.items:
-            return "not compared: this plant does not write parameters"
+            return "not compared, because this plant does not write parameters"
         return self.differing(heliostat) or "the same"
 
     def check(self, heliostat: str, items: Mapping[str, bytes]) -> None:
@@ -248,7 +252,7 @@ class ParameterSync(Part):
         home = self._clusters.home(heliostat).name
         answer = await self._clusters.answer(home, "stored", timeout, heliostat)
         if answer is None:
-            late = f"nothing within {timeout:g} s; check that it is live"
+            late = f"no reply within {timeout:g} s; check that the heliostat is live"
             raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=late)
         items = stored_items(answer)
         if not items:
@@ -299,7 +303,7 @@ class ParameterSync(Part):
         items = {item: self._wanted.items[name][item] for item in able}
         if reason := self._proofs.resting(name, items):
             del items["stow"]
-            listed = f"stow, which is not written: {reason}"
+            listed = f"the stow position, which cannot be written: {reason}"
             self._tell(alarms.PARAMETERS_DIFFER.raised(name, items=listed))
         if not items:
             return

@@ -273,7 +273,7 @@ class PlantOrders(Part):
             text = f"not sent, because it cannot be stored: {error}"
             ticket.advance(heliostats, Stage.REFUSED, text)
         elif ticket.identity in self._open and recording.begin is not None:
-            text = f"not sent: its record could not be written: {error}"
+            text = f"not sent, because its record could not be written: {error}"
             ticket.advance(heliostats, Stage.REFUSED, text)
             # It was accepted, so it gets a record as soon as the disk takes one.
             self._owed.append(recording.begin)
@@ -293,7 +293,7 @@ class PlantOrders(Part):
     @staticmethod
     def _give_up_late(recording: _Recording, now: float) -> None:
         if now > recording.until:
-            text = f"not sent: its record was not on the disk within {RECORDING:g} s"
+            text = f"not sent, because its record was not written to disk within {RECORDING:g} s"
             recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
 
     def when_recorded(self, ticket: Ticket, send: Callable[[bool], None]) -> None:
@@ -323,12 +323,12 @@ class PlantOrders(Part):
             ticket = recording.ticket
             if ticket.name not in _STILL:
                 names = [name for name in recording.heliostats if name in heliostats]
-                ticket.advance(names, Stage.REFUSED, f"not sent: overtaken by {what}")
+                ticket.advance(names, Stage.REFUSED, f"not sent, because {what} came first")
         for identity in self._unsent:
             under = self._under.get(identity)
             if under is not None and under.ticket.name not in _STILL:
                 names = [name for name in under.heliostats if name in heliostats]
-                under.ticket.advance(names, Stage.FAILED, f"not sent: overtaken by {what}")
+                under.ticket.advance(names, Stage.FAILED, f"not sent, because {what} came first")
 
     def note(self, who: str, role: str, what: str, note: str) -> None:
         """Record an action that is complete at once, such as a change of the command authority."""
@@ -619,13 +619,13 @@ class PlantOrders(Part):
         """Record the state of every open ticket, at the end of the plant."""
         until = now + _LAST
         for recording in self._recording.values():
-            text = "not sent: the plant was closed"
+            text = "not sent, because the plant was shut down"
             recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
         self.on_beat(now)
         await self._until(lambda: not self._recording, until)
         for identity, ticket in self._open.items():
             if identity not in self._recording:
-                self._owe_result(identity, f"{ticket.text}; then the plant was closed")
+                self._owe_result(identity, f"{ticket.text}; then the plant was shut down")
         self._open.clear()
         self.problem = ""
         self.pay()
@@ -658,7 +658,9 @@ def whole(values: Sequence[float], codes: str, command: str) -> tuple[float, ...
         Too many or too few numbers, or one out of range.
     """
     if len(values) != len(codes):
-        raise InputError(f"{command}: {len(values)} numbers given; the wire takes {len(codes)}")
+        raise InputError(
+            f"{command}: got {len(values)} numbers, but the command takes {len(codes)}"
+        )
     checked: list[float] = [
         int(v) if code not in "fd" and float(v).is_integer() else v
         for v, code in zip(values, codes, strict=True)
@@ -668,5 +670,5 @@ def whole(values: Sequence[float], codes: str, command: str) -> tuple[float, ...
     except (struct.error, OverflowError) as error:
         raise InputError(f"{command}: {tuple(values)} cannot be sent: {error}") from None
     if not all(abs(v) < float("inf") for v in struct.unpack("<" + codes, data)):
-        raise InputError(f"{command}: {tuple(values)} cannot be sent: give finite numbers")
+        raise InputError(f"{command}: {tuple(values)} cannot be sent; specify finite numbers")
     return tuple(float(v) for v in values)

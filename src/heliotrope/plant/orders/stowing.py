@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable
 from heliotrope.plant.orders.tickets import Ticket
 
 #: Why such a heliostat is not moved meanwhile.
-WAITS = "it waits for its turn to go to stow"
+WAITS = "it is waiting its turn to go to stow"
 
 
 class StowQueue:

@@ -115,9 +115,9 @@ class Ticket:
         for i in late:
             acknowledged = self._stage[i] == RANK[Stage.ACKNOWLEDGED]
             text = (
-                f"acknowledged, but not done within {self._patience:.0f} s"
+                f"acknowledged, but not completed within {self._patience:.0f} s"
                 if acknowledged
-                else "no answer before it expired"
+                else "no reply before the command expired"
             )
             self.advance([self.heliostats[i]], Stage.FAILED, text)
 

@@ -16,7 +16,10 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.refusals import AIM_NOT_TAKEN, STANDBY_NOT_TAKEN
 
 #: Why a point of an earlier program may not have been taken.
-_BEFORE_START = "the plant's program ended before it was acknowledged, or its store was restored"
+_BEFORE_START = (
+    "the plant's program ended before it was acknowledged, or the plant's store was "
+    "restored from a backup"
+)
 
 
 #: The refusal of a command that needs a point which was not taken.
