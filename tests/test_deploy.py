@@ -369,7 +369,7 @@ def test_the_links_file_is_read(tmp_path: Path) -> None:
     (tmp_path / "C3.toml").touch()
     keys = tmp_path / "links.keys.toml"
     keys.touch(0o600)
-    with pytest.raises(FormatError, match=r"clusters\.C1: a cluster and its plant prove"):
+    with pytest.raises(FormatError, match=r"clusters\.C1: a cluster and its plant authenticate"):
         read_links(tmp_path / "links.toml")
     keys.write_text(f'password = "x"\n[clusters]\nC1 = "{"2a" * 32}"\n')
     found = read_links(tmp_path / "links.toml")

@@ -78,10 +78,10 @@ def test_a_jack_stops_at_its_end() -> None:
     [
         (7, {}, "kind"),
         (0, {drives.ZERO: math.nan}, "finite"),
-        (0, {drives.RATE: 0.0}, "still"),
-        (0, {drives.SCALE: -1.0}, "still"),
+        (0, {drives.RATE: 0.0}, "cannot move"),
+        (0, {drives.SCALE: -1.0}, "cannot move"),
         (1, {drives.STROKE: 5.0}, "triangle"),
-        (0, {drives.WORM_SIN: 0.1, drives.WORM_RATIO: 40.0}, "backwards"),
+        (0, {drives.WORM_SIN: 0.1, drives.WORM_RATIO: 40.0}, "reverse its direction"),
     ],
 )
 def test_drives_that_cannot_work_are_refused(

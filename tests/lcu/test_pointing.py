@@ -228,9 +228,9 @@ def test_no_mirror_serves_opposite_directions() -> None:
     ("change", "text"),
     [
         ({0: math.nan}, "finite"),
-        ({0: 0.5, 2: 0.5}, "length 1"),
+        ({0: 0.5, 2: 0.5}, "unit vectors"),
         ({6: 0.0, 7: 0.0, 8: -1.0}, "parallel"),
-        ({15: 1.0, 16: 0.0, 17: 0.0}, "along"),
+        ({15: 1.0, 16: 0.0, 17: 0.0}, "parallel"),
     ],
 )
 def test_armatures_that_cannot_point_are_refused(change: dict[int, float], text: str) -> None:

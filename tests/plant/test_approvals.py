@@ -217,7 +217,7 @@ def test_who_may_ask_and_decide(tmp_path: Path) -> None:
             desk.approvals.refuse(SECOND, number, " ")
         with pytest.raises(UnknownNameError, match="waiting change '7'"):
             await desk.approvals.approve(SECOND, 7)
-        with pytest.raises(RefusedError, match=f"change {number} of Egon waits"):
+        with pytest.raises(RefusedError, match=f"change {number} of Egon is waiting"):
             await desk.ask(values={"tilt_east": 0.001})
         assert [one.number for one in desk.approvals.waiting] == [number]
         assert (desk.writes, ticket.finished) == (0, False)

@@ -248,7 +248,7 @@ def test_a_disk_that_becomes_read_only(tmp_path: Path) -> None:
     keeper.writer._drop_connection()
     database.read_only = True  # type: ignore[attr-defined]
     keeper.record_event(Event(1.0, "test", "later"))
-    with pytest.raises(StoreError, match=r"attempt to write a readonly database.*see to its disk"):
+    with pytest.raises(StoreError, match=r"attempt to write a readonly database.*check the disk"):
         keeper.writer.confirmed().result(10.0)
     assert keeper.events() == []
     database.read_only = False  # type: ignore[attr-defined]

@@ -105,7 +105,7 @@ def test_a_failure_keeps_what_was_put_and_gives_up_what_was_tried(
 ) -> None:
     database.fails = True
     writer.put(note("kept"))
-    with pytest.raises(StoreError, match=r"disk is full.*see to its disk"):
+    with pytest.raises(StoreError, match=r"disk is full.*check the disk"):
         writer.do(note("tried"))
     assert "disk is full" in writer.problem
     with pytest.raises(StoreError, match="disk is full"):

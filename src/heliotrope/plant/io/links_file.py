@@ -452,6 +452,11 @@ def _check(found: LinksFile) -> None:
                 "cluster file of a bus on this computer",
                 f"clusters.{name}",
             )
+    _check_encrypted(path, document)
+
+
+def _check_encrypted(path: Path, document: LinksDocument) -> None:
+    """Refuse links to other computers without TLS, unless the file accepts them."""
     if document.tcp is not None:
         host, _ = _listen(path, document.tcp.listen)
         encrypted = document.tcp.certificate is not None
