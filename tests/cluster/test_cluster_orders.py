@@ -497,7 +497,7 @@ def test_statistics_tell_of_each_node() -> None:
         counts = answers["s"]["A1"]
         assert counts["asked"] == counts["answered"] > 8
         assert 0.005 < counts["round_trip"] < 0.02
-        assert "question 'weather' is not known" in answers["w"]["error"]
+        assert "query 'weather' is not known" in answers["w"]["error"]
         assert "has no heliostat 'A9'" in answers["n"]["error"]
 
     run(main)
@@ -595,7 +595,7 @@ def test_no_more_orders_are_taken_than_the_bus_can_carry() -> None:
         for _ in range(1030):
             field.cluster._work.take(command)
         await asyncio.sleep(1.5)
-        assert "2048 orders are waiting; the limit is 2048" in field.plant.text("c")
+        assert "2048 orders are waiting, the limit is 2048" in field.plant.text("c")
 
     run(main)
 

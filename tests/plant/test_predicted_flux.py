@@ -23,6 +23,7 @@ from heliotrope.optics import (
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.predicted_flux import _from_outside, predicted
 from heliotrope.plant.operations.views import PredictedView
+from heliotrope.plant.refusals import RefusedError
 from support.live import LivePlant, live
 
 
@@ -51,14 +52,15 @@ def test_it_is_what_the_library_says_of_the_same_mirrors() -> None:
     live(scene, AutomaticSettings(wanted=True))
 
 
-def test_a_plant_goes_on_when_the_process_that_computes_it_has_ended() -> None:
+@pytest.mark.parametrize("error", [InputError("the process has ended"), ValueError("a defect")])
+def test_a_plant_goes_on_when_its_flux_cannot_be_computed(error: Exception) -> None:
     async def ended(*_: object) -> None:
-        raise InputError("the process that computes beside the plant has ended")
+        raise error
 
     async def scene(made: LivePlant) -> None:
         operations = made.operations
         operations._flux._worker = ended  # type: ignore[assignment]
-        with pytest.raises(InputError):
+        with pytest.raises(RefusedError, match=str(error)):
             await operations.receiver_flux()
         taken = await operations._figures()
         assert "available" in taken
@@ -144,3 +146,12 @@ def test_a_second_receiver_has_its_own_uncertainty() -> None:
     assert (first.power, first.power_sigma, first.peak_sigma) == (0.0, 0.0, 0.0)
     np.testing.assert_allclose(second.sigma, alone.sigma)
     assert second.power_sigma == pytest.approx(alone.power_sigma)
+
+
+def test_the_beams_of_a_singular_covariance_are_uncertain_in_one_direction() -> None:
+    scene = _field(12, 0.7e-3)
+    along = 1e-7 * np.array([[1.0, 1.0 + 1e-15], [1.0 + 1e-15, 1.0]])
+    mirrors = replace(scene.mirrors, pointing=np.broadcast_to(along, (12, 2, 2)))
+    (shown,) = predicted(scene.with_mirrors(mirrors), FieldOptics())
+    assert np.isfinite(shown.sigma).all()
+    assert shown.power_sigma > 0.0

@@ -77,7 +77,7 @@ def test_a_folder_is_read_as_it_was_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ('C001 = "tcp"', 'C001 = "C001.toml"', "beside twin"),
+        ('C001 = "tcp"', 'C001 = "C001.toml"', "together with twin"),
         ("none = true", "photographs = true", "a witness cannot see the sun of a simulated field"),
     ],
 )

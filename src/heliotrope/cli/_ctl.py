@@ -831,7 +831,7 @@ def _show_waiting(waiting: list[dict[str, Any]], as_json: bool = False) -> None:
         return
     for change in waiting:
         print(
-            f"change {change['number']} of {change['heliostat']}, asked for by {change['author']} "
+            f"change {change['number']} of {change['heliostat']}, requested by {change['author']} "
             f"at {_utc(change['at'])}: {change['reason']}; it ends at {_utc(change['until'])}"
         )
         if change["version"]:

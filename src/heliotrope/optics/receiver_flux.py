@@ -424,8 +424,7 @@ class _Grid:
         rows, wide = self._grid[2], len(self._columns[0])
         count, order = int(groups.max(initial=0)) + 1, np.argsort(groups, kind="stable")
         edges = np.searchsorted(groups[order], np.arange(count + 1))
-        root = np.linalg.cholesky(scatter + 1e-30 * np.eye(2))
-        factor = as_input(np.stack([root[:, 0, 0], root[:, 1, 0], root[:, 1, 1]], axis=-1))
+        factor = as_input(_root(scatter))
         own, value = np.zeros((count, rows, wide)), np.zeros(len(groups))
         slope = np.zeros((len(groups), 2))
         shared = np.zeros((count, modes.shape[1], rows, wide))
@@ -538,3 +537,12 @@ def _divisions(scene: Scene, sun: float = SUN_SIGMA**2) -> IntArray:
     for k, side in enumerate((mirrors.width, mirrors.height)):
         count[:, k] = np.clip(np.ceil(side * gain / (PART * blur)), 1, _MOST)
     return count
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Return the lower roots of covariances (N, 2, 2), which may be singular: (N, 3)."""
+    first = np.sqrt(np.maximum(covariance[:, 0, 0], 0.0))
+    mixed = np.divide(covariance[:, 1, 0], first, out=np.zeros_like(first), where=first > 0.0)
+    # Rounding may leave a singular one slightly negative.
+    second = np.sqrt(np.maximum(covariance[:, 1, 1] - mixed**2, 0.0))
+    return np.stack([first, mixed, second], axis=-1)

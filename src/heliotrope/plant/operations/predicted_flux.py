@@ -76,7 +76,7 @@ class PredictedFlux:
         Raises
         ------
         RefusedError
-            If nothing has been computed yet since the start.
+            If nothing has been computed yet since the start, or the computation failed.
         """
         running = self._computing
         if running is None and self._plant.now() - self._made_at >= EVERY:
@@ -85,7 +85,8 @@ class PredictedFlux:
             await asyncio.wait((running,), timeout=PATIENCE)
             if running.done():
                 self._computing = None
-                running.result()
+                if (error := running.exception()) is not None:
+                    raise RefusedError(f"flux: not predicted now ({error})") from error
         if not self._views and self._surfaces:
             raise RefusedError(
                 "flux: the first prediction since the start is still being computed (half a "

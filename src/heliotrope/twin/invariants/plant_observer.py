@@ -36,7 +36,8 @@ VOID_WITHIN = 4.2
 #: Leases that go to different clusters within this time are of one moment, s.
 _AT_ONCE = 0.5
 #: What a refusal says for one reason and for no other.
-ROLE_REASON, NOBODY_REASON, OTHER_REASON = "; it needs ", "nobody has it", "so nothing was sent for"
+ROLE_REASON, NOBODY_REASON = "but the command needs ", "nobody has it"
+OTHER_REASON = "was not sent; take command first"
 #: Longest time from posting a command to join to its execution, beyond its lifetime: in transit and
 #: late on the bus; and the interval between looks at the boards, s.
 LATE, LOOKS = 1.8, 0.5

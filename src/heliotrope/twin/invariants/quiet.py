@@ -50,7 +50,7 @@ GRANTED, CROSSING = 4.0, 3.0
 
 #: What a refusal says of a heliostat, and for how long a quiet stretch may have lasted by then, s:
 #: statuses come every second, what is stored is asked for again after 30 s.
-UNHEARD_REASON, UNHEARD_FOR = "has not been heard since", 0.0
+UNHEARD_REASON, UNHEARD_FOR = "it has sent nothing since", 0.0
 UNCOMPARED_REASON, UNCOMPARED_FOR = "not been compared with the wanted", 45.0
 #: A refusal by step counts that are right.
 DOUBT_REASON = "step counts may be wrong"

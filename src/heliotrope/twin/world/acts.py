@@ -115,7 +115,7 @@ class Acts:
             if name not in self._withheld:
                 self._returns(operations, name, owners)
         operations.give_back(ENGINEER, names)
-        self.acted(f"{len(names)} heliostats given")
+        self.acted(f"put {len(names)} heliostats under")
         self._beams.given(names, self.now())
         self._watch.given(names, self.now())
         self._withheld.clear()
@@ -346,7 +346,7 @@ class Acts:
         count = self.chance.randint(2, 3) if together or receiver else 1
         first, *others = self.chance.sample(self.names, count)
         operations.calibrate(person, first, together=others, receiver=receiver)
-        self.acted("asked for a", person)
+        self.acted("requested a", person)
         self._watch.asked((first, *others))
 
     def switches(self, operations: Operations, person: Person, *, on: bool) -> None:
