@@ -268,7 +268,7 @@ class Agreement(Part):
         return normalize(sun - rate * ages[:, None], "sun")
 
     def _beside(self, rows: Rows, sent: _Points, angles: FloatArray, sun: FloatArray) -> FloatArray:
-        """Return the angle between beams (K,), the axes at angles (K, 2), and their points, rad."""
+        """Return the angle between beams (K,), axes at angles (K, 2), and their points, rad."""
         normal, vertex = Armature(self._armature[rows]).pose(angles)
         beam = 2.0 * np.sum(sun * normal, axis=-1, keepdims=True) * normal - sun
         return sent.beside(rows, beam, vertex)

@@ -69,7 +69,8 @@ class DriveChecks(Part):
         self._shown: dict[str, tuple[date, str]] = {}
         #: Day of the last completed diagnosis, whatever its result.
         self._diagnosed: dict[str, date] = {}
-        #: Heliostats whose boards report a stalled drive or a sensor that does not respond.
+        #: Heliostats whose boards report a stalled drive; heliostats whose tilt sensors do not
+        #: respond.
         self._faulty: set[str] = set()
         self._silent: set[str] = set()
 
