@@ -139,7 +139,7 @@ class Attempts:
             self._tell(self.law.alarm.ended(subject))
 
     def renew(self, subjects: Iterable[str]) -> None:
-        """Begin anew: somebody wants another try, or more is known. An alarm stays until `done`."""
+        """Start afresh: another attempt is wanted or more is known. An alarm stays until `done`."""
         for subject in subjects:
             self._failed.pop(subject, None)
 
