@@ -29,7 +29,7 @@ from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import alarms
 from heliotrope.store.records import PlannedVisit
 
-#: Visits to a target that failed through no fault of a heliostat: the camera, clouds, refusals.
+#: Visits to a target that failed through no fault of a heliostat: camera, clouds, refusals.
 PLACES = RetryLaw(
     "visits to this target",
     5,
@@ -39,15 +39,15 @@ PLACES = RetryLaw(
     rest=3600.0,
     alarm=alarms.VISITS_FAIL,
 )
-#: Outcomes of visits that were broken off.
+#: Outcomes of visits that were aborted.
 _BROKEN = (
     CalibrationOutcome.REFUSED,
     CalibrationOutcome.TAKEN_OUT,
     CalibrationOutcome.ERROR,
 )
-#: A heliostat that was on a target leaves it to all others for this time, s.
+#: A heliostat that was on a target leaves it to others for this time, s.
 FRESH = 600.0
-#: Time between computations of the true errors, s.
+#: Interval between computations of the true errors, s.
 _TRUTH_EVERY = 5.0
 
 
@@ -72,7 +72,7 @@ class Scheduling(Foreseeing, Protocol):
     ) -> PlannedVisit | None:
         """Return the next of the ready heliostats (N,) for a free target, None if none is due.
 
-        With ``beside`` it goes there together with those returned before.
+        With ``beside``, the heliostat goes there together with those returned before.
         """
         ...
 
@@ -81,7 +81,7 @@ class Scheduling(Foreseeing, Protocol):
         ...
 
     def done(self, entry: CalibrationEntry) -> None:
-        """Take the result of a visit."""
+        """Accept the result of a visit."""
         ...
 
     def shone(self, mirrors: int, lit: int, seconds: float) -> None:
@@ -91,7 +91,7 @@ class Scheduling(Foreseeing, Protocol):
 
 @dataclass(frozen=True)
 class Visits:
-    """The visits that a plant can make, and what chooses and keeps them.
+    """The visits that a plant can make, and the parts that choose and store them.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Visits:
     receiver
         Calibrates heliostats on a receiver; None: they go to targets.
     pictures
-        Keeps photographs with their results; None: they are not kept.
+        Stores photographs with their results; None: they are not stored.
     """
 
     cycle: CalibrationCycle
@@ -120,9 +120,9 @@ class TrueErrors:
     Parameters
     ----------
     plant
-        The errors are timed by its clock.
+        Plant whose clock times the errors.
     truth
-        Returns the errors, rad, (N,); None: they are unknown.
+        Function that returns the errors, rad, (N,); None: they are unknown.
     """
 
     def __init__(self, plant: PlantController, truth: Callable[[], FloatArray] | None) -> None:
@@ -160,13 +160,14 @@ class Calibrating:
     visits
         The visits that the plant can make.
     book, keeping
-        Take the results.
+        Accept the results.
     truth
         True errors, known to a twin only.
     first
-        Returns the heliostats to be visited first, after those in doubt.
+        Function that returns the heliostats to be visited first, after the doubtful ones.
     ruled
-        Returns a mask of the heliostats under a rule of the timetable, (N,); None: none is.
+        Function that returns a mask of the heliostats under a timetable rule, (N,); None: there are
+        none.
     """
 
     def __init__(
@@ -190,10 +191,10 @@ class Calibrating:
         self._receiver = None if receiver is None else ReceiverVisits(plant, book, receiver, tell)
         self._running: dict[str, Running] = {}
         self._asked: dict[str, tuple[str, bool]] = {}
-        #: Why requests of persons were given up, and the last result, by heliostat.
+        #: Why operators' requests were dropped, and the last result, by heliostat.
         self._withdrawn: dict[str, str] = {}
         self._last: dict[str, CalibrationEntry] = {}
-        #: When each was on a target last, POSIX s, (N,).
+        #: When each heliostat was last on a target, POSIX s, (N,).
         self._visited = np.full(len(plant.field.names), -np.inf)
         self._flown: frozenset[str] = frozenset()
         self._places = Attempts(PLACES, log.take_alarm)
@@ -201,7 +202,7 @@ class Calibrating:
 
     @property
     def asked(self) -> tuple[str, ...]:
-        """Heliostats that persons want calibrated next, in the order in which they were asked."""
+        """Heliostats that operators want calibrated next, in the order of the requests."""
         return (*self._asked, *(name for each in self._requests for name in each.asked))
 
     @property
