@@ -346,7 +346,7 @@ class AutomaticControl:
                 raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
 
     def _locked(self, heliostats: Sequence[str]) -> list[str | None]:
-        """Return the locks that keep heliostats from their aims, in words; None where none does."""
+        """Return the locks that keep heliostats from their aims, in words; None without a lock."""
         aims = self._plant.aims[[self._plant.field.place(name) for name in heliostats]]
         return self._plant.lockouts.reasons(heliostats, aims)
 
@@ -687,7 +687,7 @@ class AutomaticControl:
             self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
 
     def _stow_up(self, *, told: bool) -> None:
-        """Stow the wanted heliostats that are up; with ``told`` say so even if there are none."""
+        """Stow the wanted heliostats out of stow; with ``told``, report it even if none are."""
         up = self._plant.field.among(states.UP, self._plant.now()) & self._raising.wanted
         names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
         if names:
