@@ -116,7 +116,7 @@ def main() -> None:
         print("heliotrope: interrupted", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:
-        # The reader of our output has gone, as `head` does.
+        # The reader of our output has closed it, as `head` does.
         sys.stderr.close()
         sys.exit(141)
     except OSError as error:

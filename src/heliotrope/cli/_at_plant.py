@@ -19,23 +19,14 @@ from heliotrope.local import (
     socket_folder,
 )
 
-#: Requests of the socket for emergencies.
+#: Requests that use the socket for emergencies.
 URGENT = frozenset({"POST emergency", "POST stow", "POST defocus"})
 #: First frame of a caller without a token.
 _USER: dict[str, Any] = {"user": True}
 
 
 class AtPlant:
-    """Has the methods of `console.Client` that `heliotrope ctl` needs.
-
-    Parameters
-    ----------
-    token
-        API token; "": none, which the plant's own user and root need not have to see the plant and
-        to give EMERGENCY, DEFOCUS and STOW.
-    data
-        Data folder of the plant.
-    """
+    """A caller with the methods of `console.Client` that `heliotrope ctl` needs."""
 
     def __init__(self, token: str, data: Path) -> None:
         self._hello: dict[str, Any] = {"token": token} if token else _USER
@@ -50,16 +41,10 @@ class AtPlant:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Do nothing: each call has a connection of its own."""
+        """Do nothing, because each call has its own connection."""
 
     def ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
-        """Send a request of the API; return the answer.
-
-        Raises
-        ------
-        HeliotropeError
-            If the plant refuses it, or cannot be reached.
-        """
+        """Send an API request; return the reply."""
         request, arguments, blob = f"{method} {path}", dict(body or {}), b""
         if request == "POST aim":
             points = arguments.pop("points", {})
@@ -72,13 +57,13 @@ class AtPlant:
         try:
             return ask_once(self._folder / EMERGENCY, self._hello, request, arguments)
         except CallError:
-            # A token that has expired, or of a viewer, must not stop an emergency.
+            # An expired token, or a viewer's token, must not prevent an emergency.
             return ask_once(self._folder / EMERGENCY, _USER, request, arguments)
 
     def get(self, path: str) -> Any:
-        """Return the view of a path."""
+        """Return the view for a path."""
         return self.ask("GET", path)
 
     def picture(self, path: str) -> bytes:
-        """Return the JPEG of a path."""
+        """Return the JPEG for a path."""
         return fetch_once(self._folder / ORDINARY, self._hello, f"GET {path}", {})[1]

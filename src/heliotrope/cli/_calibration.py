@@ -1,4 +1,4 @@
-"""Options and progress bars that the commands of calibration share."""
+"""Options and progress bars shared by the calibration commands."""
 
 import re
 from collections import Counter
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from heliotrope.calibration.learn.learning import Progress, Runner
 
-# Options that mean the same in every command of calibration.
+# Options with the same meaning in every calibration command.
 Place = Annotated[
     Path, typer.Argument(help="Folder with measurements, properties and tower; or a plant file.")
 ]
@@ -77,7 +77,7 @@ def parse_model(text: str) -> str | tuple[str, ...]:
 
 @contextmanager
 def progress_of_steps(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Give a function (step, done, all) that draws a bar on the terminal's error stream."""
+    """Yield a function (step, done, total) that draws a bar on the terminal's error stream."""
     from rich.console import Console
     from rich.progress import Progress as Bar
 
@@ -91,14 +91,14 @@ def progress_of_steps(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def progress(label: str, quiet: bool) -> "Iterator[Progress]":
-    """Give a function (done, all) that draws a bar on the terminal's error stream."""
+    """Yield a function (done, total) that draws a bar on the terminal's error stream."""
     with progress_of_steps(quiet) as steps:
         yield lambda done, total: steps(label, done, total)
 
 
 @contextmanager
 def connected(scheduler: str | None) -> "Iterator[Client | None]":
-    """Give a client of a dask scheduler; None if none is named."""
+    """Yield a client of a dask scheduler; None if no scheduler is specified."""
     if scheduler is None:
         yield None
         return
@@ -113,7 +113,7 @@ def connected(scheduler: str | None) -> "Iterator[Client | None]":
 
 @contextmanager
 def workers(scheduler: str | None) -> "Iterator[Runner | None]":
-    """Give a runner on a dask scheduler; None for this process."""
+    """Yield a runner on a dask scheduler; None for this process."""
     with connected(scheduler) as client:
         if client is None:
             yield None

@@ -1,4 +1,4 @@
-"""Shared by the commands: arguments to values, values to the screen."""
+"""Shared by the commands: conversion of arguments to values, and display of values."""
 
 import json
 import math
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def parse_time(text: str) -> datetime:
-    """Return a time with time zone from ISO 8601; "now" is the present."""
+    """Return a time with time zone from ISO 8601; "now" means the present time."""
     from datetime import UTC
 
     if text == "now":
@@ -37,7 +37,7 @@ def parse_time(text: str) -> datetime:
 
 
 def day_of(time: datetime, site: "Site") -> date:
-    """Return the day that a time names: in UTC the site's own, else that of the zone it is in."""
+    """Return the day of a time: for UTC the site's own day, else the day in its time zone."""
     from heliotrope.sun import solar_day
 
     return time.date() if time.utcoffset() else solar_day(time, site)
@@ -91,7 +91,7 @@ def parse_numbers(
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    # A nan is within no limits.
+    # NaN lies within no limits.
     if len(values) not in ({count} if count else range(1, 1000)) or not all(
         least <= value <= most for value in values
     ):
@@ -136,7 +136,7 @@ def plain(value: Any) -> Any:
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
-    # Arrays and numbers of NumPy, which need not be imported for this.
+    # Arrays and numbers of NumPy, which need not be imported for this check.
     if type(value).__module__ == "numpy":
         return plain(value.tolist())
     if isinstance(value, datetime):
@@ -159,6 +159,6 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str
         table.add_row(*row)
     console = Console()
     if not console.is_terminal:
-        # A file or a pipe has no width, and numbers must not be cut.
+        # A file or a pipe has no width, and numbers must not be truncated.
         console = Console(width=1000)
     console.print(table)

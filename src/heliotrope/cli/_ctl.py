@@ -37,7 +37,7 @@ LockedReceivers = Annotated[
     typer.Option("--receiver", help="Receiver; may be repeated.", show_default=False),
 ]
 LockedTower = Annotated[bool, typer.Option("--tower", help="The tower: all heliostats.")]
-#: Statuses of answers: name, password or code is wrong; the code of a second factor is needed.
+#: Status codes: name, password or code is wrong; a second-factor code is required.
 _REFUSED, _NEEDS_CODE = 401, 428
 Wait = Annotated[
     float,
@@ -75,14 +75,14 @@ def _where(
 
 
 def _sign_in_client(context: typer.Context) -> "Client":
-    """Return a client without a token; only the console takes passwords."""
+    """Return a client without a token, because only the console accepts passwords."""
     from heliotrope.console.client import Client
 
     return Client("", context.obj[0])
 
 
 def _sign_in(client: "Client", name: str, password: str) -> None:
-    """Sign in; ask for a code where the account has a second factor."""
+    """Sign in; ask for a code if the account has a second factor."""
     from heliotrope.console.stream import RemoteError
 
     try:
@@ -202,7 +202,7 @@ def _set_up_factor(client: "Client", own: str) -> None:
 
 
 def _account(name: str) -> str:
-    """Return the path of an account, whatever its name has in it."""
+    """Return the path of an account, whatever characters its name contains."""
     return f"accounts/{quote(name, safe='')}"
 
 
@@ -361,7 +361,7 @@ def flux(
 
 
 def _give_or_take(value: float, sigma: float | None, unit: str) -> str:
-    """Return a value and its standard deviation in a unit of 1000, if it is known."""
+    """Return a value with its standard deviation, if known, in a unit of 1000."""
     digits = f"{1e-3 * value:.0f}"
     return f"{digits} {unit}" if sigma is None else f"{digits} ± {1e-3 * sigma:.0f} {unit}"
 
@@ -668,7 +668,7 @@ def emergency(
 
 
 def _print_causes(answer: dict[str, Any]) -> None:
-    """Print the orders of persons that stand; where none does, why an emergency holds."""
+    """Print the active orders of persons or, if there are none, why an emergency is active."""
     for call in answer["calls"]:
         print(f"ordered by {call['who']} ({call['act']}, {_utc(call['at'])}): {call['reason']}")
     if answer["on"] and not answer["calls"]:
@@ -825,7 +825,7 @@ def approvals(
 
 
 def _show_waiting(waiting: list[dict[str, Any]], as_json: bool = False) -> None:
-    """Print the changes that wait for a second engineer."""
+    """Print the changes that await a second engineer."""
     if as_json:
         print_json(waiting)
         return
@@ -851,12 +851,12 @@ def _show_waiting(waiting: list[dict[str, Any]], as_json: bool = False) -> None:
         print("no change waits for approval")
 
 
-#: Units on the screen: name, and its size in the unit of the API.
+#: Displayed units: name, and size in the unit of the API.
 _SHOWN = {"rad": ("mrad", 1e-3), "m": ("mm", 1e-3), "1": ("", 1.0)}
 
 
 def _parameter(text: str, units: dict[str, str]) -> tuple[str, float]:
-    """Return name and value of NAME=VALUE, in the unit of the API."""
+    """Return the name and value from NAME=VALUE, in the unit of the API."""
     key, _, number = text.partition("=")
     name = key
     for ending in ("_mrad", "_mm", "_deg"):
@@ -1154,7 +1154,7 @@ def timetable(
 
 
 def _entries(in_force: list[dict[str, Any]], name: str, remove: bool) -> list[dict[str, Any]]:
-    """Return the entries in force but for one, as the API takes them."""
+    """Return the entries in force except one, in the form that the API accepts."""
     if remove and name not in [entry["name"] for entry in in_force]:
         raise UnknownNameError("timetable entry", name, [entry["name"] for entry in in_force])
     keys = ("name", "heliostats", "target", "at", "every_s", "rule")
@@ -1227,7 +1227,7 @@ def _places(
     receivers: list[str] | None,
     tower: bool,
 ) -> dict[str, object]:
-    """Return the places that a person locks or gives back, as the API takes them."""
+    """Return the places that a person locks or unlocks, in the form that the API accepts."""
     named = {"heliostats": heliostats, "targets": targets, "receivers": receivers}
     return {key: list(names or ()) for key, names in named.items()} | {"tower": tower}
 
@@ -1274,7 +1274,7 @@ def _give(
 def _follow_with_authority(
     client: "Client | AtPlant", path: str, order: dict[str, Any] | None, wait: float
 ) -> None:
-    """Give an order that needs the command authority, and follow it to its end."""
+    """Issue an order that needs the command authority, and follow it to its end."""
     client.ask("POST", "authority")
     try:
         _follow(client, client.ask("POST", path, order), wait)

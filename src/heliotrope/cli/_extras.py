@@ -1,8 +1,8 @@
-"""Packages that a plain installation leaves out, and the extras that bring them."""
+"""Packages that a plain installation omits, and the extras that contain them."""
 
 from heliotrope.errors import InputError
 
-#: Name to import: extra of `pyproject.toml`.
+#: Imported name, and the extra of `pyproject.toml` that contains it.
 EXTRAS = {
     "aiomqtt": "control", "alembic": "store", "argon2": "console", "cryptography": "control",
     "dask": "cluster", "distributed": "cluster", "duckdb": "store", "embreex": "rays",
@@ -10,20 +10,12 @@ EXTRAS = {
     "segno": "console", "serialx": "control", "sqlalchemy": "store", "starlette": "console",
     "uvicorn": "console", "websockets": "console",
 }  # fmt: skip
-#: The extra with everything that a command needs, where that is more than one package.
+#: The extra with everything that a command needs, if that is more than one package.
 _WHOLE = {"run": "console", "ctl": "console", "store": "store"}
 
 
 def missing(error: ModuleNotFoundError, command: str) -> InputError | None:
-    """Return the refusal for a package that is not installed; None: no extra brings it.
-
-    Parameters
-    ----------
-    error
-        What the import raised.
-    command
-        Name of the command; empty if unknown.
-    """
+    """Return the refusal for a package that is not installed; None: no extra contains it."""
     package = (error.name or "").partition(".")[0]
     extra = EXTRAS.get(package)
     if extra is None:

@@ -1,4 +1,4 @@
-"""Options of the light of a field, which ``flux`` and ``aim`` share."""
+"""Options for the light on a field, shared by ``flux`` and ``aim``."""
 
 import re
 from pathlib import Path
@@ -116,7 +116,7 @@ def _facets(text: str) -> tuple[int, int]:
 
 
 def canting_of(text: str, plant: "Plant") -> Any:
-    """Return the canting of facets: "slant", a focal length or a sun."""
+    """Return the canting of facets: "slant", a focal length or a sun position."""
     from heliotrope.sun import vector
 
     if text == "slant":

@@ -1,8 +1,4 @@
-"""What people do with the records of a plant is recorded there: backups, exports, queries.
-
-A plant that runs records it itself, by its local interface; into the store of one that is stopped
-the command writes.
-"""
+"""Records in a plant's store what users do with it: backups, exports, queries."""
 
 import os
 import sys
@@ -13,27 +9,19 @@ from pathlib import Path
 from heliotrope.errors import HeliotropeError
 from heliotrope.local import ORDINARY, AwayError, ask_once, name_here, socket_folder
 
-#: Data folder of a plant whose store is in PostgreSQL, as `heliotrope ctl` reads it.
+#: Data folder of a plant with its store in PostgreSQL, as `heliotrope ctl` reads it.
 _PLANT = "HELIOTROPE_PLANT"
-#: Longest detail that a plant takes.
+#: Longest detail that a plant accepts.
 _LONGEST = 400
 
 
 def this_person() -> str:
-    """Return how the user of this process is named in records."""
+    """Return the name under which the user of this process is recorded."""
     return name_here(os.geteuid())
 
 
 def note_use(place: str, kind: str, detail: str) -> None:
-    """Record in a store what this person did with it; say so if that is not possible.
-
-    Parameters
-    ----------
-    place
-        Data folder of a plant, or the URL of its database.
-    kind, detail
-        Name of a `SecurityEvent`, and what was done.
-    """
+    """Record in a store what this user did with it; report if that is not possible."""
     detail = " ".join(detail.split())[:_LONGEST]
     try:
         try:
@@ -59,7 +47,7 @@ def _write(place: str, kind: str, detail: str) -> None:
     from heliotrope.store.records import Event
 
     with Database(place) as database:
-        database.require()  # a keeper would make a store where there is none
+        database.require()  # a keeper would create a store if there were none
     known = SecurityEvent[kind]
     note = SecurityNote(known, time.time(), this_person(), "", plain(detail))
     with closing(Keeper(place)) as keeper:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def one_plant(command: str, field: Path | None, heliostats: int | None, *, prototype: bool) -> None:
-    """Refuse several plants at once."""
+    """Refuse more than one plant at once."""
     from heliotrope.errors import InputError
 
     if prototype and (field is not None or heliostats is not None):
@@ -39,7 +39,7 @@ def design_of(field: Path | None, heliostats: int | None, *, prototype: bool) ->
 
 
 def start_of(command: str, text: str, design: "Plant") -> "datetime":
-    """Return a simulated start; "morning", or of a day: three hours before noon at the site.
+    """Return a simulated start time; "morning" or a day: three hours before noon at the site.
 
     Raises
     ------

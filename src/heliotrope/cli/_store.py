@@ -12,7 +12,7 @@ app = typer.Typer(
     help="Inspect, back up, restore and export the store of a plant.", no_args_is_help=True
 )
 
-#: Ending of an audit in a file, as the library's `JsonLines` writes it.
+#: Suffix of an audit file, as the library's `JsonLines` writes it.
 _LINES = ".jsonl"
 Place = Annotated[
     str, typer.Argument(help="Data folder of a plant, or postgresql://user@host/name.")

@@ -1,4 +1,4 @@
-"""``heliotrope track --law guo``: the closed form of Guo beside the armature."""
+"""``heliotrope track --law guo``: Guo's closed form, compared with the armature."""
 
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
@@ -61,7 +61,7 @@ def _document(
     branches = []
     for b in range(2):
         gamma, alpha = float(solution.gamma[b]), float(solution.alpha[b])
-        # The armature's solution that stands nearest, for the turn of the azimuth too.
+        # The nearest solution of the armature, including the rotation of the azimuth.
         apart = angle_between(guo.forward(alpha, gamma, parameters), armature.normal)
         over = np.abs(wrap_signed(armature.angles[:, 1] - alpha))
         other = int(np.argmin(over + apart))

@@ -1,4 +1,4 @@
-"""One line for a command line that cannot be used: the option, its value, the limits."""
+"""One line for an invalid command line: the option, its value, the limits."""
 
 import typer
 from typer.exceptions import TyperException

@@ -1,4 +1,4 @@
-"""``heliotrope aim``: aims that keep the flux on a receiver under a limit, although mirrors err."""
+"""``heliotrope aim``: aims that keep the flux on a receiver under a limit despite mirror errors."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from heliotrope.aims import AimPlan, FluxLimit
     from heliotrope.aims.strategies import Strategy
 
-#: Heliostats and cells that are named on the screen.
+#: Maximum number of heliostats and cells that are listed.
 NAMED = 5
 
 

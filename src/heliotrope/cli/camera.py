@@ -89,7 +89,7 @@ def _from_chessboard(
     old = next((c for c in plant.cameras if c.name == name), None)
     camera = lens.camera(name)
     if old is not None:
-        # Its pose was found with the old lens.
+        # Its pose was determined with the old lens.
         camera = replace(camera, targets=old.targets, source=old.source)
     write_with_pictures(with_camera(plant, camera), places[1], places[0].parent)
     forgotten = old is not None and old.position is not None
@@ -305,7 +305,7 @@ def _wishes(
 
 
 def _split(texts: Sequence[str], read: Callable[[str], Value]) -> dict[str, Value]:
-    """Return values by the name before "="; the value without a name is under ""."""
+    """Return values by the name before "="; a value without a name is under ""."""
     values: dict[str, Value] = {}
     for text in texts:
         name, _, value = text.rpartition("=")

@@ -139,7 +139,7 @@ def commission(
 def _joint(
     plant: "Plant", together: int | None, first: int | None, step: str, sigma_mrad: float
 ) -> "JointTerms | None":
-    """Return the joint visits: those of the plant file, as far as no option says otherwise."""
+    """Return the joint visits of the plant file, as changed by the options."""
     from heliotrope.calibration.plan.joint_terms import JointTerms
     from heliotrope.errors import InputError
     from heliotrope.field.coded_visits import JointSettings
@@ -181,7 +181,7 @@ def _fleets(
     flight: tuple[int, int],
     quiet: bool,
 ) -> "tuple[list[Fleet], Any, dict[str, Any] | None]":
-    """Return the knowledge of the heliostats, the measured ones, and the figures of the flight."""
+    """Return what is known about the heliostats, the measured ones, and the flight's results."""
     import numpy as np
 
     from heliotrope.calibration.plan.fleets import fleets_of
@@ -208,7 +208,7 @@ def _fleets(
 def _flown(
     plant: "Plant", fleets: "list[Fleet]", model: str, flight: tuple[int, int], quiet: bool
 ) -> "tuple[list[Fleet], dict[str, Any]]":
-    """Return the fleets after a flight, each mirror as its cluster's middle one."""
+    """Return the fleets after a flight, with each heliostat as the middle one of its cluster."""
     import numpy as np
 
     from heliotrope.airborne.plan import Craft, PlanSettings, PointSelection, plan_flight

@@ -7,9 +7,9 @@ import typer
 
 from heliotrope.cli._common import print_json, print_table
 
-#: Suns of `defocus`: azimuth from the middle of the day, and elevation, degrees.
+#: Sun positions for `defocus`: azimuth from noon, and elevation, degrees.
 _SUNS = ((0.0, 65.0), (0.0, 40.0), (90.0, 30.0), (-70.0, 20.0))
-#: How far from the receiver beams are followed there, m.
+#: Distance from the receiver up to which beams are followed there, m.
 _AROUND = 100.0
 
 app = typer.Typer(help="Create and check plant files.", no_args_is_help=True)
@@ -123,7 +123,7 @@ def defocus(
     aims, center = np.stack(list(defaults.values())), design.receivers[0].center
     documents = []
     for bearing, elevation in _SUNS:
-        # The highest suns stand on the side of the equator.
+        # The sun is highest towards the equator.
         azimuth = bearing + (0.0 if design.site.latitude_deg < 0.0 else 180.0)
         sun = direction(np.radians(azimuth), np.radians(elevation))
         row: dict[str, float] = {"azimuth_deg": azimuth % 360.0, "elevation_deg": elevation}

@@ -1,4 +1,4 @@
-"""``heliotrope flux``: what each heliostat puts on the receiver, and what is lost where."""
+"""``heliotrope flux``: what each heliostat sends to the receiver, and what is lost where."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
     from heliotrope.optics import FieldOptics, FluxTable, PlantFlux
 
-#: Suns of a table that are shown on the screen.
+#: Number of sun positions of a table that are displayed.
 SHOWN = 12
-#: Words for the efficiencies, in the order of the light.
+#: Names of the efficiencies, in the order of the light path.
 _WORDS = {
     "cosine": "cosine",
     "shading": "  not shaded",
@@ -146,7 +146,7 @@ def flux(
 
 @dataclass(frozen=True)
 class _Order:
-    """What is asked for, whatever the suns."""
+    """The requested computation, apart from the sun positions."""
 
     light: "FieldOptics"
     receiver: tuple[str, ...]
@@ -155,7 +155,7 @@ class _Order:
     as_json: bool
 
     def check(self, field: Path, *, table: bool, year: bool) -> None:
-        """Refuse files that cannot be written, or that this table has nothing for."""
+        """Refuse files that cannot be written, or for which this table has no data."""
         from heliotrope.calibration.plan.report import check_picture
         from heliotrope.cli.plan import check_outputs
 
@@ -175,7 +175,7 @@ class _Order:
         return {"receiver": self.receiver, "aim": self.aim, "light": self.light}
 
     def print_files(self) -> None:
-        """Say which files were written."""
+        """Report which files were written."""
         for name, path in self.files.items():
             print(f"{name}: {path}")
 
@@ -266,7 +266,7 @@ def _document(result: "PlantFlux", when: Any) -> dict[str, Any]:
 
 
 def _second(result: "PlantFlux", second: "PlantFlux") -> dict[str, Any]:
-    """Return the result of the rays beside that of the engine."""
+    """Return the result of ray tracing beside that of the engine."""
     import numpy as np
 
     apart = [a.flux - b.flux for a, b in zip(result.maps, second.maps, strict=True)]

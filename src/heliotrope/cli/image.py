@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from heliotrope.mechanism.chain import Mechanism
     from heliotrope.sun import Site
 
-#: Frames after which models of empty targets are saved.
+#: Number of frames after which models of empty targets are saved.
 _OFTEN = 20
 
 
@@ -143,7 +143,7 @@ def _follow(
 
     if len(paths) != 1:
         raise InputError(f"--live follows one source, but {len(paths)} were given; give one")
-    # A camera of the plant may be given by its name.
+    # A plant camera may be specified by its name.
     named = next((c for c in place.cameras if c.name == paths[0]), None)
     text = named.source if named is not None else paths[0]
     folder = place.folder if named is not None else Path()
@@ -199,7 +199,7 @@ def open_place(path: Path) -> Place:
 
 
 def _files(paths: Sequence[Path]) -> tuple[list[Path], set[Path]]:
-    """Return the photographs, and those of folders whose suffix is of another kind."""
+    """Return the photographs, and which of those found in folders have other suffixes."""
     from heliotrope.errors import FormatError
     from heliotrope.imaging.files import IMAGE_SUFFIXES, OTHER_SUFFIXES, find_images
 
@@ -267,7 +267,7 @@ def _job(
 def _write(
     path: Path, outcomes: "Sequence[Outcome]", entries: "Sequence[Entry | None]", place: Place
 ) -> tuple[int, list[str]]:
-    """Write the table of sightings; return their number and a line for each photograph left out."""
+    """Write the table of sightings; return their number and a line for each omitted photograph."""
     import time
 
     from heliotrope.calibration.sighting_table import write_sightings
@@ -333,7 +333,8 @@ def print_spots(outcomes: "Sequence[Outcome]") -> None:
         readings = outcome.document["targets"]
         for reading in readings:
             if not reading["found"]:
-                # A camera sees few of a plant's targets: absent ones matter only if all are absent.
+                # A camera observes few of a plant's targets, so absent targets matter only if all
+                # are absent.
                 if not any(r["found"] for r in readings):
                     print(f"  {reading['target']}: {reading['reasons'][0]['text']}")
                 continue
@@ -404,7 +405,7 @@ def follow(
             if memory is not None:
                 job = replace(job, settings=replace(job.settings, empty=known.models))
             try:
-                # The camera hardly moves from one frame to the next.
+                # The camera barely moves from one frame to the next.
                 outcome = look(frame, place, job, previous=views)  # type: ignore[arg-type]
             except HeliotropeError as error:
                 print(f"heliotrope: {error}", file=sys.stderr)
@@ -423,7 +424,7 @@ def follow(
 
 @contextmanager
 def _kept(known: "Memory", folder: Path | None) -> "Iterator[None]":
-    """Save the models at the end, also after Ctrl-C."""
+    """Save the models at the end, even after Ctrl-C."""
     try:
         yield
     finally:

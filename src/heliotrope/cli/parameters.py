@@ -1,4 +1,4 @@
-"""``heliotrope parameters``: one machine in the parameters of Guo, of Malan and of this program."""
+"""``heliotrope parameters``: one heliostat in the parameters of Guo, Malan and this program."""
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 

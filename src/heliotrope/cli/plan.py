@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
     from heliotrope.field.target import Target
 
-#: Rows of a campaign that are shown on the screen.
+#: Number of rows of a campaign that are displayed.
 SHOWN = 20
 
 
@@ -150,7 +150,7 @@ class _PlanOrder:
 
     @property
     def seconds(self) -> tuple[float, float]:
-        """The span, unix seconds."""
+        """The time span, Unix seconds."""
         return self.span[0].timestamp(), self.span[1].timestamp()
 
     @property
@@ -159,11 +159,11 @@ class _PlanOrder:
         return [t.name for t in self.targets]
 
     def print_json(self, document: dict[str, Any]) -> None:
-        """Print a document with the span."""
+        """Print a document with the time span."""
         print_json({"from": self.span[0], "to": self.span[1], **document})
 
     def print_files(self) -> None:
-        """Say which files were written."""
+        """Report which files were written."""
         for what, path in (("table", self.csv), ("picture", self.picture)):
             if path is not None:
                 print(f"{what}: {path}")
@@ -187,7 +187,7 @@ def check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path
 
 
 def span_of(begin: str, end: str | None, days: float | None) -> tuple[datetime, datetime]:
-    """Return beginning and end of a plan; without either, it lasts a week."""
+    """Return the start and end of a plan; by default it lasts a week."""
     start = parse_time(begin)
     if end is not None and days is not None:
         raise InputError("give --to or --days, not both")
@@ -204,7 +204,7 @@ def span_of(begin: str, end: str | None, days: float | None) -> tuple[datetime, 
 
 
 def targets_of(plant: "Plant", names: list[str] | None) -> "tuple[Target, ...]":
-    """Return the targets by name, or all."""
+    """Return the targets with given names, or all targets."""
     targets = tuple(plant.target(name) for name in dict.fromkeys(names or ())) or plant.targets
     if not targets:
         raise InputError("this plant has no target; a measurement with a camera needs one")
@@ -212,7 +212,7 @@ def targets_of(plant: "Plant", names: list[str] | None) -> "tuple[Target, ...]":
 
 
 def made_so_far(plant: "Plant", path: Path | None) -> "Sightings | None":
-    """Return the sightings of a table, and say which were left out."""
+    """Return the sightings of a table, and report which were left out."""
     if path is None:
         return None
     from heliotrope.calibration.plausibility import judge_in

@@ -33,14 +33,14 @@ class Broadcast:
     ) -> None:
         self._config, self._exchange, self._watch = config, exchange, watch
         self._epoch, self._keys, self._clock = epoch, keys, clock
-        self._offset: float | None = None  # GPS minus monotonic time, as told
+        self._offset: float | None = None  # GPS minus monotonic time, as last broadcast
 
     def bus_time(self) -> float | None:
-        """Return the GPS time of the local controllers in s, None if none was sent."""
+        """Return the GPS time of the local controllers in s, None if no time was sent."""
         return None if self._offset is None else self._clock.monotonic() + self._offset
 
     async def second(self, present: Time) -> None:
-        """Send the broadcasts; ``present`` is the time now."""
+        """Send the broadcasts of one second; ``present`` is the time now."""
         now, exchange = self._clock.monotonic(), self._exchange
         sound = present.usable and not present.jumped
         if sound:
@@ -54,7 +54,7 @@ class Broadcast:
         quality = _QUALITIES.index(present.quality)
         if await exchange.broadcast("TIME", int(week), int(1000.0 * seconds), quality):
             self._offset = present.gps_s - now
-        # Asked now: the program may have stood still since this second began.
+        # Checked now because the program may have been suspended since this second began.
         if not self._watch.verdict.dark and not self._watch.alone(self._clock.monotonic()):
             second = round(present.gps_s - self._config.phase)
             utc_s = present.utc_s - (present.gps_s - second)

@@ -25,11 +25,11 @@ from heliotrope.lcu.signing import NO_KEY, fingerprint, pads_of, tag, wrapped
 from heliotrope.links.keys import KeyRing
 from heliotrope.safety import alarms
 
-#: Time for meeting in one second, s: the sun goes out after it.
+#: Time for meeting in one second, s; the sun vector is sent after it.
 _SHARE = 0.2
-#: A local controller that does not answer is asked again this often, then after a pause, s.
+#: A local controller that does not reply is polled again this often, then after a pause, s.
 _TRIES, _PAUSE = 3, 60.0
-#: What is wrong is reported after this time, s: a key is given within a few seconds.
+#: A problem is reported after this time, s; a key is normally delivered within a few seconds.
 _PATIENCE = 15.0
 
 _MOVES = "they accept the key once they are at rest (stowed, locked, idle or defocused)"
@@ -41,30 +41,30 @@ _OWN = "their own keys are not in the cluster's key file, or differ from it"
 
 
 class _Held:
-    """The known state of one local controller's keys of the bus."""
+    """What the cluster knows about the bus keys of one local controller."""
 
     def __init__(self, boots: int) -> None:
         self.boots = boots
-        self.prints: tuple[int, int] | None = None  # of the newest key and the old one
+        self.prints: tuple[int, int] | None = None  # fingerprints of the newest key and the old key
         self.tries = 0
-        self.again = 0.0  # when to ask again, monotonic s
-        self.why = ""  # why it has not the keys that it should have
+        self.again = 0.0  # when to query again, monotonic s
+        self.why = ""  # why it lacks the keys that it should have
 
 
 class BusKeys:
-    """Meets the local controllers in signed sessions, and gives them keys.
+    """Meets the local controllers in signed sessions, and sends them keys.
 
     Parameters
     ----------
     cluster
         Name of the cluster.
     ring
-        Keys of the bus, the newest first; empty: local controllers that have one lose it. None:
-        the cluster signs nothing, and changes no key.
+        Bus keys, newest first. If empty, local controllers that have a key lose it. None: the
+        cluster signs nothing, and changes no key.
     nodes, exchange, reports, kept
         Parts of the cluster.
     clock
-        Returns monotonic s.
+        Function that returns monotonic s.
     """
 
     def __init__(
@@ -84,14 +84,14 @@ class BusKeys:
         self._taken: tuple[bytes, ...] = ()
         self._held: dict[int, _Held] = {}
         self._next = 0
-        self._missing: dict[int, float] = {}  # nodes that have not the keys, and since when
+        self._missing: dict[int, float] = {}  # nodes that lack the keys, and since when
         self._reported: set[int] = set()
         self._look()
 
     # -- the keys ----------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Take keys that have changed, and decide which one signs."""
+        """Adopt keys that have changed, and decide which key signs."""
         keys = () if self._ring is None else self._ring.keys
         if keys != self._taken:
             self._taken = keys
@@ -111,7 +111,7 @@ class BusKeys:
         )
 
     def _due(self, prints: tuple[int, int]) -> bytes | None:
-        """Return the key to be set where these are held; None: they are as they should be."""
+        """Return the key to be set in a node that holds these keys; None: its keys are correct."""
         newest, old = prints
         if not self._keys:
             return NO_KEY if newest else None
@@ -125,7 +125,7 @@ class BusKeys:
     # -- sessions ----------------------------------------------------------------------------
 
     async def meet(self, token: int) -> None:
-        """Ask those whose keys are unknown, and send sessions to those that want one."""
+        """Query nodes whose keys are unknown, and send sessions to nodes that want a session."""
         self._look()
         begin = self._clock()
         count = len(self._nodes)
@@ -165,7 +165,7 @@ class BusKeys:
     # -- keys for local controllers ----------------------------------------------------------
 
     async def supply(self) -> None:
-        """Give one local controller the key that is due, and report those that have not theirs."""
+        """Send one local controller the key that is due, and report nodes that lack their keys."""
         if self._ring is not None and self._exchange.connected:
             for node in sorted(self._nodes, key=lambda node: self._waited(node.index)):
                 held = self._held.get(node.index)
@@ -199,7 +199,7 @@ class BusKeys:
         try:
             edition = self._kept.next_edition(struct.unpack("<I", data)[0] if data else 0)
         except OSError:
-            return  # the epoch's alarm tells it; the next second tries again
+            return  # the alarm of the epoch reports it; the next second tries again
         if edition is None:
             return
         carried = wrapped(sha256, node.member.key, edition, key)
@@ -218,7 +218,7 @@ class BusKeys:
             return
         result = answer.values[2]
         if result == messages.DONE:
-            held.prints = None  # they are asked for
+            held.prints = None  # to be requested again
         elif result == messages.REFUSED_KEY:
             held.why, held.again = _OWN, now + _PAUSE
         elif result == messages.REFUSED_STATE:

@@ -11,8 +11,8 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.link import Bus, SendOutcome
 from heliotrope.links.messages import BUS_ENTRY, BUS_RECEIVED, BUS_SENT
 
-#: A record ends after this time, s; after this many entries; or before it is larger, bytes: a
-#: message of a link has at most 64 KiB.
+#: Limits of a recording: this time, s; this many entries; and this size, bytes, because a message
+#: on a link has at most 64 KiB.
 LONGEST, MOST, LARGEST = 5.0, 500, 48 * 1024
 
 
@@ -39,23 +39,23 @@ class RecordedBus:
 
     @property
     def recording(self) -> bool:
-        """Whether a record has begun and has not been taken."""
+        """Whether a recording has begun and has not been collected."""
         return self._began is not None
 
     @property
     def complete(self) -> bool:
-        """Whether a record has reached its time, its number or its size."""
+        """Whether a recording has reached its limit of time, entries or size."""
         if self._began is None:
             return False
         return bool(self._full) or self._clock.monotonic() - self._began >= LONGEST
 
     def record(self) -> None:
-        """Begin a record."""
+        """Begin a recording."""
         self._began, self._utc_s = self._clock.monotonic(), self._clock.utc().timestamp()
         self._entries, self._size, self._full = [], 0, ""
 
     def taken(self) -> tuple[float, str, bytes]:
-        """End the record; return its beginning (POSIX s), why it is over, and its entries."""
+        """End the recording; return its beginning (POSIX s), why it ended, and its entries."""
         record = self._utc_s, self._full or f"{LONGEST:g} s are over", b"".join(self._entries)
         self._began, self._entries = None, []
         return record
@@ -93,7 +93,7 @@ class RecordedBus:
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame that is not answered; see `SerialBus.transmit`."""
+        """Send a frame that gets no reply; see `SerialBus.transmit`."""
         begin = self._clock.monotonic()
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
         if outcome is SendOutcome.SENT:
@@ -109,7 +109,7 @@ class RecordedBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the answer; see `SerialBus.transact`."""
+        """Send a frame and return the reply; see `SerialBus.transact`."""
         self._keep(BUS_SENT, frame, self._clock.monotonic())
         answer = await self._bus.transact(
             frame, timeout, expires=expires, urgent=urgent, complete=complete

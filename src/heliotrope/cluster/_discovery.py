@@ -13,18 +13,18 @@ from heliotrope.cluster._nodes import Nodes
 from heliotrope.lcu import messages, wire
 from heliotrope.lcu.node import HERE_SLOT_MS, HERE_SLOTS
 
-#: Duration of all slots and the last answer, s.
+#: Duration of all slots and the last reply, s.
 SPAN = 1e-3 * HERE_SLOTS * HERE_SLOT_MS + 0.06
 _LARGEST = 0xFFFFFFFF
 _HERE = messages.NUMBER_OF["HERE"]
 _CLEAN = 2
-#: A single serial number still garbled after this many questions is noise.
+#: A single serial number that is still garbled after this many queries is noise.
 _GARBLED = 4
 
 
 @dataclass(frozen=True)
 class HereAnswer:
-    """The answer of a local controller."""
+    """The reply of a local controller."""
 
     serial: int
     firmware: int
@@ -40,9 +40,9 @@ class _Range:
 
 
 def heard(data: bytes, sequence: int) -> tuple[list[HereAnswer], bool]:
-    """Return the answers to a question, and whether other bytes came."""
+    """Return the replies to a query, and whether other bytes were received."""
     reader = wire.Reader()
-    # A zero ends a frame that was cut off.
+    # A zero byte terminates a frame that was cut off.
     frames = reader.feed(data + b"\0")
     answers = []
     for frame in frames:
@@ -54,7 +54,7 @@ def heard(data: bytes, sequence: int) -> tuple[list[HereAnswer], bool]:
 
 
 class Discovery:
-    """One search of the bus, question by question.
+    """One search of the bus, query by query.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class Discovery:
     Attributes
     ----------
     questions
-        Number of questions so far.
+        Number of queries so far.
     """
 
     def __init__(self, nodes: Nodes, exchange: Exchange) -> None:
@@ -81,15 +81,15 @@ class Discovery:
 
     @property
     def done(self) -> bool:
-        """Whether the whole range of serial numbers has been asked."""
+        """Whether the whole range of serial numbers has been polled."""
         return not self._ranges
 
     async def step(self) -> None:
-        """Ask one question."""
+        """Send one query."""
         now = self._ranges[-1]
         data, sequence = await self._exchange.gather("DISCOVER", now.low, now.high, span=SPAN)
         if data is None:
-            return  # something urgent came between
+            return  # something urgent interrupted it
         self.questions += 1
         answers, garbled = heard(data, sequence)
         fresh = [answer for answer in answers if self._answers.get(answer.serial) != answer]
@@ -110,8 +110,8 @@ class Discovery:
     def result(self) -> dict[str, Any]:
         """Return the controllers found, each with its name, if it has one, and expected address.
 
-        ``missing`` names configured heliostats that did not answer; ``garbled`` lists serial
-        numbers whose answers were always damaged (two with the same number).
+        ``missing`` names configured heliostats that did not reply; ``garbled`` lists serial numbers
+        whose replies were always damaged (two controllers share the number).
         """
         named = {node.member.serial: node for node in self._nodes}
         listed = [

@@ -1,9 +1,9 @@
 """DEFOCUS and STOW: broadcast three times, then confirmed by each heliostat.
 
-They come from anyone or from the safety table, and take precedence over all other bus traffic. A
-heliostat that has not acknowledged is named, and polled again every second until it has. The first
-order is the cluster's own at start-up: a DEFOCUS of everything on the bus, which needs no
-acknowledgement.
+Anyone can order them, and so can the safety table. They take precedence over all other bus traffic.
+A heliostat that has not acknowledged is reported by name, and polled every second until it has. The
+cluster itself issues the first order at start-up: a DEFOCUS of everything on the bus, which needs
+no acknowledgement.
 """
 
 from collections import deque
@@ -17,13 +17,13 @@ from heliotrope.links.messages import Stage
 from heliotrope.safety import ORDER_BUDGET, alarms
 
 _CALLS = 3
-#: Time for asking again in each second after the first, s: polling and the sun go on.
+#: Time for repeated queries in each second after the first, s; polling and the sun vector continue.
 _SHARE = 0.3
 #: Attempts for each node in the first round.
 _ROUNDS = 3
-#: A node that missed this many questions in a row is asked after all others.
+#: A node that missed this many consecutive queries is queried after all others.
 _SILENT = 3
-#: Reported to the plant as failed after this, s; the node is still asked.
+#: After this time a node is reported to the plant as failed, s; it is still queried.
 _PATIENCE = 30.0
 
 
@@ -36,7 +36,7 @@ class _Order:
         self.calls = _CALLS if everybody else 0
         self.waiting = deque(sorted(nodes, key=lambda node: node.missed >= _SILENT))
         self.tries = {node.index: 0 for node in nodes}
-        self.sent: set[int] = set()  # nodes that were called or asked
+        self.sent: set[int] = set()  # nodes that were sent the broadcast or a query
         self.new = True
         self.given_up = False
 
@@ -53,7 +53,7 @@ class Emergencies:
     Attributes
     ----------
     pressing
-        Whether something must be sent before all else.
+        Whether an emergency must be sent before anything else.
     """
 
     def __init__(
@@ -66,20 +66,21 @@ class Emergencies:
     ) -> None:
         self._nodes, self._exchange = nodes, exchange
         self._goals, self._reports, self._clock = goals, reports, clock
-        # Mirrors may be up, and one that is missing in the cluster's file hears nothing else.
+        # Heliostats may be out of stow, and one that is missing in the cluster's file receives no
+        # other order.
         self._orders = [_Order("", "DEFOCUS", [], True, clock())]
         self._serving = 0.0
         self._asked: set[tuple[str, int]] = set()
         self.pressing = True
 
     def begin(self, identity: str, name: str, nodes: list[ClusterNode]) -> None:
-        """Take an emergency for some heliostats or all; a repeated one counts once."""
+        """Accept an emergency for some or all heliostats; a repeated order counts once."""
         if identity and any(order.identity == identity for order in self._orders):
             return
         everybody = len(nodes) == len(self._nodes)
         if name == "STOW" and everybody:
             for older in self._orders:
-                # A heliostat that has not defocused yet goes to stow directly.
+                # A heliostat that has not defocused yet goes directly to stow.
                 older.name = name
         self._orders.append(_Order(identity, name, nodes, everybody, self._clock()))
         for node in nodes:
@@ -87,10 +88,10 @@ class Emergencies:
         self.pressing = True
 
     async def serve(self) -> None:
-        """Broadcast and ask until every order has had its round.
+        """Broadcast and query until every order has had its round.
 
-        Orders not sent at all go first, and among these the ones for heliostats that answer. Once
-        this has gone on for the budget of an order, silent heliostats wait for the next second, so
+        Orders not sent at all go first, and among these the orders for heliostats that reply. Once
+        this has used up the time budget of an order, silent heliostats wait for the next second, so
         that many orders on a dead bus take no longer than a few.
         """
         self._serving = self._clock()
@@ -107,7 +108,7 @@ class Emergencies:
         self._orders = [order for order in self._orders if order.waiting or order.calls]
 
     def second(self) -> None:
-        """Begin a second: name the heliostats that have not acknowledged, and ask them again."""
+        """Begin a second: report heliostats that have not acknowledged, and query them again."""
         now = self._clock()
         for order in self._orders:
             self._name(order, now)
@@ -131,7 +132,7 @@ class Emergencies:
                 self._reports.add(order.identity, Stage.SENT, node.name)
 
     async def _round(self, order: _Order) -> None:
-        """Ask each node that has not acknowledged."""
+        """Query each node that has not acknowledged."""
         begin = self._clock()
         for number in range(_ROUNDS if order.new else 1):
             if number and self._clock() - begin > ORDER_BUDGET:
@@ -154,7 +155,7 @@ class Emergencies:
             return True  # polling finds it when it comes back
         if node.missed < _SILENT:
             return False
-        # Another order may have asked it for the same.
+        # Another order may have requested the same from it.
         if order.new:
             enough = order.tries[node.index] > number
         else:
@@ -165,7 +166,7 @@ class Emergencies:
         begin = self._clock()
         answer = await self._exchange.ask(node, order.name, expires=begin + 1.0, urgent=True)
         self._asked.add((order.name, node.index))
-        # An order that came after this frame is asked for separately.
+        # An order that arrived after this frame was sent needs its own query.
         same = [
             other
             for other in self._orders

@@ -8,23 +8,23 @@ from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.safety import alarms
 
-#: A new epoch begins after this many consecutive unexplained "duplicate" answers to commands, of
-#: all local controllers together or of one, but one by one only every so many seconds: it voids
-#: the commands that are under way to all.
+#: A new epoch begins after this many consecutive unexplained "duplicate" replies to commands,
+#: counted over all local controllers or for one alone. For one alone, it begins at most once in so
+#: many seconds, because a new epoch voids the commands under way to all.
 _OUT_OF_STEP, _REST = 3, 30
 
 
 class Epoch:
-    """Begins epochs, and judges by the answers of local controllers when one is needed.
+    """Begins epochs, and judges from the replies of local controllers when a new one is needed.
 
     Parameters
     ----------
     kept
-        Where the epoch outlasts a restart.
+        Storage in which the epoch survives a restart.
     exchange
         Sends under the epoch.
     reports
-        Where alarms go.
+        Receives alarms.
     present
         The time at the start. Without a state file only the time makes the epoch higher than that
         of any earlier run.
@@ -44,28 +44,28 @@ class Epoch:
         self.kept, self._exchange, self._reports = kept, exchange, reports
         self._of_time = present.usable
         self._duplicates = 0
-        self._of_one: Counter[int] = Counter()  # by the place of the local controller
+        self._of_one: Counter[int] = Counter()  # by the index of the local controller
         self._rest = 0
         self._storing = False
-        self._next: int | None = None  # stored, and not in use yet
+        self._next: int | None = None  # stored, but not yet in use
         exchange.begin_epoch(kept.start(int(present.gps_s) if self._of_time else 0))
 
     def taken(self, place: int) -> None:
-        """Note that a local controller has taken a command: it is in step."""
+        """Note that a local controller has accepted a command, so it is in step."""
         self._duplicates = 0
         self._of_one.pop(place, None)
 
     def duplicate(self, place: int) -> None:
-        """Note that a local controller answered a new command with "duplicate".
+        """Note that a local controller replied "duplicate" to a new command.
 
-        A single one is out of step after a frame that somebody else has sent under the cluster's
-        address with a later number.
+        A single local controller is out of step after another sender has used the cluster's address
+        with a later number.
         """
         self._duplicates += 1
         self._of_one[place] += 1
 
     def second(self) -> None:
-        """Begin an epoch if the local controllers are out of step, or one that is stored."""
+        """Begin a new epoch if the local controllers are out of step, or use one that is stored."""
         self._rest = max(0, self._rest - 1)
         single = max(self._of_one.values(), default=0) >= _OUT_OF_STEP and not self._rest
         if single:
@@ -81,7 +81,7 @@ class Epoch:
         self._use()
 
     def _begin(self, at_least: int) -> None:
-        """Have an epoch stored; until it is, the present one goes on."""
+        """Have a new epoch stored; until it is, the present one continues."""
         if self._storing or self._next is not None:
             return
         self._storing, self._duplicates = True, 0
@@ -99,7 +99,7 @@ class Epoch:
         self.kept.begin(at_least, stored)
 
     def _use(self) -> None:
-        """Begin the stored epoch: only before SESSION, which sends it to the local controllers."""
+        """Begin the stored epoch; only before SESSION, which sends it to local controllers."""
         if self._next is not None:
             self._exchange.begin_epoch(self._next)
             self._next = None

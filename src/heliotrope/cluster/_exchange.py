@@ -16,7 +16,7 @@ from heliotrope.links.link import Bus, SendOutcome
 
 #: The share of bad frames is computed over this many seconds.
 _WINDOW = 10
-#: Returns the tag of bytes under a key of the bus.
+#: Function that returns the tag of some bytes under a bus key.
 Sign = Callable[[bytes], bytes]
 
 
@@ -26,7 +26,7 @@ def sha256(data: bytes) -> bytes:
 
 
 class NodeAnswer(NamedTuple):
-    """An answer: name, values, and the number of earlier attempts without an answer."""
+    """A reply: its name, its values, and the number of earlier attempts without a reply."""
 
     name: str
     values: tuple[Any, ...]
@@ -43,7 +43,7 @@ class Exchange:
     clock
         Clock of the bus's expiries.
     answer, stored_answer
-        Time limit of a whole answer, s; the same where flash is written before it.
+        Time limit of a complete reply, s; the same if flash is written before the reply.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Exchange:
     async def broadcast(
         self, name: str, *values: Any, life: float = 0.5, urgent: bool = False
     ) -> bool:
-        """Send a message to all within ``life`` s, and return whether it went out."""
+        """Broadcast a message within ``life`` s, and return whether it was sent."""
         return await self.transmit(
             self.sender.frame(wire.BROADCAST, name, *values), life=life, urgent=urgent
         )
@@ -103,11 +103,11 @@ class Exchange:
         await self.transmit(self.sender.session(self.token(token)))
 
     async def send_session(self, address: int, token: int, number: bytes, sign: Sign) -> None:
-        """Begin a signed session with one local controller, over the number that it has drawn."""
+        """Begin a signed session with one local controller, over the number that it drew."""
         await self.transmit(self.sender.session_to(address, self.token(token), number, sign))
 
     async def transmit(self, frame: bytes, *, life: float = 0.5, urgent: bool = False) -> bool:
-        """Send a frame that is not answered, within ``life`` s; return whether it went out."""
+        """Send a frame that gets no reply, within ``life`` s; return whether it was sent."""
         expires = self.clock.monotonic() + life
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
         return outcome is SendOutcome.SENT
@@ -115,7 +115,7 @@ class Exchange:
     async def poll(
         self, node: ClusterNode, question: Question, sequence: int, begin: float
     ) -> tuple[Any, ...] | None:
-        """Ask a node at ``begin``, and return the values of its answer or None; sets ``now``."""
+        """Query a node at ``begin``, and return the values of its reply or None; sets ``now``."""
         node.asked()
         self._asked += 1
         data = await self._bus.transact(question.frame(node.address, sequence), self._answer)
@@ -143,12 +143,12 @@ class Exchange:
         tries: int = 1,
         urgent: bool = False,
     ) -> NodeAnswer | None:
-        """Send a message to a node, repeat the same frame if nothing comes, and return the answer.
+        """Send a message to a node, repeat the same frame if no reply comes, and return the reply.
 
-        ``stored``: flash is written before the answer.
+        ``stored``: flash is written before the reply.
 
-        A frame repeated before any other is made acts once: if the node has already taken it, it
-        answers "duplicate".
+        A frame that is repeated before any other frame is created takes effect once. If the node
+        has already accepted it, the node replies "duplicate".
         """
         frame = self.sender.frame(node.address, name, *values, key=key)
         sequence = self.sender.count & 0xFFFF
@@ -185,10 +185,10 @@ class Exchange:
         stored: bool = False,
         complete: Callable[[bytes], bool] = lambda _: False,
     ) -> tuple[bytes | None, int]:
-        """Ask all, and return the bytes that arrive within ``span`` s, and the sequence.
+        """Query all nodes; return the bytes that arrive within ``span`` s, and the sequence number.
 
-        None in place of the bytes if `interrupt` was called meanwhile. ``stored``: flash is
-        written before the answer.
+        None in place of the bytes if `interrupt` was called in the meantime. ``stored``: flash is
+        written before the reply.
         """
         span += self._stored_answer if stored else 0.0
         frame = self.sender.frame(wire.BROADCAST, name, *values, key=key)
@@ -202,7 +202,7 @@ class Exchange:
         expires: float | None,
         complete: Callable[[bytes], bool] | None,
     ) -> bytes | None:
-        """Make a transaction that may take long; None if `interrupt` was called meanwhile."""
+        """Run a transaction that may take long; None if `interrupt` was called in the meantime."""
         try:
             async with asyncio.timeout(None) as self._gathering:
                 return await self._bus.transact(frame, timeout, expires=expires, complete=complete)
@@ -212,7 +212,7 @@ class Exchange:
             self._gathering = None
 
     def interrupt(self) -> None:
-        """Abort long transactions and repeat nothing, until `resume`: an emergency waits."""
+        """Abort long transactions and repeat nothing until `resume`, because an emergency waits."""
         self._hurry = True
         if self._gathering is not None:
             self._gathering.reschedule(asyncio.get_running_loop().time())
@@ -223,7 +223,8 @@ class Exchange:
 
     def _spoilt(self, node: ClusterNode, data: bytes, now: float) -> None:
         node.spoilt(data)
-        # A node that is switched off says nothing about the bus; damage always does.
+        # The silence of a node that is switched off proves nothing about the bus; damaged bytes
+        # always do.
         if data or now - node.heard_at <= _WINDOW:
             self._bad += 1
 

@@ -25,21 +25,22 @@ from heliotrope.links.messages import Stage
 from heliotrope.safety import DEFOCUS_BUDGET, STOW_BUDGET
 
 _ALL = frozenset(range(len(states.STATES)))
-#: States that show that the beam is off.
+#: States in which the beam is off the receiver.
 _BEAM_OFF = _ALL.difference(states.BEAM_OUT)
 
 
 #: A STATUS requested sooner after the ACK may not show the motion yet, s: a few ticks of a board.
 _SETTLE = 0.2
-#: Step counts this close to their goal have reached it: the sun moves this much in a few ticks.
+#: Step counts this close to their goal have reached it, because the sun moves them by this much in
+#: a few ticks.
 _NEAR = 20
-#: Time limit of the longest way, from stow to standby, s.
+#: Time limit of the longest path, from stow to standby, s.
 _LONGEST = 900.0
 
 
 @dataclass(frozen=True)
 class Goal:
-    """States that a command leads to, and those on the way there.
+    """States that a command leads to, and states on the way there.
 
     Attributes
     ----------
@@ -48,11 +49,12 @@ class Goal:
     clear, needed
         Flags that must be clear, and set, in one of ``there``; until then it is on its way.
     near
-        Whether the step counts must be near their goal. A defocused mirror follows the sun beside
-        the receiver, so it never stands still.
+        Whether the step counts must be near their goal. A defocused heliostat keeps its beam beside
+        the receiver as the sun moves, so it never stands still.
     evidence
-        States and flags, one of which shows that the command was taken where the goal looks like
-        the state before it and the answer was lost. None: the goal itself shows it.
+        States and flags, any of which shows that the command was accepted. They are needed if the
+        reply was lost and the goal looks like the state before the command. None: the goal itself
+        shows it.
     limit
         Time allowed to get there, s.
     """
@@ -66,7 +68,7 @@ class Goal:
     limit: float = _LONGEST
 
     def reached(self, state: int, flags: int, off: int) -> bool | None:
-        """Return True if the goal is reached, None if the mirror is on its way, False if neither.
+        """Return True if the goal is reached, None if it is on the way, False if neither.
 
         ``off`` is the distance of the step counts from their goal.
         """
@@ -76,11 +78,11 @@ class Goal:
         return None if state in self.on_way else False
 
     def shown(self, state: int, flags: int) -> bool:
-        """Whether state and flags show that the command was taken."""
+        """Whether state and flags show that the command was accepted."""
         return self.evidence is None or state in self.evidence[0] or bool(flags & self.evidence[1])
 
 
-#: Neither states nor flags show whether it was taken.
+#: Neither states nor flags show whether the command was accepted.
 _NOTHING: tuple[frozenset[int], int] = (frozenset(), 0)
 GOALS = {
     "APPROACH": Goal(frozenset({IDLE}), frozenset({APPROACHING})),
@@ -101,7 +103,8 @@ GOALS = {
         _BEAM_OFF - {states.DEFOCUSED}, clear=names.MOVING, needed=names.AT_STOW, limit=STOW_BUDGET
     ),
 }
-#: Goals that an order leaves in force, besides those of its own name: a stow is not undone.
+#: Goals that an order leaves in force, besides goals of its own name, because DEFOCUS must not undo
+#: a stow.
 _SPARED = {"DEFOCUS": ("STOW",)}
 assert STOWED in GOALS["STOW"].goal_states
 assert STOWING in GOALS["STOW"].goal_states
@@ -124,7 +127,7 @@ class Shift:
     steps: int
 
     def shown(self, goals: tuple[int, int]) -> bool:
-        """Whether only the command can explain the goals."""
+        """Whether only the command can explain the present goals."""
         off = abs(goals[self.axis] - self.origin - self.steps)
         # The sun moves the goals as well, until the command ends tracking.
         return off == 0 or (off <= _NEAR and abs(self.steps) > 2 * _NEAR)
@@ -135,12 +138,12 @@ class _Watch:
     identity: str
     name: str
     since: float
-    sure: bool  # that it was taken
+    sure: bool  # whether the command is known to have been accepted
     shift: Shift | None = None
 
 
 class Goals:
-    """Goals not yet reached, judged by every STATUS."""
+    """Goals not yet reached, evaluated at every STATUS."""
 
     def __init__(self, reports: Reports) -> None:
         self._reports = reports
@@ -156,9 +159,10 @@ class Goals:
         sure: bool = True,
         shift: Shift | None = None,
     ) -> None:
-        """Begin the goal of a command that a node has acknowledged; others are void (see `end`).
+        """Begin the goal of a command that a node acknowledged; other goals are void (see `end`).
 
-        Not ``sure``: the answer was lost, and ``shift``, if known, shows whether it was taken.
+        Not ``sure``: the reply was lost, and ``shift``, if known, shows whether the command was
+        accepted.
         """
         if name not in GOALS:
             self._reports.add(identity, Stage.DONE, node.name)
@@ -172,23 +176,23 @@ class Goals:
         return node.index in self._watches
 
     def end(self, node: ClusterNode, why: str, name: str) -> None:
-        """Give up the goals of a node.
+        """Abandon the goals of a node.
 
-        Those of an order of the same ``name`` stay, since the mirror goes where they ask, and so
-        does a STOW when DEFOCUS comes.
+        Goals of an order of the same ``name`` remain, because the heliostat goes there anyway; a
+        STOW also remains when DEFOCUS comes.
         """
         spared = (name, *_SPARED.get(name, ()))
         self._judge(node, lambda watch: None if watch.name in spared else why)
 
     def heard(self, node: ClusterNode, asked_at: float) -> None:
-        """Judge a node's STATUS and STEPS; STATUS was requested at ``asked_at``."""
+        """Evaluate a node's STATUS and STEPS; STATUS was requested at ``asked_at``."""
         watches = self._watches.get(node.index)
         if watches is None:
             return
         self._judge(node, lambda watch: self._verdict(node, watch, asked_at))
 
     def second(self, nodes: Nodes, now: float) -> None:
-        """Give up goals that take too long."""
+        """Abandon goals that take too long."""
         for index in list(self._watches):
             self._judge(nodes[index], functools.partial(_late, nodes[index], now))
 
@@ -208,7 +212,7 @@ class Goals:
             self._watches.pop(node.index, None)
 
     def _verdict(self, node: ClusterNode, watch: _Watch, asked_at: float) -> str | None:
-        """Return the reason of a failure, an empty text once it is done, None while it goes on."""
+        """Return the reason for a failure, an empty text if it is done, None if it is under way."""
         if asked_at < watch.since + _SETTLE:
             return None
         if watch.name in messages.SAFE and node.flags & names.COUNTS_UNKNOWN:
@@ -228,7 +232,7 @@ class Goals:
             watch.sure = watch.sure or watch.shift.shown((primary_goal, secondary_goal))
         off = max(abs(primary_goal - primary), abs(secondary_goal - secondary))
         reached = goal.reached(node.state, node.flags, off)
-        # No later STATUS would show it either.
+        # A later STATUS would not show it either.
         ended = not watch.sure and goal.evidence is _NOTHING
         if reached is None and not ended:
             return None

@@ -22,7 +22,7 @@ from heliotrope.links.messages import NEVER, NODE
 _ROW = struct.Struct("<BBIIiiiiIHbHIIII")
 assert _ROW.size == NODE.itemsize
 
-#: Questions to a node rotate through this many sequences: four minutes of them.
+#: Queries to a node cycle through this many sequence numbers, which takes four minutes.
 SEQUENCES = 256
 
 _NO_STATUS = (states.UNCONFIGURED, 0, 0, 0, NEVER, 0, 0, 0, 0)
@@ -31,11 +31,11 @@ _UNSTUFFED_MOST = 254
 
 
 class OrderRefusedError(Exception):
-    """A command that is refused; the text says why."""
+    """A command was refused; the text says why."""
 
 
 class Question:
-    """A question without values, and the quick reading of its answer."""
+    """A query without values, and the fast parsing of its reply."""
 
     def __init__(self, name: str, answer: str) -> None:
         self.number = messages.NUMBER_OF[name]
@@ -45,8 +45,8 @@ class Question:
         self._frames: dict[int, bytes] = {}
 
     def frame(self, address: int, sequence: int) -> bytes:
-        """Return the frame of the question to an address."""
-        # Shared by all clusters of a process, which use the same addresses.
+        """Return the frame of the query to an address."""
+        # Shared by all clusters of a process, because they use the same addresses.
         key = address << 16 | sequence
         frame = self._frames.get(key)
         if frame is None:
@@ -55,9 +55,10 @@ class Question:
         return frame
 
     def read(self, data: bytes, address: int, sequence: int) -> tuple[Any, ...] | None:
-        """Return the answer's values if the bytes are exactly that answer, else None.
+        """Return the reply's values if the bytes are exactly that reply, else None.
 
-        COBS is decoded in place: where no block is full, each of its codes means one zero.
+        COBS is decoded in place: as long as no block is full, each of its codes stands for one
+        zero.
         """
         last = self.size - 1
         if len(data) != self.size or data.find(0) != last:
@@ -91,18 +92,18 @@ assert STEPS.size < _UNSTUFFED_MOST
 
 @dataclass(slots=True)
 class Counts:
-    """Counts of one local controller since the start.
+    """Counts of one local controller since start-up.
 
     Attributes
     ----------
     asked, answered
-        Questions; answers.
+        Queries; replies.
     late, corrupt, silent
-        Questions without their answer: an answer to another question came; damaged bytes; nothing.
+        Queries without their own reply: the reply to another query arrived; damaged bytes; nothing.
     retries
         Frames sent again.
     round_trip, longest
-        Time from question to whole answer, s: the last, and the longest.
+        Time from query to complete reply, s: the last, and the longest.
     """
 
     asked: int = 0
@@ -127,13 +128,13 @@ class ClusterNode:
     status, steps
         Values of the last STATUS and STEPS.
     status_at, steps_at
-        When they were asked for, monotonic s; -inf: never. The answer may have been read later.
+        When they were requested, monotonic s; -inf: never. The reply may have been read later.
     heard_at
-        When it last answered anything, monotonic s; -inf: never.
+        When it last replied to anything, monotonic s; -inf: never.
     follow_until
-        Until when its step counts are requested each second, monotonic s.
+        End of the time in which its step counts are requested each second, monotonic s.
     missed
-        Consecutive questions without an answer.
+        Consecutive queries without a reply.
     """
 
     def __init__(self, member: Member, index: int) -> None:
@@ -148,28 +149,28 @@ class ClusterNode:
         self._sequence = 0
 
     def next_sequence(self) -> int:
-        """Return the sequence of the next questions."""
+        """Return the sequence number of the next query."""
         self._sequence = self._sequence % SEQUENCES + 1
         return self._sequence
 
     @property
     def known(self) -> bool:
-        """Whether its state was heard since the start; if not, ``state`` means nothing."""
+        """Whether its state was received since start-up; if not, ``state`` means nothing."""
         return self.status_at > -math.inf
 
     @property
     def state(self) -> int:
-        """State as last heard, of `lcu.states`."""
+        """Last reported state, of `lcu.states`."""
         return int(self.status[0])
 
     @property
     def flags(self) -> int:
-        """Flags as last heard, bits of `lcu.names.FLAGS`."""
+        """Last reported flags, bits of `lcu.names.FLAGS`."""
         return int(self.status[1])
 
     @property
     def fault(self) -> int:
-        """Fault as last heard, of `lcu.names.FAULTS`."""
+        """Last reported fault, of `lcu.names.FAULTS`."""
         return int(self.status[2])
 
     def take_status(self, status: tuple[Any, ...], asked_at: float) -> None:
@@ -181,20 +182,20 @@ class ClusterNode:
         self.steps, self.steps_at = steps, asked_at
 
     def follow(self, until: float) -> None:
-        """Have its step counts requested each second until a monotonic time."""
+        """Request its step counts each second until a monotonic time."""
         self.follow_until = max(self.follow_until, until)
 
     def asked(self, *, again: bool = False) -> None:
-        """Count a question; ``again``: its frame was sent before."""
+        """Count a query; ``again``: its frame was sent before."""
         self.counts.asked += 1
         self.counts.retries += again
 
     def retried(self) -> None:
-        """Count a question that will be sent again."""
+        """Count a query that will be sent again."""
         self.counts.retries += 1
 
     def answered(self, now: float, took: float) -> None:
-        """Count an answer."""
+        """Count a reply."""
         counts = self.counts
         counts.answered += 1
         counts.round_trip = took
@@ -203,7 +204,7 @@ class ClusterNode:
         self.missed = 0
 
     def spoilt(self, data: bytes) -> None:
-        """Count bytes that came in place of an answer."""
+        """Count bytes that were received in place of a reply."""
         self.missed += 1
         if not data.strip(b"\0"):
             self.counts.silent += 1
@@ -213,9 +214,9 @@ class ClusterNode:
             self.counts.corrupt += 1
 
     def pack_into(self, block: bytearray, now: float) -> None:
-        """Write its row of `messages.NODE`."""
+        """Write the record of this node in `messages.NODE`."""
         state, flags, fault, _, sun_age, supply, temperature, crc, boots = self.status
-        # An ACK shows that the node is there, not its state: the row is as old as its STATUS.
+        # An ACK shows that the node is there, not its state; the record is as old as its STATUS.
         _ROW.pack_into(
             block,
             self.index * _ROW.size,
@@ -282,7 +283,7 @@ class Nodes:
         return (nodes if names else list(self._nodes)), refused
 
     def rows(self, now: float) -> bytes:
-        """Return a row of `messages.NODE` for each, at a monotonic time."""
+        """Return a record of `messages.NODE` for each node, at a monotonic time."""
         block = bytearray(_ROW.size * len(self._nodes))
         for node in self._nodes:
             node.pack_into(block, now)
@@ -292,7 +293,7 @@ class Nodes:
 def answer_in(
     data: bytes, address: int, sequence: int, numbers: tuple[int, ...]
 ) -> wire.Frame | None:
-    """Return the answer to a question from received bytes, None if it is not there."""
+    """Return the reply to a query from received bytes, None if they hold no such reply."""
     for frame in wire.Reader().feed(data):
         if (
             frame.to == wire.CLUSTER_ADDRESS

@@ -26,28 +26,28 @@ from heliotrope.lcu import messages, names, states, wire
 from heliotrope.lcu.journal import CODES_OF, ITEMS, SIZE_OF, TARGETS
 from heliotrope.links.messages import Command, Parameters, ProtocolError, Stage
 
-#: Commands by what they do to an order that stands.
+#: Commands by property; see `lcu.messages`.
 _RELATIVE = messages.having("relative")
 _REPEATED = messages.having("again")
 _STORED = messages.having("stored")
 
 #: The same frame is sent this often before other jobs get their turn.
 TRIES = 3
-#: Temporary refusals: the node has not heard the time, session or authority yet.
+#: Temporary refusals: the node has not yet received the time, session or authority.
 _AGAIN = (messages.DUPLICATE, messages.EXPIRED, messages.REFUSED_AUTHORITY)
-#: Refusals that may mean that an earlier frame was taken and its answer lost.
+#: Refusals that may mean that an earlier frame was accepted and its reply lost.
 _MAYBE = (messages.DUPLICATE, messages.REFUSED_STATE, messages.BUSY)
 #: Limit for all heliostats together; the bus carries about a hundred a second.
 _MOST_JOBS = 2048
-#: The step counts of heliostats commanded at most this many at a time are requested each second
-#: for this long, s.
+#: If at most this many heliostats are commanded at a time, their step counts are requested each
+#: second for this long, s.
 _FEW, FOLLOWED = 4, 60.0
-#: Commands that may move a mirror: refused while a row of the safety table forbids motion.
+#: Commands that may move a heliostat, refused while a row of the safety table forbids motion.
 MOTIONS = messages.MOTIONS | messages.POINTS
 #: A command's life on the wire, s: less than a local controller accepts by its clock.
 _WIRE_LIFE = wire.HORIZON_S - 2.0
 _ITEM_NUMBER = {row[0]: number for number, row in enumerate(ITEMS, 1)}
-#: The message that sets an item, and the axis where it is one of two.
+#: The message that sets an item, and the axis if the item exists for both axes.
 _MESSAGE_OF = {
     item: (name, axis if len(items) == 2 else None)
     for name, items in TARGETS.items()
@@ -77,17 +77,17 @@ class Order:
 
 
 class NodeOrder:
-    """An order at one heliostat."""
+    """An order for one heliostat."""
 
     def __init__(self, order: Order, node: ClusterNode) -> None:
         self.order, self.node = order, node
         self.place = 0
         self.told_sent = False
-        self.unanswered = False  # an earlier frame of this step may have been taken
-        self.edition = -1  # of the node's journal; -1: not known yet
+        self.unanswered = False  # an earlier frame of this step may have been accepted
+        self.edition = -1  # of the node's journal; -1: not yet known
         self.last = ""  # reason of the last retry
-        self.void = ""  # reason to give it up once its frame is answered
-        self.origin: tuple[int, int] | None = None  # goals of the counts before it, if known
+        self.void = ""  # reason to abandon it once its frame is answered
+        self.origin: tuple[int, int] | None = None  # step-count goals before it, if known
 
     @property
     def step(self) -> Step:
@@ -95,7 +95,7 @@ class NodeOrder:
         return self.order.steps[self.place]
 
     def shift(self) -> Shift | None:
-        """The change that a JOG makes; None: not known."""
+        """The change that a JOG makes; None: unknown."""
         if self.origin is None:
             return None
         axis, steps = self.step.values
@@ -110,9 +110,9 @@ class Orders:
     nodes, exchange, goals, reports, watch, epoch
         Parts of the cluster.
     gps
-        Returns the GPS time of the local controllers in s, None if they have none.
+        Function that returns the GPS time of the local controllers in s, None if they have none.
     look
-        Asks a node for its state.
+        Function that polls the state of a node.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Orders:
     # -- accepting -------------------------------------------------------------------------
 
     def accept(self, command: Command, nodes: list[ClusterNode]) -> None:
-        """Take a command for some of its heliostats, or refuse it."""
+        """Accept a command for some of its heliostats, or refuse it."""
         try:
             steps = self._steps_of(command, nodes)
             self._may(command.token, command.lifetime, len(nodes))
@@ -209,7 +209,7 @@ class Orders:
         return self._watch.authority(self._clock())
 
     def accept_parameters(self, message: Parameters) -> None:
-        """Take items for the journal of a heliostat, or refuse them."""
+        """Accept items for the journal of a heliostat, or refuse them."""
         try:
             node = self._nodes.named(message.heliostat)
             steps = _steps_of_items(node, message)
@@ -227,7 +227,7 @@ class Orders:
         self._ready.append(NodeOrder(order, node))
 
     def _supersede(self, order: Order, node: ClusterNode) -> None:
-        """Give up an earlier point of a node: tried again, it would come after the new one."""
+        """Abandon an earlier point of a node, which would arrive after the new one if retried."""
         why = f"superseded by another {order.name}"
 
         def earlier(job: NodeOrder) -> bool:
@@ -245,12 +245,12 @@ class Orders:
     # -- time ------------------------------------------------------------------------------
 
     def second(self) -> None:
-        """Give jobs that are to be retried their turn."""
+        """Make jobs that are to be retried ready again."""
         self._ready.extend(self._later)
         self._later.clear()
 
     def cancel(self, nodes: Iterable[ClusterNode], name: str, why: str) -> None:
-        """Give up unacknowledged jobs, and goals that DEFOCUS or STOW ends, of some heliostats."""
+        """Abandon unacknowledged jobs of some heliostats, and goals that DEFOCUS or STOW ends."""
         chosen = {node.index for node in nodes}
         for job in [*self._ready, *self._later]:
             if job.node.index in chosen:
@@ -282,7 +282,7 @@ class Orders:
             if job.step.name in _RELATIVE:
                 await self._note_origin(job)
             elif self._goals.waits(job.node):
-                # A goal reached since the last poll would be given up.
+                # A goal reached since the last poll would otherwise be abandoned.
                 await self._look(job.node)
             self._reports.add(job.order.identity, Stage.SENT, job.node.name)
         if job.step.item:
@@ -290,7 +290,7 @@ class Orders:
         return await self._set(job)
 
     async def _note_origin(self, job: NodeOrder) -> None:
-        """Ask for the goals of the step counts: if the answer is lost, they show what was done."""
+        """Query the step-count goals: if the reply is lost, they show what was done."""
         node, asked_at = job.node, self._clock()
         node.follow(asked_at + FOLLOWED)
         await self._look(node)
@@ -335,7 +335,7 @@ class Orders:
         return self._again(job, f"no reply to {step.name} before the command expired")
 
     async def _give_address(self, job: NodeOrder, head: tuple[int, ...], key: bytes) -> None:
-        """Broadcast to an unknown address; then ask the node by its serial number."""
+        """Broadcast to an unknown address; then query the node by its serial number."""
         serial, address = job.step.values
         frame = self._exchange.sender.frame(
             wire.BROADCAST, "SET_ADDRESS", *head, serial, address, key=key
@@ -367,7 +367,7 @@ class Orders:
         return int(gps + life) & 0xFFFFFFFF
 
     async def _knows_edition(self, job: NodeOrder) -> bool:
-        """Ask for the edition of the node's journal: another cluster may have written it."""
+        """Query the edition of the node's journal, because another cluster may have written it."""
         if job.edition < 0:
             data = await self._stored(job, "edition")
             if data is None:
@@ -400,7 +400,7 @@ class Orders:
         return self._advance(job)
 
     def _judge(self, job: NodeOrder, result: int, *, lost: bool) -> None:
-        """Continue after an ACK; ``lost``: an earlier answer may have been lost."""
+        """Continue after an ACK; ``lost``: an earlier reply may have been lost."""
         name = job.step.name
         if result == messages.DONE:
             self._epoch.taken(job.node.index)
@@ -426,7 +426,7 @@ class Orders:
         return text
 
     def _advance(self, job: NodeOrder, *, sure: bool = True) -> None:
-        """Continue after a step; not ``sure``: the goal shows whether it was taken."""
+        """Continue after a step; not ``sure``: the goal shows whether it was accepted."""
         if job.void:
             return self._fail(job, job.void)
         order, node, done = job.order, job.node, job.step
@@ -457,7 +457,7 @@ class Orders:
 
 
 async def stored(exchange: Exchange, node: ClusterNode, item: str, expires: float) -> bytes | None:
-    """Return a node's stored item, empty if it has none; None if it does not answer."""
+    """Return a node's stored item, empty if it has none; None if it does not reply."""
     answer = await exchange.ask(
         node,
         "QUERY_STORED",
@@ -499,12 +499,12 @@ def _typed(number: int, values: Sequence[float]) -> tuple[Any, ...]:
 
 
 def _steps_of_items(node: ClusterNode, message: Parameters) -> tuple[Step, ...]:
-    """Return the messages that store items, then their checks.
+    """Return the messages that store items, followed by their checks.
 
     Raises
     ------
     OrderRefusedError
-        Items that cannot be stored.
+        If items cannot be stored.
     """
     try:
         items = message.items()

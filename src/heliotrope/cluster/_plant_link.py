@@ -30,19 +30,20 @@ from heliotrope.links.messages import (
 )
 from heliotrope.safety import AcknowledgeRole, Alarm, alarms
 
-#: Life of a message to the plant, s. The ages in a status count from when it was made: it is not
-#: sent later than `_STATUS_WAITS`, since the program may have been frozen meanwhile.
+#: Life of a message to the plant, s. The ages in a status count from the time at which it was made.
+#: It is not sent later than `_STATUS_WAITS`, because the program may have been suspended in the
+#: meantime.
 _NEWS_LIFE = 5.0
 _STATUS_LIFE, _STATUS_WAITS = 1.0, 1.0
-#: The names of the rows and the alarms are repeated after this many statuses: one may have been
-#: lost.
+#: The names of the rows and the alarms are repeated after this many statuses, because a status may
+#: have been lost.
 _NAMES_EVERY = 10
-#: Stands for an unknown error of the time, s.
+#: Represents an unknown time error, s.
 _UNBOUNDED = 1e9
 
 
 class PlantLink:
-    """Listens to the plant and reports to it.
+    """Receives messages from the plant and reports to it.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ class PlantLink:
     link, clock, nodes, watch, work, reports
         Parts of the cluster.
     wake
-        Called when a message has come: it may be urgent.
+        Called when a message has arrived, because it may be urgent.
     """
 
     def __init__(
@@ -71,10 +72,10 @@ class PlantLink:
         self._names = tuple(node.name for node in nodes)
         self._opened = -1
         self._was_connected = False
-        self._number = 0  # of the status
-        self._told_names = 0  # in which status
+        self._number = 0  # of the last status
+        self._told_names = 0  # number of the last status with names
         self._names_lost = False
-        self._made_at = clock.monotonic()  # the status
+        self._made_at = clock.monotonic()  # when the last status was made
 
     @property
     def connected(self) -> bool:
@@ -84,7 +85,7 @@ class PlantLink:
     # -- from the plant --------------------------------------------------------------------
 
     async def listen(self) -> None:
-        """Take messages until the link is closed."""
+        """Receive messages until the link is closed."""
         async for data in received(self._link):
             try:
                 message = decode(data)
@@ -127,7 +128,7 @@ class PlantLink:
     # -- to the plant ----------------------------------------------------------------------
 
     def report(self, present: Time, begin: float) -> None:
-        """Report the status of the second that began at a monotonic time."""
+        """Report the status of the second that began at monotonic time ``begin``."""
         self._number += 1
         connected, opened = self._link.connected, self._link.statistics.opened
         if connected and (opened != self._opened or not self._was_connected):
@@ -137,8 +138,9 @@ class PlantLink:
         with_names = (self._number - self._told_names) % _NAMES_EVERY == 0
         if with_names:
             self._reports.repeat()
-        # Alarms are not repeated at once: on a slow line they may be what kept the status back.
-        # What is made before the line is there may be the first that the plant gets of this file.
+        # Alarms are not repeated at once, because on a slow line they may be what delayed the
+        # status. A status made before the line is up may be the first that the plant receives of
+        # this configuration.
         with_names, self._names_lost = with_names or self._names_lost or not connected, False
         self._reports.status(
             ClusterStatus(

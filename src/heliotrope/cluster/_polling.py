@@ -19,9 +19,9 @@ from heliotrope.lcu import names, states
 from heliotrope.links.clock import Clock
 from heliotrope.safety import alarms
 
-#: A node that missed this many questions in a row is asked only every fifth second.
+#: A node that missed this many consecutive queries is queried only every fifth second.
 _ABSENT, _PROBE = 3, 5
-#: A node shows a sun that jumped until it is restarted; the alarm ends after this time, s.
+#: A node reports a jump of the sun until it is restarted; the alarm ends after this time, s.
 _JUMP_SHOWS = 60.0
 
 
@@ -45,7 +45,7 @@ class Polling:
         self._by_address = sorted(nodes, key=lambda node: node.address)
         self._started = clock.monotonic()
         self._number = 0  # of the second
-        self._next = 0  # the place at which the last round was cut off
+        self._next = 0  # index at which the last round was cut off
         self._silent: set[int] = set()
         self._unreadable: set[int] = set()
         self._jumped: dict[str, float] = {}
@@ -60,7 +60,7 @@ class Polling:
         self._number += 1
 
     async def round(self, until: float, work: Work, closing: asyncio.Event) -> None:
-        """Ask every node once, and carry out orders in between."""
+        """Poll every node once, and carry out orders in between."""
         nodes, count = self._by_address, len(self._nodes)
         first, self._next = self._next, 0
         now = self._clock.monotonic()
@@ -76,11 +76,11 @@ class Polling:
                 now = self._clock.monotonic()
 
     async def look(self, node: ClusterNode) -> None:
-        """Ask a node for its state, between two rounds."""
+        """Poll the state of a node, between two rounds."""
         await self._poll(node, self._clock.monotonic())
 
     async def _poll(self, node: ClusterNode, now: float) -> float:
-        """Ask a node for state and step counts at ``now``, and return the time afterwards."""
+        """Poll a node for state and step counts at ``now``, and return the time afterwards."""
         exchange, sequence = self._exchange, node.next_sequence()
         status = await exchange.poll(node, STATUS, sequence, now)
         if status is None or not self._believes(node, status, now):
@@ -97,7 +97,7 @@ class Polling:
         return exchange.now
 
     def _believes(self, node: ClusterNode, status: tuple[Any, ...], asked_at: float) -> bool:
-        """Take a STATUS; return False if its firmware has states unknown here."""
+        """Accept a STATUS; return False if its firmware has states that are unknown here."""
         if status[0] >= len(states.STATES):
             self._reports.alarm(alarms.NODE_UNINTELLIGIBLE.raised(node.name, state=status[0]))
             self._unreadable.add(node.index)
@@ -116,7 +116,7 @@ class Polling:
             and node.state in states.BEAM_OUT
             and not self._emergencies.waits(node)
         ):
-            # It missed the broadcast, or has just come back.
+            # The heliostat missed the broadcast, or has just come back.
             self._emergencies.begin("", "DEFOCUS", [node])
         return True
 
@@ -129,7 +129,7 @@ class Polling:
             self._reports.clear(alarms.NODE_FAULT.ended(node.name))
 
     def _report_sun(self, node: ClusterNode) -> None:
-        """Report the first jump of the sun since a local controller was started."""
+        """Report the first jump of the sun since a local controller started."""
         if node.flags & names.SUN_JUMPED:
             self._jumped[node.name] = node.heard_at
             self._reports.alarm(alarms.SUN_JUMPED.raised(node.name))
@@ -138,7 +138,7 @@ class Polling:
             self._reports.clear(alarms.SUN_JUMPED.ended(node.name))
 
     def end_second(self, now: float) -> None:
-        """Give up goals that take too long, and report silent heliostats."""
+        """Abandon goals that take too long, and report silent heliostats."""
         for name, at in self._jumped.items():
             if now - at > _JUMP_SHOWS:
                 self._reports.clear(alarms.SUN_JUMPED.ended(name))
@@ -146,7 +146,8 @@ class Polling:
         limit = self._config.silence
         for node in self._nodes:
             silent = now - max(node.heard_at, self._started) > limit
-            # One that answers, but does not tell its step counts: its beam may be anywhere.
+            # A heliostat that replies but does not report its step counts: its beam may be
+            # anywhere.
             unsure = now - max(node.steps_at, self._started) > limit + self._config.steps_every
             silent |= unsure and node.index not in self._unreadable
             if silent and node.index not in self._silent:

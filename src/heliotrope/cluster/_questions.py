@@ -17,13 +17,13 @@ from heliotrope.links.messages import Answer, Ask
 #: Items that are never revealed.
 _SECRET = ("key_id", "bus_keys")
 _PATIENCE = 5.0
-#: Attempts for a node that does not answer, one a second.
+#: Attempts for a node that does not reply, one per second.
 _TRIES = 3
 _STORED = tuple(name for name, _ in ITEMS if name not in _SECRET)
 
 
 class _Recall:
-    """A question for the stored items of a node, one by one."""
+    """A query for the stored items of a node, one item at a time."""
 
     def __init__(self, ask: Ask, node: ClusterNode) -> None:
         self.ask, self.node = ask, node
@@ -37,7 +37,7 @@ class _Recall:
 
 
 class Questions:
-    """Answers the plant's questions when the bus is free."""
+    """Answers the plant's queries when the bus is free."""
 
     def __init__(
         self,
@@ -52,15 +52,15 @@ class Questions:
         self._waiting: deque[Ask | _Recall] = deque(maxlen=64)
         self._later: list[_Recall] = []
         self._discovery: Discovery | None = None
-        self._recording = ""  # identity of the question for frames
+        self._recording = ""  # identity of the query for frames
 
     @property
     def ready(self) -> bool:
-        """Whether a question waits for the bus."""
+        """Whether a query waits for the bus."""
         return bool(self._waiting)
 
     def take(self, ask: Ask) -> None:
-        """Answer a question, or keep it until the bus is free."""
+        """Answer a query, or keep it until the bus is free."""
         if ask.what == "checksums":
             data = {node.name: node.status[7] for node in self._nodes if node.known}
             self._reports.answer(Answer(ask.identity, data))
@@ -86,7 +86,7 @@ class Questions:
         }
 
     def second(self) -> None:
-        """Give questions that are to be retried their turn; answer with a complete record."""
+        """Make queries to be retried ready again, and send a recording that is complete."""
         self._waiting.extend(self._later)
         self._later.clear()
         if self._bus.complete:
@@ -103,7 +103,7 @@ class Questions:
             self._bus.record()
 
     async def serve(self) -> None:
-        """Do one step of the first question."""
+        """Do one step of the first query."""
         first = self._waiting[0]
         if isinstance(first, _Recall):
             self._waiting.popleft()
@@ -132,7 +132,7 @@ class Questions:
             self._waiting.append(_Recall(ask, node) if ask.what == "stored" else ask)
 
     async def _diagnosis(self, ask: Ask) -> None:
-        """Answer with the result of a node's last diagnosis of movement."""
+        """Reply with the result of a node's last motion diagnosis."""
         node = self._nodes.named(ask.heliostat)
         answer = await self._exchange.ask(
             node,
@@ -147,7 +147,7 @@ class Questions:
             self._reports.answer(Answer(ask.identity, {"result": answer.values[0]}))
 
     async def _recall(self, recall: _Recall) -> None:
-        """Ask for one item; items already received are not asked for again."""
+        """Request one item; items already received are not requested again."""
         ask, node, items = recall.ask, recall.node, recall.items
         data = await stored(self._exchange, node, recall.item, self._clock() + _PATIENCE)
         if data is None:

@@ -7,15 +7,16 @@ from dataclasses import replace
 from heliotrope.links.messages import Answer, ClusterStatus, Message, Progress, Stage
 from heliotrope.safety import Alarm
 
-#: Messages that may wait; the oldest are dropped first. Of the status only the newest is kept.
+#: Messages that may wait; the oldest are dropped first. Only the newest status is kept.
 _CAPACITY = 256
 
 
 class Reports:
     """An outbox.
 
-    The same stage of one command at several heliostats is one message. An alarm is reported when
-    it changes, and again at intervals while it is active. A status with names lists those that are.
+    The same stage of one command at several heliostats becomes one message. An alarm is reported
+    when it changes, and again at intervals while it is active. A status with names lists the active
+    alarms.
     """
 
     def __init__(self) -> None:
@@ -31,7 +32,7 @@ class Reports:
             self._groups.setdefault((identity, stage, text), []).append(heliostat)
 
     def answer(self, answer: Answer) -> None:
-        """Report an answer."""
+        """Report a reply to a query."""
         self._out.append(answer)
 
     def status(self, status: ClusterStatus) -> None:
@@ -51,7 +52,7 @@ class Reports:
         self._out.append(alarm)
 
     def clear(self, ended: Alarm) -> None:
-        """Report that an alarm is over, with the severity that it was raised with."""
+        """Report that an alarm has ended, with the severity with which it was raised."""
         known = self._alarms.pop((ended.condition, ended.subject), None)
         if known is not None:
             self._out.append(replace(ended, severity=known.severity))
@@ -62,7 +63,7 @@ class Reports:
         return tuple(self._alarms.values())
 
     def repeat(self) -> None:
-        """Report all active alarms: to a new connection, and since each may have been lost."""
+        """Report all active alarms: to a new connection, and because any may have been lost."""
         waiting = {id(message) for message in self._out}
         self._out.extend(alarm for alarm in self._alarms.values() if id(alarm) not in waiting)
 
@@ -79,7 +80,7 @@ class Reports:
         self._published.clear()
 
     def take(self) -> list[Message]:
-        """Return all waiting reports, and forget them."""
+        """Return all waiting reports, and clear the outbox."""
         messages = list(self._out)
         self._out.clear()
         for (identity, stage, text), names in self._groups.items():

@@ -14,11 +14,11 @@ to wait like any other but is never blocked, because no restart could give it an
 
 import math
 
-#: A run that asked while the lease of another one ran waits for this long after its end, s.
+#: A run that asked while another run held the lease waits this long after the lease ends, s.
 PATIENCE = 10.0
 #: Blocked runs are remembered up to this number; the oldest is forgotten first.
 _MOST = 16
-#: A blocked run that has not asked for this long counts as gone, s.
+#: A blocked run that has not asked for this long is considered gone, s.
 GONE = 60.0
 
 
@@ -41,7 +41,7 @@ class PlantRuns:
 
     @property
     def blocked(self) -> tuple[str, ...]:
-        """Runs that get no lease any more."""
+        """Runs that no longer get a lease."""
         return tuple(self._blocked)
 
     def admits(self, run: str, now: float) -> bool:
@@ -56,7 +56,7 @@ class PlantRuns:
         return False
 
     def took(self, run: str, now: float, over: float) -> None:
-        """Note an admitted lease; block the runs that have asked since the last one of its run."""
+        """Note an admitted lease; block the runs that asked since the previous lease of its run."""
         if run == self.holder:
             self._blocked.update(dict.fromkeys(self._asked - {""}, now))
             for oldest in tuple(self._blocked)[:-_MOST]:

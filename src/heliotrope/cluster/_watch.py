@@ -29,11 +29,11 @@ from heliotrope.safety import (
 )
 
 _LINE = "emergency_line"
-#: The row of the plant's silence trips after this, plus autonomy; no lease may be longer. s.
+#: The row for the plant's silence trips after this time plus autonomy, s; no lease may be longer.
 _PLANT_LEASE = 3.0
-#: A row that has tripped releases below 2 s of silence; a shorter lease would never release it.
+#: A row that has tripped resets below 2 s of silence; a shorter lease would never reset it.
 _SHORTEST_LEASE = 1.0
-#: Stands for an unknown error of the time, s.
+#: Represents an unknown time error, s.
 _UNBOUNDED = 1e9  # beyond safety.condition.UNKNOWN_TIME
 
 
@@ -44,11 +44,11 @@ class Verdict:
     Attributes
     ----------
     act
-        The strongest; None: nothing is wrong.
+        The strongest act; None: nothing is wrong.
     new
-        DEFOCUS or STOW if it has just become due; None otherwise.
+        DEFOCUS or STOW if it has just been demanded; None otherwise.
     acts
-        All, for the status: "DEFOCUS plant_link_lost".
+        All acts, for the status: "DEFOCUS plant_link_lost".
     forbidden
         Why motion is forbidden, empty if it is allowed.
     """
@@ -74,13 +74,13 @@ class Watch:
     longest_autonomy
         Longest autonomy that the plant may grant, s.
     reports
-        Where alarms go.
+        Receives alarms.
     now, present
-        Monotonic time, s, and the time that the next second's is compared with.
+        Monotonic time, s, and the time with which that of the next second is compared.
     limits
-        Numbers of the safety table that the plant sets.
+        Limits of the safety table that the plant sets.
     line
-        Returns whether current flows in the emergency line; None: there is no line.
+        Function that returns whether current flows in the emergency line; None: there is no line.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Watch:
     verdict
         Demands of the safety table in this second.
     runs
-        Run of the plant that the cluster belongs to, and those that it refuses.
+        Run of the plant that the cluster belongs to, and the runs that it refuses.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Watch:
     # -- the lease -------------------------------------------------------------------------
 
     def take(self, lease: Lease, now: float) -> str | None:
-        """Take a new lease; return the reason if it is refused."""
+        """Accept a new lease; return the reason if it is refused."""
         if not _SHORTEST_LEASE <= lease.lifetime <= _PLANT_LEASE:
             return f"lease of {lease.lifetime:g} s: give {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s"
         if not (0 <= lease.token <= 0xFFFFFFFF and lease.autonomy >= 0.0):
@@ -145,15 +145,15 @@ class Watch:
         return None
 
     def lease_left(self, now: float) -> float:
-        """Return the remaining time of the plant's lease without autonomy, s; below 0: over."""
+        """Return the remaining time of the plant's lease without autonomy, s; below 0: expired."""
         return max(self._over - now, -_UNBOUNDED)
 
     def alone(self, now: float) -> bool:
-        """Whether lease and autonomy are over."""
+        """Whether lease and autonomy have expired."""
         return now >= self._over + self._autonomy
 
     def authority(self, now: float) -> int:
-        """Return the token of the command authority, 0 once lease and autonomy are over."""
+        """Return the token of the command authority, 0 once lease and autonomy have expired."""
         return 0 if self.alone(now) else self.token
 
     # -- the table -------------------------------------------------------------------------
@@ -201,9 +201,9 @@ class Watch:
         return self.verdict
 
     def _step(self, time: Time, now: float) -> float:
-        """Return the step of the time against the monotonic clock, s.
+        """Return the step of the time relative to the monotonic clock, s.
 
-        The last time that had a source counts, however long it has had none since.
+        The last time that had a source counts, however long ago that was.
         """
         if time.quality == "none":
             return 0.0
@@ -223,6 +223,6 @@ class Watch:
             )
 
     def acknowledge(self, condition: str, who: str, role: AcknowledgeRole) -> str | None:
-        """Acknowledge a row that latches; return the reason of a refusal, None if accepted."""
+        """Acknowledge a latching row; return the reason for a refusal, None if accepted."""
         self._state, refusal = acknowledge(self._state, condition, who, role)
         return refusal

@@ -12,7 +12,7 @@ from heliotrope.links.messages import Ask, Command, Emergency, Parameters, Stage
 
 
 class Work:
-    """Takes orders, and carries them out piece by piece, the most urgent first."""
+    """Accepts orders, and carries them out step by step, the most urgent first."""
 
     def __init__(
         self,
@@ -29,7 +29,7 @@ class Work:
         self._epoch = epoch
 
     def take(self, message: Emergency | Command | Parameters | Ask) -> None:
-        """Take an order or a question of the plant."""
+        """Accept an order or a query from the plant."""
         if isinstance(message, Emergency):
             self._take_named(message)
         elif isinstance(message, Parameters):
@@ -40,7 +40,7 @@ class Work:
             self._take_named(message)
 
     def _take_named(self, message: Emergency | Command) -> None:
-        """Take an order for the heliostats that are here; the others are named in a refusal."""
+        """Accept an order for the heliostats of this cluster; the others are named in a refusal."""
         nodes, unknown = self._nodes.chosen(message.heliostats)
         for name, refusal in unknown.items():
             self._reports.add(message.identity, Stage.REFUSED, name, refusal)
@@ -65,7 +65,7 @@ class Work:
         self._emergencies.begin("", name, list(self._nodes))
 
     def ready(self, *, patient: bool = True) -> bool:
-        """Whether there is work to do; questions count only if ``patient``."""
+        """Whether there is work to do; queries count only if ``patient``."""
         return self._exchange.connected and (
             self._emergencies.pressing or self._orders.ready or (patient and self._questions.ready)
         )
@@ -81,7 +81,7 @@ class Work:
         self._reports.publish()
 
     async def begin_second(self) -> None:
-        """Ask again for missing acknowledgements, of emergencies at once."""
+        """Request missing acknowledgements again, those of emergencies at once."""
         self._questions.second()
         self._epoch.second()
         self._emergencies.second()
@@ -89,5 +89,5 @@ class Work:
             await self._emergencies.serve()
 
     def resume(self) -> None:
-        """Give orders that are to be retried their turn."""
+        """Make orders that are to be retried ready again."""
         self._orders.second()

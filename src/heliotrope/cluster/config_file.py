@@ -35,7 +35,7 @@ _OLD_TIME = {
 
 
 class ClusterSiteTable(Table):
-    """``[site]``: the origin of ENU, and its air."""
+    """``[site]``: the ENU origin, and the atmosphere there."""
 
     latitude_deg: float = Field(ge=-90.0, le=90.0, description="North positive.")
     longitude_deg: float = Field(ge=-180.0, le=180.0, description="East positive.")
@@ -86,7 +86,7 @@ class PlantLinkTable(Table):
 
 
 class TimeTable(Table):
-    """``[time]``: the computer's clock, and how far it is trusted."""
+    """``[time]``: the computer's clock, and how far it can be trusted."""
 
     error_s: float | None = Field(
         None,
@@ -142,13 +142,13 @@ class SafetyTable(Table):
 
     @property
     def limits(self) -> Limits:
-        """The numbers by condition."""
+        """The limits by condition."""
         apart = ("emergency_line", "longest_autonomy_s")
         return self.model_dump(exclude_defaults=True, exclude=set(apart))
 
 
 class MemberTable(Table):
-    """``[[heliostats]]``: one for each, up to 32."""
+    """``[[heliostats]]``: one table per heliostat, up to 32."""
 
     name: str = Field(min_length=1, description="As the plant knows it.")
     address: int = Field(ge=1, le=65534, description="On the bus.")
@@ -188,7 +188,7 @@ TABLES: tuple[type[Table], ...] = (
 
 @dataclass(frozen=True)
 class Installation:
-    """A cluster as it is installed: its configuration, and where its ports lead.
+    """An installed cluster: its configuration, and the addresses of its ports.
 
     Attributes
     ----------
@@ -199,16 +199,15 @@ class Installation:
     plant
         ``[plant]``.
     scheme, host, port, prefix
-        Of the plant's URL; ``prefix`` of MQTT topics.
+        Parts of the plant's URL; ``prefix`` of MQTT topics.
     key_file
-        File of the keys; None: there is none.
+        Key file; None: there is none.
     bus_key_file, bus_keys
-        File of the keys of the bus, and the keys, replaced by `take_bus_keys`; None: no frame is
-        signed.
+        File of the bus keys, and the keys, replaced by `take_bus_keys`; None: no frame is signed.
     plant_keys, password
-        Of the link, and of the MQTT broker; replaced by `take_keys`.
+        Keys of the link, and password for the MQTT broker; replaced by `take_keys`.
     error
-        Bound of the clock's error that the operator vouches for, s; None: the kernel's is used.
+        Bound on the clock error that the operator guarantees, s; None: the kernel's bound is used.
     gpsd
         Host and port of gpsd; None: there is none.
     state
@@ -236,12 +235,12 @@ class Installation:
     emergency_line: Path | None
 
     def take_keys(self) -> None:
-        """Read the key file again, and give the link its keys; those of heliostats stay.
+        """Read the key file again, and update the keys of the link; heliostat keys stay unchanged.
 
         Raises
         ------
         FormatError
-            If it cannot be used, or has no key of the plant any more.
+            If the file cannot be used, or no longer has the plant key.
         """
         keys = Keys(self.key_file, HELIOSTATS)
         if not keys.plant:
@@ -249,12 +248,12 @@ class Installation:
         self.plant_keys.keys, self.password.word = keys.plant, keys.password
 
     def take_bus_keys(self) -> None:
-        """Read the file of the bus's keys again.
+        """Read the bus key file again.
 
         Raises
         ------
         FormatError
-            If it cannot be used.
+            If the file cannot be used.
         """
         if self.bus_key_file is not None and self.bus_keys is not None:
             self.bus_keys.keys = read_bus_keys(self.bus_key_file)
@@ -282,7 +281,7 @@ def read_cluster(path: str | Path) -> Installation:
 
 
 def _refuse_old(path: Path) -> None:
-    """Refuse keys of a former format, and say what to write instead."""
+    """Refuse keys of an earlier format, and say what to write instead."""
     time = read_toml(path, "a cluster file").get("time")
     for key in time if isinstance(time, dict) else ():
         if key in _OLD_TIME:
@@ -345,7 +344,7 @@ def _install(
 
 
 def _placed(path: Path, table: PlantLinkTable) -> PlantLinkTable:
-    """Return a table of files in the folder of the cluster's file."""
+    """Return a table with file paths relative to the folder of the cluster file."""
     if table.authority is None:
         return table
     return table.model_copy(update={"authority": str(path.parent / table.authority)})

@@ -51,7 +51,7 @@ from heliotrope.sun import broadcast_values
 
 #: Polling ends this long after the beginning of the second, s.
 _ROUND = 0.95
-#: The beginning of the second is shifted by at most this at a time, s.
+#: The beginning of the second is shifted by at most this amount at a time, s.
 _STEER = 0.1
 
 
@@ -191,7 +191,7 @@ class Cluster:
             await self._ended.wait()
 
     async def _master(self) -> None:
-        """Work through one second after the other: the only task that uses the bus."""
+        """Run one second after the other; this is the only task that uses the bus."""
         due = self._clock.monotonic()
         present = self._time.time()
         if present.usable:
@@ -205,7 +205,7 @@ class Cluster:
                 await self._exchange.broadcast("DEFOCUS", urgent=True)
 
     async def _serve_until(self, due: float) -> None:
-        """Carry out orders until the next second begins; an emergency wakes it at once."""
+        """Carry out orders until the next second begins; an emergency wakes this task at once."""
         while not self._closing.is_set() and (remaining := due - self._clock.monotonic()) > 0.0:
             if self._work.ready():
                 await self._work.serve()
@@ -227,7 +227,7 @@ class Cluster:
             self._work.obey(verdict.new.name, "; ".join(verdict.acts))
         await self._work.begin_second()
         if self._exchange.connected:
-            # An emergency on a silent bus takes seconds: the broadcast needs the time now.
+            # An emergency on a silent bus takes seconds, and the broadcast needs the present time.
             await self._broadcast.second(self._time.time())
             self._work.resume()
             await self._polling.round(begin + _ROUND, self._work, self._closing)
@@ -240,12 +240,12 @@ class Cluster:
     def _next_due(self, begin: float, present: Time) -> float:
         ahead = 0.0
         if present.usable:
-            # When this second should have begun by the time, within half a second.
+            # When this second should have begun according to the time source, within half a second.
             ahead = (present.gps_s - self.config.phase + 0.5) % 1.0 - 0.5
         return begin + 1.0 - max(-_STEER, min(_STEER, ahead))
 
     def take_alarm(self, alarm: Alarm) -> None:
-        """Report an alarm of the surrounding program, raised or cleared."""
+        """Report an alarm of the enclosing program, raised or cleared."""
         (self._reports.alarm if alarm.active else self._reports.clear)(alarm)
 
     def line(self) -> str:

@@ -38,7 +38,7 @@ class Kept:
     Attributes
     ----------
     epoch
-        Those of this run.
+        Epoch of this run.
 
     Raises
     ------
@@ -54,7 +54,7 @@ class Kept:
         if path is not None and path.exists():
             self.epoch, self._edition = _read(path)
         self._reserved = self._edition
-        #: What was last given to the disk: no later writing may take it back.
+        #: The values last handed to the disk; no later write may go below them.
         self._handed = (self.epoch, self._reserved)
         self._reserving = False
         self._problem: Exception | None = None
@@ -62,12 +62,12 @@ class Kept:
     def start(self, at_least: int) -> int:
         """Return the epoch of a new run, above all earlier ones and not below ``at_least``.
 
-        It waits for the disk, and reserves editions in the same write.
+        It waits for the disk, and reserves editions in the same write operation.
 
         Raises
         ------
         OSError
-            If it cannot be stored.
+            If the epoch cannot be stored.
         """
         epoch = self._above(at_least)
         self._write(epoch, self._edition + _BLOCK)
@@ -91,7 +91,7 @@ class Kept:
         Raises
         ------
         OSError
-            If it could not be stored; it is then not used either, and storing is retried.
+            If it could not be stored; the edition is then not used either, and storing is retried.
         """
         edition = max(self._edition, above) + 1
         if edition + _AHEAD > self._reserved and not self._reserving:
@@ -105,7 +105,7 @@ class Kept:
         return edition
 
     def close(self) -> None:
-        """Close the disk, which may still write for a moment."""
+        """Close the disk, which may still finish a write."""
         self._disk.close()
 
     def _above(self, at_least: int) -> int:
@@ -121,7 +121,7 @@ class Kept:
         self._disk.do(partial(self._write, 0, reserved), stored)
 
     def _write(self, epoch: int, reserved: int) -> None:
-        """Write both numbers, neither below what was written before; one piece at a time."""
+        """Write both numbers, neither below what was written before; one write at a time."""
         epoch, reserved = max(epoch, self._handed[0]), max(reserved, self._handed[1])
         if self._path is not None:
             beside = self._path.with_name(self._path.name + ".new")

@@ -34,14 +34,14 @@ def time_of(installation: Installation, clock: Clock) -> TimeKeeper:
     gpsd = None if installation.gpsd is None else Gpsd(clock, *installation.gpsd)
     if installation.error is not None:
         return SystemTime(clock, installation.error, gpsd=gpsd)
-    timekeeping.kernel_bound()  # a system that cannot be asked is refused at the start
+    timekeeping.kernel_bound()  # a system that does not report the bound is refused at start-up
     return SystemTime(clock, bound=timekeeping.kernel_bound, gpsd=gpsd)
 
 
 def line_of(file: Path | None) -> Callable[[], bool] | None:
-    """Return a function for whether current flows in a GPIO file's line; None: there is no line.
+    """Return a function that reads the emergency line from a GPIO file; None: there is no line.
 
-    A file that cannot be read counts as an open line.
+    The function returns whether current flows. A file that cannot be read counts as an open line.
     """
     if file is None:
         return None
@@ -57,32 +57,32 @@ def line_of(file: Path | None) -> Callable[[], bool] | None:
 
 
 class LocalCluster:
-    """A cluster whose bus is connected to the plant's machine.
+    """A cluster whose bus is connected to the plant's computer.
 
     Parameters
     ----------
     path
         Path of its cluster file; the table ``[plant]`` is not used.
     name, members
-        As the plant knows them.
+        Name of the cluster and of its heliostats in the plant.
     clock
         Clock of the plant.
 
     Attributes
     ----------
     link
-        The plant's end.
+        The plant's end of the link.
     parts
-        Bus, time and both ends of the link, to be run.
+        Bus, time and both ends of the link; the owner runs them.
     cluster
-        To be run within them.
+        The cluster; the owner runs it within ``parts``.
     installation
-        Of the cluster file.
+        As read from the cluster file.
 
     Raises
     ------
     FormatError
-        If the file is for another cluster, or its heliostats are not the plant's.
+        If the file is for another cluster, or its heliostats are not those of the plant.
     """
 
     def __init__(self, path: Path, name: str, members: tuple[str, ...], clock: Clock) -> None:

@@ -31,16 +31,16 @@ from heliotrope.links.link import (
     until_closed,
 )
 
-#: Start, eight data bits, stop.
+#: Bits per character: start, eight data bits, stop.
 _BITS = 10
 _BAUD_RATES = (1200, 4_000_000)
-#: An echo may be this late, in s: USB adapters collect bytes for up to 16 ms.
+#: An echo may be delayed by this much, in s: USB adapters collect bytes for up to 16 ms.
 _ECHO_LIMIT = 0.05
 
 
 @dataclass(frozen=True)
 class BusSettings:
-    """How a bus is driven.
+    """Settings of a bus.
 
     Parameters
     ----------
@@ -49,16 +49,16 @@ class BusSettings:
     gap
         Silence before a frame, in s; None: 3.5 characters, at least 1.75 ms, as on Modbus.
     echo
-        The adapter receives its own frames.
+        Whether the adapter receives its own frames.
     first_pause, longest_pause
         Pauses between attempts to open the port, in s.
     open_limit
-        Time limit for opening it, in s.
+        Time limit for opening the port, in s.
 
     Raises
     ------
     InputError
-        A rate or a gap that no bus has.
+        If a rate or gap is out of range.
     """
 
     baud_rate: int = 115200
@@ -92,22 +92,22 @@ class BusSettings:
 
 @dataclass(slots=True)
 class BusStatistics:
-    """Counts of a bus since it was made.
+    """Counts of a bus since it was created.
 
     Attributes
     ----------
     sent, answered, silent
-        Frames sent; requests with bytes in answer; requests without.
+        Frames sent; requests with reply bytes; requests without.
     dropped, expired
-        Not sent: no port; the turn came too late.
+        Frames not sent because there was no port; because they had expired before their turn.
     stray
         Unrequested bytes.
     spoilt
-        Frames whose echo came back altered or not at all.
+        Frames whose echo was altered or missing.
     opened, failures, reconnects
-        Ports opened; attempts that failed; ports opened after the first.
+        Ports opened; failed attempts; ports opened after the first.
     last_received
-        When the last byte came, in s of the monotonic clock.
+        When the last byte arrived, in s of the monotonic clock.
     """
 
     sent: int = 0
@@ -124,17 +124,17 @@ class BusStatistics:
 
 
 def ends_in_zero(data: bytes) -> bool:
-    """Return whether bytes hold a whole frame of the wire: something, then a zero."""
+    """Return whether bytes hold a complete frame: at least one other byte, then a zero."""
     return data.endswith(b"\0") and bool(data.strip(b"\0"))
 
 
 class _Port(asyncio.Protocol):
-    """Received bytes of a port and their time, without the adapter's own echo."""
+    """Received bytes of a port and their times, without the adapter's own echo."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self.data = bytearray()
-        self.echo = b""  # that is still to come
+        self.echo = b""  # the echo that is still expected
         self.spoilt = False
         self.last_at = clock.monotonic()
         self.news = asyncio.Event()
@@ -160,7 +160,7 @@ class _Port(asyncio.Protocol):
         self.news.set()
 
     async def hear(self, until: float) -> None:
-        """Wait for the next bytes, or until an instant of the clock."""
+        """Wait for the next bytes, or until a monotonic time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(until - self._clock.monotonic()):
                 await self.news.wait()
@@ -203,7 +203,7 @@ class SerialBus:
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open; only answers show which nodes are alive."""
+        """Whether the port is open; only replies show which nodes are alive."""
         return self._port is not None
 
     @property
@@ -277,7 +277,7 @@ class SerialBus:
             self._port = self._transport = None
             port.lost.set()
             port.news.set()
-            transport.abort()  # what has not gone out is not to go out later
+            transport.abort()  # whatever has not been sent yet must not be sent later
             await transport.wait_closed()
 
     # -- transactions ------------------------------------------------------------------
@@ -285,21 +285,21 @@ class SerialBus:
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame that nobody answers, and wait until it is out.
+        """Send a frame that gets no reply, and wait until it has been sent.
 
         Parameters
         ----------
         frame
-            With its terminator.
+            Frame with its terminator.
         expires
-            By the monotonic clock; if its turn comes later, it is dropped.
+            Monotonic time after which the frame is dropped.
         urgent
-            Next, before all that wait.
+            Send it next, before all waiting frames.
 
         Raises
         ------
         LinkClosedError
-            When the bus is closed.
+            If the bus is closed.
         """
         async with self._turns.turn(urgent=urgent):
             port, outcome = await self._put(frame, expires)
@@ -320,32 +320,32 @@ class SerialBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the answer.
+        """Send a frame and return the reply.
 
         Parameters
         ----------
         frame
-            With its terminator.
+            Frame with its terminator.
         timeout
-            For the whole answer, from the end of the frame, in s.
+            Time limit for the complete reply, from the end of the frame, in s.
         expires, urgent
             As in `transmit`.
         complete
-            Returns whether the bytes received so far are the whole answer; None: that of the wire,
-            `ends_in_zero`.
+            Function that returns whether the bytes received so far are the complete reply; None:
+            `ends_in_zero`, the rule of the wire.
 
         Returns
         -------
         bytes
-            What came, whole or not; empty if nothing did or the frame was not sent (see
-            ``statistics``). Only the codec can decide whether it is an answer.
+            Whatever was received, complete or not; empty if nothing was received or the frame was
+            not sent (see ``statistics``). Only the codec can decide whether it is a reply.
 
         Raises
         ------
         InputError
-            A timeout that is not above 0.
+            If the timeout is not above 0.
         LinkClosedError
-            When the bus is closed.
+            If the bus is closed.
         """
         if not timeout > 0.0:
             raise InputError(f"bus {self._url}: a timeout of {timeout} s; it must be above 0")

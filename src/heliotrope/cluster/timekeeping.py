@@ -27,23 +27,23 @@ from heliotrope.links.gpsd import Gpsd
 
 Quality = Literal["gps", "system", "holdover", "none"]
 
-#: An earlier time is not believed: a computer without a clock battery starts in the past.
+#: An earlier time is not believed, because a computer without a clock battery starts in the past.
 NOT_BEFORE = datetime(2026, 1, 1, tzinfo=UTC)
 #: adjtimex(2) returns this for a clock that is not synchronised.
 _TIME_ERROR = 5
-#: Index of the bound of the clock's error in ``struct timex``, counted in longs; in µs.
+#: Index of the clock's error bound in ``struct timex``, counted in longs; in µs.
 _MAXERROR = 3
-#: Two oscillators are assumed to agree in rate within this: twice the largest slew of NTP.
+#: The rates of two oscillators are assumed to agree within this, twice the largest slew of NTP.
 _SLEW = 1e-3
-#: The kernel lets the bound of a clock grow by this ratio (MAXFREQ, 500 ppm), once a second.
+#: The kernel lets the error bound of a clock grow at this rate (MAXFREQ, 500 ppm), once a second.
 _GROWTH = 500e-6
 #: A bound that exceeds its growth by more than this was renewed, s: two ticks of a second.
 _RENEWED = 1e-3
 #: A bound not renewed for this long is holdover, s.
 _FRESH = 300.0
-#: Above this error bound there is no time, s.
+#: Above this error bound the time is unusable, s.
 LARGEST_ERROR = 1.0
-#: Clock and receiver contradict each other above this, s; reports come up to 1 s late.
+#: Clock and receiver contradict each other above this difference, s; reports arrive up to 1 s late.
 CONTRADICTION = 2.0
 
 
@@ -85,8 +85,8 @@ class Time:
 class TimeKeeper(Protocol):
     """A cluster's source of time.
 
-    Run ``run`` in a TaskGroup of the owner (or use `link.running`); it returns when the keeper is
-    closed. ``time`` may be called at any time, also before ``run`` and after ``close``.
+    The owner runs ``run`` in a TaskGroup (or uses `link.running`); it returns when the keeper is
+    closed. ``time`` may be called at any time, even before ``run`` and after ``close``.
     """
 
     def time(self) -> Time:
@@ -165,7 +165,7 @@ def kernel_bound() -> float:
         If the system does not provide the bound.
     """
     ask = getattr(ctypes.CDLL(None, use_errno=True), "adjtimex", None)
-    timex = (ctypes.c_long * 128)()  # zeros ask and change nothing; larger than any struct timex
+    timex = (ctypes.c_long * 128)()  # zeros query and change nothing; larger than any struct timex
     state = -1 if ask is None else int(ask(timex))
     if state < 0:
         raise InputError(
@@ -176,10 +176,10 @@ def kernel_bound() -> float:
 
 
 class _Bound:
-    """The kernel's bound, carried on through a restart of the program that renews it.
+    """The kernel's bound, carried over a restart of the program that renews it.
 
-    chronyd declares the clock unsynchronised when it starts. That does not disturb the oscillator:
-    unless the clock is set meanwhile, the previous bound goes on growing.
+    chronyd declares the clock unsynchronised when it starts. The oscillator is not affected, so the
+    previous bound continues to grow unless the clock is set in the meantime.
     """
 
     def __init__(self, ask: Callable[[], float]) -> None:
@@ -260,7 +260,7 @@ class SystemTime:
         return Time(utc.timestamp(), _gps(utc), error, quality, jumped, note)
 
     def _judged(self, utc: datetime, *, jumped: bool) -> tuple[float, Quality, str]:
-        """Return bound, quality and note."""
+        """Return the error bound, the quality and the note."""
         now = self._clock.monotonic()
         error = self._error if self._bound is None else self._bound.at(now, jumped=jumped)
         if utc < NOT_BEFORE:
@@ -289,7 +289,7 @@ class SystemTime:
         return error, "system" if ahead is None else "gps", problem
 
     async def run(self) -> None:
-        """Check the clock every second, so that a jump there and back does not go unnoticed."""
+        """Check the clock every second, so that a jump forward and back does not go unnoticed."""
         if self._gpsd is None:
             await self._look()
             return
@@ -323,5 +323,5 @@ def _old(error: float, limit: str) -> str:
 def _gps(utc: datetime) -> float:
     try:
         return gps_seconds(utc)
-    except TimeError:  # before the scale began: a clock that was never set
+    except TimeError:  # before the GPS scale began: the clock was never set
         return (utc - GPS_EPOCH).total_seconds()

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 
 
 class Turns:
-    """Turns on the bus: first come, first served, but urgent tasks before all others."""
+    """Turns on the bus: first come, first served, but urgent tasks go before all others."""
 
     def __init__(self) -> None:
         self._busy = False
@@ -17,7 +17,7 @@ class Turns:
 
     @contextlib.asynccontextmanager
     async def turn(self, *, urgent: bool) -> AsyncIterator[None]:
-        """Hold the bus for a block."""
+        """Hold the bus for the duration of a block."""
         if self._busy:
             mine = asyncio.get_running_loop().create_future()
             heapq.heappush(self._waiting, (not urgent, next(self._number), mine))

@@ -1,4 +1,7 @@
-"""The process of page and API: ``python -m heliotrope.console``, started by `heliotrope run`."""
+"""The process of the page and the API: ``python -m heliotrope.console``.
+
+`heliotrope run` starts it.
+"""
 
 import contextlib
 import sys
@@ -9,9 +12,10 @@ from heliotrope.console.remote import RemotePlant
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.processes import give_way
 
-#: The plant goes first: less of the processor, and memory is taken from the console first.
+#: The plant takes precedence: the console gets less processor time, and memory is taken from it
+#: first.
 _NICE, _EXPENDABLE = 5, 500
-#: Most memory, bytes: six times what it has beside 320 heliostats.
+#: Maximum memory, bytes; six times what the process uses with 320 heliostats.
 _MEMORY = 2 << 30
 
 

@@ -11,12 +11,12 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Collection
 from typing import TypeVar
 
-#: Time that a failure counts, s, and attempts for one name at one address in it.
+#: Time for which a failure counts, s, and number of attempts for one name at one address within it.
 SPAN, AN_HOUR = 3600.0, 12
-#: Delay after each failure of a name at an address, s; the first ones cost nothing.
+#: Delay after each failure of a name at an address, s; the first failures cause no delay.
 _OWN = (0.0, 0.0, 0.0, 0.0, 15.0, 30.0, 60.0, 120.0, 240.0, 300.0, 300.0)
-#: Failures of a name, and from an address, that cost nothing; then the delay doubles from 1 s up to
-#: the longest, s.
+#: Number of failures of a name, and from an address, that cause no delay; after that the delay
+#: doubles from 1 s up to the longest, s.
 _NAME, _ADDRESS = (5, 300.0), (20, 10.0)
 _KEPT = 64
 Pair = tuple[str, str]
@@ -30,9 +30,9 @@ class SignInFailures:
     Parameters
     ----------
     monotonic
-        Returns the time, s.
+        Function that returns the time, s.
     shared
-        Addresses of many people, such as trusted proxies, that are not counted as one caller.
+        Addresses of many users, such as trusted proxies, which do not count as one caller.
     largest
         Number of names, addresses and pairs of them that are kept; the longest unused are dropped
         first.
@@ -68,7 +68,7 @@ class SignInFailures:
         return (name, address) in self._good
 
     def is_home(self, address: str) -> bool:
-        """Whether anybody has signed in from an address."""
+        """Whether anyone has signed in from an address."""
         return address in self._homes
 
     def meet(self, name: str, address: str) -> None:
@@ -83,7 +83,7 @@ class SignInFailures:
             self._homes -= Counter([oldest])
 
     def begin(self, name: str, address: str) -> None:
-        """Count an attempt as failed until `good` says otherwise.
+        """Count an attempt as failed until `good` is called.
 
         Counting only after the slow password check would let many attempts through at once.
         """
@@ -94,7 +94,7 @@ class SignInFailures:
             _kept(self._addresses, address, _KEPT, self._largest).append((now, pair))
 
     def undo(self, name: str, address: str) -> None:
-        """Count the last attempt of a name at an address no more: it was no guess."""
+        """Discard the last attempt of a name at an address, because it was not a guess."""
         pair = (name, address)
         if times := self._pairs.get(pair):
             times.pop()
@@ -105,7 +105,7 @@ class SignInFailures:
                 failures.remove(failure)
 
     def good(self, name: str, address: str) -> None:
-        """Forget the failures of a name at an address where it has signed in, and no others."""
+        """Forget the failures of a name at an address where it has signed in, but no others."""
         pair = (name, address)
         self._pairs.pop(pair, None)
         for failures in (self._names.get(name), self._addresses.get(address)):
@@ -117,7 +117,7 @@ class SignInFailures:
 
 
 def _kept(kept: "OrderedDict[K, deque[V]]", key: K, most: int, largest: int) -> "deque[V]":
-    """Return the failures of a key, which is now the last used."""
+    """Return the failures of a key, which becomes the most recently used."""
     failures = kept.setdefault(key, deque(maxlen=most))
     kept.move_to_end(key)
     if len(kept) > largest:
@@ -138,7 +138,7 @@ def _own_until(times: Collection[float], now: float) -> float:
 def _shared_until(
     failures: Collection[tuple[float, Pair]], now: float, free: int, longest: float
 ) -> float:
-    """Return when anybody may try again for a name, or from an address, s."""
+    """Return when anyone may try again for a name, or from an address, s."""
     recent = [at for at, _ in failures if now - at < SPAN]
     more = len(recent) - free
     return recent[-1] + min(longest, 2.0**more) if more >= 0 else now

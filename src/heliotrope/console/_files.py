@@ -10,9 +10,9 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 STATIC = Path(__file__).with_name("static")
-#: The page's only script from another package, which its own page of `camera teach` has too.
+#: The page's only script from another package; the page of `camera teach` also uses it.
 _CLICKING = Path(__file__).parents[1] / "imaging" / "targets" / "clicking.js"
-#: Smaller answers are not compressed, bytes.
+#: Smaller responses are not compressed, bytes.
 SMALL = 1024
 _KINDS = {
     ".css": "text/css",
@@ -20,7 +20,7 @@ _KINDS = {
     ".json": "application/json",
     ".svg": "image/svg+xml",
 }
-#: Address and file of each page but the sign-in's.
+#: Address and file of each page except the sign-in page.
 PAGES = {
     "/": "console",
     "/emergency": "emergency",
@@ -29,27 +29,28 @@ PAGES = {
     "/trends": "trends",
     "/wall": "wall",
 }
-#: What stands in the HTML for the folder of the files.
+#: Placeholder in the HTML for the folder of the files.
 _FOLDER = "/console/static/"
 
-#: By the address in the folder: `live.js`, `languages/de.json`.
+#: Files by their address within the folder: `live.js`, `languages/de.json`.
 _READ = {
     file.relative_to(STATIC).as_posix(): file.read_bytes()
     for file in sorted(STATIC.rglob("*"))
     if file.is_file()
 } | {_CLICKING.name: _CLICKING.read_bytes()}
 _TAG = hashlib.sha256(b"".join(_READ.values())).hexdigest()[:12]
-#: Folder of the page's files. The version in its name lets a browser keep them for good.
+#: Folder of the page's files. Its name contains the version, so that a browser can keep the files
+#: permanently.
 KEPT = f"/console/{_TAG}"
 
 
 class Files:
-    """An ASGI middleware that answers for the files of the page.
+    """An ASGI middleware that serves the files of the page.
 
     Parameters
     ----------
     app
-        Application that answers all other requests.
+        Application that serves all other requests.
 
     Attributes
     ----------
@@ -64,7 +65,7 @@ class Files:
         self._answers = {path: _answer(path.removeprefix(f"{KEPT}/")) for path in self.paths}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer from memory, or pass the request on."""
+        """Respond from memory, or pass the request on."""
         if scope["type"] != "http" or scope["path"] not in self._answers:
             await self._app(scope, receive, send)
             return
@@ -97,5 +98,5 @@ def page(name: str) -> str:
 
 
 def takes_gzip(headers: Headers) -> bool:
-    """Whether the browser accepts compressed answers."""
+    """Whether the browser accepts compressed responses."""
     return "gzip" in headers.get("accept-encoding", "")

@@ -1,13 +1,13 @@
-"""Passwords that are guessed first: common ones and their variations, sequences, and the own name.
+"""Passwords that are guessed first: common ones and variations, sequences, and the account name.
 
-NIST SP 800-63B, section 3.1.1.2, requires such a list. A longer list is of little use here, because
-a password has ten characters or more, and guessing is slowed down (see `_attempts`).
+NIST SP 800-63B, section 3.1.1.2, requires such a list. A longer list would be of little use here,
+because a password has ten characters or more, and guessing is slowed down (see `_attempts`).
 """
 
 import itertools
 import re
 
-#: Common passwords without the digits and signs that people put around them.
+#: Common passwords, without the digits and signs that people add at either end.
 _WORDS = """
 abc abcd abcdef access admin administrator alexander america asdfasdf asdfghjkl baseball
 basketball batman benutzer bienvenue blink butterfly changeme charlie chocolate computer
@@ -27,13 +27,13 @@ _LETTERS = str.maketrans("4@831!0$5", "aabeiioss")
 _ROWS = ("abcdefghijklmnopqrstuvwxyz", "01234567890", "qwertyuiop", "qwertzuiop", "asdfghjkl",
          "zxcvbnm", "yxcvbnm", "qazwsxedcrfvtgbyhnujmikolp", "1qaz2wsx3edc4rfv5tgb6yhn7ujm8ik9ol",
          "1q2w3e4r5t6y7u8i9o0p")  # fmt: skip
-#: So many different characters at least, and at most this share of them in runs.
+#: Minimum number of different characters, and maximum fraction of characters in runs.
 _DIFFERENT, _RUNNING = 5, 0.75
 _LEAST_RUN = 4
 
 
 def weakness(password: str, name: str = "") -> str | None:
-    """Return the reason why a password is guessed early, None if none is known.
+    """Return the reason why a password would be guessed early, None if none is known.
 
     Parameters
     ----------
@@ -59,12 +59,12 @@ def weakness(password: str, name: str = "") -> str | None:
 
 
 def _repeated(text: str) -> bool:
-    """Whether a text is one part over and over."""
+    """Whether a text consists of one part repeated."""
     return (text + text).find(text, 1) < len(text)
 
 
 def _running(text: str) -> int:
-    """Return the characters of a text that stand in runs of a row, forwards or backwards."""
+    """Return the number of characters of a text in runs along a row, in either direction."""
     rows, count, place = [*_ROWS, *(row[::-1] for row in _ROWS)], 0, 0
     while place < len(text):
         longest = max(_common_run(text, place, row) for row in rows)
@@ -74,7 +74,7 @@ def _running(text: str) -> int:
 
 
 def _common_run(text: str, place: int, row: str) -> int:
-    """Return the length of the run that begins at a place and follows a row."""
+    """Return the length of the run along a row that begins at a given place."""
     begin = row.find(text[place])
     if begin < 0:
         return 0

@@ -4,19 +4,19 @@ import logging
 import time
 from collections.abc import Callable
 
-#: Loggers whose lines strangers can cause.
+#: Loggers whose lines can be caused by strangers.
 NOISY = ("asyncio", "heliotrope.console", "uvicorn.error", "websockets.server")
-#: Lines of one kind within a span, s, and kinds that are kept.
+#: Number of lines of one kind within a span, s, and number of kinds that are remembered.
 MOST, SPAN, KINDS = 5, 60.0, 500
 
 
 class Repeated(logging.Filter):
-    """Passes a few lines of each kind within a span, then one with the count of the others.
+    """Passes a few lines of each kind within a span, then one line with the number of the others.
 
     Parameters
     ----------
     monotonic
-        Returns the time, s.
+        Function that returns the time, s.
     """
 
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -26,7 +26,7 @@ class Repeated(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether a line is written."""
-        kind = (record.name, record.lineno)  # never its text, which a stranger may choose
+        kind = (record.name, record.lineno)  # never the text, which a stranger may choose
         now = self._now()
         begun, count = self._counts.get(kind, (now, 0))
         if now - begun >= SPAN:
@@ -40,7 +40,7 @@ class Repeated(logging.Filter):
 
 
 def limit() -> None:
-    """Limit the repeated lines of the noisy loggers, once for the process."""
+    """Limit repeated lines of the noisy loggers, once per process."""
     for name in NOISY:
         logger = logging.getLogger(name)
         if not any(isinstance(entry, Repeated) for entry in logger.filters):

@@ -1,4 +1,4 @@
-"""Passwords, kept as argon2id hashes."""
+"""Passwords, stored as argon2id hashes."""
 
 import secrets
 
@@ -7,10 +7,11 @@ import argon2
 from heliotrope.console._guessable import weakness
 from heliotrope.errors import InputError
 
-#: Shortest and longest password; a longer one would cost the server too much to hash.
+#: Lengths of the shortest and the longest password; a longer one would cost the server too much to
+#: hash.
 SHORTEST, LONGEST = 10, 200
 _HASHER = argon2.PasswordHasher()
-#: Verified where there is no account, so that both cases take the same time.
+#: Verified if there is no account, so that both cases take the same time.
 _NOBODY = _HASHER.hash(secrets.token_hex(16))
 
 
@@ -20,7 +21,7 @@ def check_password(password: str, name: str = "") -> str:
     Raises
     ------
     InputError
-        If it is too short or too long, or guessed early.
+        If it is too short, too long, or easily guessed.
     """
     if not SHORTEST <= len(password) <= LONGEST:
         raise InputError(f"password: {len(password)} characters; give {SHORTEST} to {LONGEST}")
@@ -30,14 +31,14 @@ def check_password(password: str, name: str = "") -> str:
 
 
 def hash_password(password: str) -> str:
-    """Return the argon2id hash; takes some 50 ms."""
+    """Return the argon2id hash, which takes some 50 ms."""
     return _HASHER.hash(check_password(password))
 
 
 def verify_password(kept: str | None, password: str) -> bool:
     """Return whether a password matches a hash.
 
-    It takes the same time without an account, and for one that has no password.
+    It takes the same time if there is no account, or if the account has no password.
     """
     known = kept if kept is not None and kept.startswith("$argon2") else None
     try:

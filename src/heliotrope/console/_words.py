@@ -5,12 +5,12 @@ import hmac
 
 
 def csrf_of(session: str) -> str:
-    """Return the CSRF word that a page must send with every change in a session."""
+    """Return the CSRF token that a page must send with every change in a session."""
     return hmac.new(session.encode(), b"heliotrope csrf", hashlib.sha256).hexdigest()
 
 
 def same(word: str, other: str) -> bool:
     """Return whether two words are equal, in constant time."""
-    # JSON may hold half a surrogate pair, which UTF-8 has no bytes for.
+    # JSON may contain half a surrogate pair, for which UTF-8 has no bytes.
     said, meant = (word.encode(errors="surrogatepass") for word in (word, other))
     return hmac.compare_digest(said, meant)

@@ -229,7 +229,7 @@ async def revoke(
 
 
 async def _find(console: Console, name: str, *, password: bool) -> None:
-    """Check that there is an account, and that it may have a password if that is to be changed."""
+    """Check that an account exists and, if its password is to be changed, that it may have one."""
     account = await console.ask(lambda: console.people.account(name))
     if account is None:
         raise HTTPException(404, f"there is no account {name}")
@@ -238,13 +238,13 @@ async def _find(console: Console, name: str, *, password: bool) -> None:
 
 
 async def _without_password(console: Console, who: Caller) -> bool:
-    """Whether a session's account has no password yet, as the store says now."""
+    """Whether a session's account has no password yet, according to the store."""
     found = await console.ask(lambda: console.people.account(who.person.name))
     return who.by == "session" and found is not None and found.no_password
 
 
 async def _hashed(console: Console, who: Caller, request: Request, password: str) -> str:
-    """Return the hash of a new password, which somebody who has signed in gives."""
+    """Return the hash of a new password, which a signed-in person has entered."""
     pair = (who.person.name, console.address(request))
     try:
         async with console.hashing.turn(pair, request.is_disconnected, known=True):

@@ -43,7 +43,7 @@ from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.orders.authority import OPERATOR_COMMANDS, Role
 from heliotrope.store.people import LONGEST_NAME
 
-#: Answers that any route behind the sign-in may give.
+#: Responses that any route behind the sign-in may return.
 REFUSALS: dict[int | str, dict[str, Any]] = {
     401: {"model": models.Problem, "description": "Not signed in"},
     403: {"model": models.Problem, "description": "The role is too low"},
@@ -58,7 +58,7 @@ MOST_SHARED = 100
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 Named = Annotated[str, Path(max_length=64)]
-#: Name of an account, whatever it is: the path of its route takes a slash too.
+#: Name of an account, whatever it contains; the path of its route accepts a slash too.
 AccountNamed = Annotated[str, Path(max_length=LONGEST_NAME)]
 
 
@@ -70,9 +70,9 @@ def answer(value: Any) -> JSONResponse:
 async def shared(
     console: Console, request: Request, call: str, fresh: float, **arguments: Any
 ) -> Response:
-    """Return an answer that is the same for everybody, encoded once for all callers of a moment.
+    """Return a response that is the same for everyone, encoded once for all simultaneous callers.
 
-    It holds nothing of the caller, so its compressed length reveals no secret.
+    It contains nothing about the caller, so its compressed length reveals no secret.
     """
     key = " ".join((call, *map(str, arguments.values())))
     now, kept = time.monotonic(), console.shared.get(key)
@@ -125,7 +125,7 @@ async def command(
 
 
 def _endpoint(name: str, call: Call) -> Callable[..., Any]:
-    """Return the function of a route: it makes a call with the arguments of the request."""
+    """Return the function of a route, which makes a call with the arguments of the request."""
 
     async def endpoint(
         console: Console, request: Request, who: Caller, order: Any = None, **parameters: Any
@@ -151,7 +151,7 @@ def _endpoint(name: str, call: Call) -> Callable[..., Any]:
 
 
 def _arguments(call: Call) -> Iterator[Parameter]:
-    """Yield the arguments of a request: those in its path, in its query, and its body."""
+    """Yield the arguments of a request, from its path, its query, and its body."""
     method, path = call.request.split()
     hints = get_type_hints(call.arguments, include_extras=True)
     for key, field in call.arguments.model_fields.items():
@@ -226,15 +226,15 @@ async def live(socket: WebSocket) -> None:
 
 
 async def _show(console: Console, socket: WebSocket) -> None:
-    """Send the live stream until its viewer leaves, may see it no more, or the console ends."""
+    """Send the live stream until its viewer leaves, loses the right to it, or the console ends."""
 
     async def follow() -> None:
-        # A viewer that has left is noticed below: a closed socket cannot be written to.
+        # A viewer that has left is detected below, because a closed socket cannot be written to.
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, OSError):
             await console.stream.follow(socket.send_bytes)
 
     async def end() -> None:
-        """Close the socket once its session or token has ended, also where nothing is sent."""
+        """Close the socket once its session or token has ended, even if nothing is being sent."""
         while await _still_known(console, socket):
             await asyncio.sleep(TRUSTED)
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, OSError):
@@ -249,7 +249,7 @@ async def _show(console: Console, socket: WebSocket) -> None:
 
 
 async def _still_known(console: Console, socket: WebSocket) -> bool:
-    """Whether a viewer may watch on; whoever was admitted may while the store cannot say."""
+    """Whether a viewer may continue; if the store does not respond, admitted viewers may."""
     try:
         return await find_caller(console, socket) is not None
     except HeliotropeError:

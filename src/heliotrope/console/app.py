@@ -48,7 +48,7 @@ ABOUT = (
 ROUTERS = (api.router, accounts.router, factor.router)
 #: Address of the one-time link.
 ENTER = "/enter"
-#: Errors of a request that the answer lists, and their longest texts, characters.
+#: Number of errors that the response to a request lists, and their longest texts, characters.
 MOST_ERRORS, LONGEST_TEXT, LONGEST_WORD = 5, 200, 64
 
 
@@ -58,7 +58,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     Parameters
     ----------
     plant
-        The plant at work, in its own process.
+        The running plant, in its own process.
     settings
         Settings of the console.
     """
@@ -68,7 +68,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
 
     async def read(used: list[str]) -> dict[Key, Session | ApiToken]:
         found = await plant.valid(used)
-        # Whoever is signed in has a place there, also after a new start of this process.
+        # Whoever is signed in has a place there, even after a restart of this process.
         for one in found.values():
             if isinstance(one, Session):
                 attempts.meet(one.name, network_of(one.note))
@@ -114,7 +114,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
         app.add_exception_handler(kind, _problem(status))
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_middleware(Files)
-    # The middleware added last comes first.
+    # The middleware added last is called first.
     app.add_middleware(Guard, console=lambda: console, routes=_routes(), edge=app.state.edge)
     _pages(app)
     return app
@@ -130,7 +130,7 @@ def _problem(status: int) -> Callable[[Request, Exception], Response]:
 
 
 def _invalid(request: Request, error: Exception) -> Response:
-    """Return the errors of a request, without its contents."""
+    """Return the errors of a request, without the content of the request."""
     del request
     assert isinstance(error, RequestValidationError)
     errors = [
@@ -153,7 +153,7 @@ def _routes() -> Routes:
 
 
 def _pages(app: FastAPI) -> None:
-    """Add the pages; the guard admits only those who may see them."""
+    """Add the pages; the guard admits only callers who may see them."""
     texts = {path: page(name) for path, name in PAGES.items()}
 
     async def show(request: Request) -> Response:

@@ -34,17 +34,17 @@ from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.people import Account, ApiToken, Session
 
 T = TypeVar("T")
-#: The shared answer that never changes.
+#: The shared response that never changes.
 FIXED = "field"
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 _API = "/api/v1"
-#: What a person may do who owes something: stop the field, see who they are, and leave.
+#: What a person with something outstanding may do: stop the field, see who they are, and leave.
 #: `commands` lets STOW and DEFOCUS pass.
 _ALWAYS = frozenset(
     {("POST", f"{_API}/{path}") for path in ("emergency", "stow", "defocus", "commands")}
     | {(method, f"{_API}/session") for method in ("GET", "HEAD", "DELETE")}
 )
-#: What a person may owe: what to do about it, and the requests that settle it.
+#: What may be outstanding for a person: what to do about it, and the requests that settle it.
 DUES: dict[str, tuple[str, frozenset[tuple[str, str]]]] = {
     "password": ("change your password first", frozenset({("PUT", f"{_API}/session/password")})),
     "factor": (
@@ -52,10 +52,10 @@ DUES: dict[str, tuple[str, frozenset[tuple[str, str]]]] = {
         frozenset({("POST", f"{_API}/session/factor"), ("PUT", f"{_API}/session/factor")}),
     ),
 }
-#: What a page sends by itself, or what gives command back: no sign that a person is there, and
-#: nothing that needs one.
+#: Requests that a page sends by itself, or that return the authority; they neither show nor require
+#: that a person is present.
 _BY_ITSELF = frozenset({("PUT", f"{_API}/authority"), ("DELETE", f"{_API}/authority")})
-#: Settles that a person has been away.
+#: The request that confirms a person's presence after an absence.
 _THERE = ("PUT", f"{_API}/session/presence")
 
 
@@ -70,30 +70,31 @@ class Console:
     attempts: SignInFailures
     roster: Roster[Session | ApiToken]
     presence: Presence
-    #: Turns for checks of passwords.
+    #: Queue for password checks.
     hashing: Hashing = field(default_factory=Hashing)
 
-    #: How a trusted proxy names people; None: it does not.
+    #: How a trusted proxy identifies users; None: it does not.
     by_proxy: ByProxy | None = None
 
     #: Number of heliostats; 0 before it is known, see `heliostats`.
     size: int = 0
 
-    #: Threads that wait for the store, which the plant's process has.
+    #: Threads that wait for the store, which is in the plant's process.
     threads: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(4, "console store")
     )
 
-    #: Counts the security events that are not sent to the plant one by one.
+    #: Counts the security events that are not sent to the plant individually.
     counter: EventCounter = field(default_factory=EventCounter)
 
-    #: Answers that all viewers ask for, with the time: made at most twice a second.
+    #: Responses that all viewers request, with their time; created at most twice a second.
     shared: dict[str, tuple[float, bytes, bytes | None]] = field(default_factory=dict)
 
     async def forget_expired(self) -> None:
         """Remove expired sessions and tokens from the store, and record that they have ended.
 
-        Sessions end by the machine's time. Security events that were only counted are recorded too.
+        Sessions end by the computer's time. Security events that were only counted are recorded
+        too.
         """
         while True:
             for kind, name, more in self.counter.sums(time.monotonic()):
@@ -101,7 +102,7 @@ class Console:
                     await self.plant.note(kind, name, more=more)
                 except HeliotropeError:
                     self.counter.count(kind, name, time.monotonic(), more)
-            with contextlib.suppress(HeliotropeError):  # others report a full store
+            with contextlib.suppress(HeliotropeError):  # other parts report a full store
                 for expired in await self.ask(lambda: self.people.forget_expired(self.now())):
                     ended = (
                         SecurityEvent.TOKEN_ENDED if expired.token else SecurityEvent.SESSION_ENDED
@@ -114,21 +115,21 @@ class Console:
     ) -> None:
         """Record a security event that a request has caused.
 
-        A flood must not cost the plant a call for each: events are counted here as there, and
-        `forget_expired` sends the sums.
+        A flood must not cost the plant one call per event, so events are counted here as in the
+        plant, and `forget_expired` sends the totals.
         """
         if self.counter.admits(kind, who, time.monotonic()):
             address = self.address(connection)
             nearest = connection.client.host if connection.client else ""
-            # What a proxy says of an address is no more certain than the proxy.
+            # An address stated by a proxy is no more certain than the proxy itself.
             origin = address if address == nearest else f"{address} via {nearest}"
             await self.plant.note(kind, who, origin, plain(detail))
 
     def address(self, connection: HTTPConnection) -> str:
-        """Return the address that a request comes from, see `address_of`.
+        """Return the address from which a request comes, see `address_of`.
 
-        Where the proxy has a secret, what a request without it says of an address is not believed:
-        other programs on the proxy's machine send some too.
+        If the proxy has a secret, a request without it is not believed about its address, because
+        other programs on the proxy's computer also send requests.
         """
         if self.by_proxy is not None and not self.by_proxy.sends(connection.headers):
             return connection.client.host if connection.client else ""
@@ -148,19 +149,19 @@ class Console:
             self.shared[FIXED] = fixed
 
     async def ask(self, work: Callable[[], T]) -> T:
-        """Return the result of work of the store, done in a thread: its disk may be slow.
+        """Return the result of work in the store, run in a thread because its disk may be slow.
 
-        The threads have no other work: those that hang must not take the place of others.
+        The threads have no other work, so those that hang do not block anything else.
         """
         return await asyncio.get_running_loop().run_in_executor(self.threads, work)
 
     @property
     def emergency_port(self) -> int:
-        """Port of the way for EMERGENCY alone; 0: none."""
+        """Port of the path for EMERGENCY alone; 0: none."""
         return self.settings.emergency_port or 0
 
     def now(self) -> float:
-        """Return the machine's time, POSIX s: sessions end by it, whatever the plant's time."""
+        """Return the computer's time, POSIX s, by which sessions end, whatever the plant's time."""
         return time.time()
 
 
@@ -171,7 +172,7 @@ class Caller:
     Attributes
     ----------
     person
-        With the role that applies now.
+        Person with the role that applies now.
     by
         "session" or "token".
     secret
@@ -179,7 +180,7 @@ class Caller:
     expires
         POSIX s; None for never.
     owes
-        What the person must do before anything else, see `DUES`; "" for nothing.
+        What the person must do before anything else, see `DUES`; "" if there is nothing.
     factor
         Whether the account has a second factor.
     by_proxy
@@ -196,17 +197,17 @@ class Caller:
     factor: bool = False
     by_proxy: bool = False
     no_password: bool = False
-    #: Whether this order needs the password again, see `presence`.
+    #: Whether this order requires the password again, see `presence`.
     away: bool = False
 
     @property
     def csrf(self) -> str:
-        """The word that must be sent with every change; "" for a token."""
+        """The token that must be sent with every change; "" for an API token."""
         return _words.csrf_of(self.secret) if self.by == "session" else ""
 
 
 async def app_console(connection: HTTPConnection) -> Console:
-    """Return the console of an application, in the loop: a thread would cost more."""
+    """Return the console of an application, in the event loop because a thread would cost more."""
     return console_of(connection)
 
 
@@ -221,13 +222,13 @@ AppConsole = Annotated[Console, Depends(app_console)]
 async def find_caller(console: Console, connection: HTTPConnection) -> Caller | None:
     """Return the caller, None if unknown or no longer valid.
 
-    EMERGENCY accepts a caller known recently: it must not wait for a store that is slow or
-    gone.
+    EMERGENCY accepts a recently known caller, because it must not wait for a store that is slow or
+    unavailable.
 
     Raises
     ------
     HeliotropeError
-        If the store cannot say.
+        If the store does not respond.
     """
     presented = secret_of(console.settings, connection)
     if presented is None:
@@ -245,7 +246,7 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
 
 
 def introduced(console: Console, connection: HTTPConnection) -> Introduced | None:
-    """Return the person whom a trusted proxy names; None if there is no proxy, or nobody."""
+    """Return the person whom a trusted proxy identifies; None if there is no proxy or no person."""
     address = connection.client.host if connection.client else ""
     if console.by_proxy is None or address not in console.settings.proxies:
         return None
@@ -253,7 +254,7 @@ def introduced(console: Console, connection: HTTPConnection) -> Introduced | Non
 
 
 def _as_introduced(console: Console, connection: HTTPConnection, who: Caller) -> bool:
-    """Whether a session is that of the person whom the proxy names now, with that role."""
+    """Whether a session belongs to the person whom the proxy now identifies, with that role."""
     if who.by != "session":
         return True
     person = introduced(console, connection)
@@ -265,7 +266,7 @@ def _as_introduced(console: Console, connection: HTTPConnection, who: Caller) ->
 def signed_in(console: Console, account: Account | Session, secret: str, expires: float) -> Caller:
     """Return the caller of a session."""
     person, least = person_of(account.name, account.role), console.settings.second_factor
-    has_one = account.factor or account.by_proxy  # theirs is the proxy's business
+    has_one = account.factor or account.by_proxy  # for them this is up to the proxy
     needs_factor = bool(least) and person.role >= ROLES[least] and not has_one
     owes = "password" if account.password_due else "factor" if needs_factor else ""
     return Caller(
@@ -315,7 +316,7 @@ async def caller(connection: HTTPConnection, console: AppConsole) -> Caller:
         raise HTTPException(401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
     changes = connection.scope.get("method", "GET") not in SAFE_METHODS
     if changes:
-        # A caller that makes a change must see it.
+        # A caller that makes a change must see its effect.
         console.forget()
     if who.by == "session" and changes:
         word = connection.headers.get("x-csrf-token", "")
@@ -329,9 +330,10 @@ async def caller(connection: HTTPConnection, console: AppConsole) -> Caller:
 
 
 def _attended(console: Console, connection: HTTPConnection, who: Caller) -> Caller:
-    """Return the caller of a session, away or not; whoever is there counts as seen."""
+    """Return the caller of a session, away or not; a caller who is present counts as seen."""
     request = (connection.scope.get("method", "GET"), connection.scope["path"])
-    # Those without a password here cannot give it again; the proxy asks them in its own time.
+    # Users without a password here cannot enter it again; the proxy authenticates them at its own
+    # intervals.
     if request in _BY_ITSELF or who.by_proxy or who.no_password:
         return who
     if console.presence.away(who.secret):
@@ -341,12 +343,12 @@ def _attended(console: Console, connection: HTTPConnection, who: Caller) -> Call
 
 
 def settle(who: Caller, connection: HTTPConnection) -> None:
-    """Admit a caller who is there and owes nothing, or whose request settles it.
+    """Admit a caller who is present with nothing outstanding, or whose request settles it.
 
     Raises
     ------
     HTTPException
-        423 for a person who must confirm that they are there; 403 for any other request.
+        423 for a person who must confirm their presence; 403 for any other request.
     """
     if who.away:
         raise HTTPException(
@@ -377,7 +379,7 @@ async def refused(console: Console, connection: HTTPConnection, who: Caller) -> 
 
 @dataclass(frozen=True)
 class AtLeast:
-    """A dependency that admits only a role or higher; the guard asks it before it reads a body."""
+    """A dependency that admits only a minimum role; the guard evaluates it before the body."""
 
     role: Role
 

@@ -13,12 +13,12 @@ from heliotrope.safety import Alarm
 
 
 class ConsoleProcesses:
-    """Starts both processes, watches them, and starts each again without the other.
+    """Starts both processes, monitors them, and restarts each independently of the other.
 
     Parameters
     ----------
     interface, on_alarm, on_address, patience
-        As for `ConsoleProcess`.
+        As in `ConsoleProcess`.
     settings
         Settings of the console.
 
@@ -53,7 +53,7 @@ class ConsoleProcesses:
 
     @property
     def settings(self) -> ConsoleSettings:
-        """The settings, with the ports that are used once a process has begun."""
+        """The settings, with the actual ports once a process has started."""
         return self._listeners.settings
 
     async def run(self) -> None:

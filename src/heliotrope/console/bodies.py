@@ -12,27 +12,28 @@ from heliotrope.errors import InputError
 
 #: Deepest nesting of JSON; requests of the API need three levels.
 DEEPEST = 16
-#: Most values in a body: points of 200,000 heliostats, a name and three numbers each.
+#: Maximum number of values in a body: points of 200,000 heliostats, with a name and three numbers
+#: each.
 MOST_VALUES = 1_000_000
-#: Most escaped characters in a body.
+#: Maximum number of escaped characters in a body.
 _MOST_ESCAPES = 500_000
 #: A larger body is checked in a thread, bytes.
 _SMALL = 1 << 16
-#: A refused request is answered when its sender pauses for so long, s.
+#: A refused request is answered when its sender pauses for this long, s.
 _PAUSE = 1.0
 _ESCAPED = re.compile(rb"\\.", re.DOTALL)
 _OTHER = bytes(sorted(set(range(256)) - set(b"[]{}")))
 
 
 class Incoming:
-    """A `receive` that knows whether the body of its request has come to its end.
+    """A `receive` that knows whether the body of its request has ended.
 
     Parameters
     ----------
     receive
-        The server's.
+        The server's ``receive``.
     headers
-        Of the request.
+        Headers of the request.
     """
 
     def __init__(self, receive: Receive, headers: Headers) -> None:
@@ -46,12 +47,12 @@ class Incoming:
         return message
 
     async def discard(self, most: int) -> None:
-        """Read what is left of the body and forget it, unless it is announced as longer than this.
+        """Read and discard the rest of the body, unless its announced length exceeds ``most``.
 
-        A server that answers and closes while its client still sends makes the client's system
-        forget the answer: the client is told that the connection was reset, instead of why it was
-        refused. A sender that pauses for longer than a second is not waited for, and one that
-        waits for leave to send its body (Expect) is not asked for it.
+        If a server responds and closes while its client is still sending, the client's system
+        discards the response, and the client sees a reset connection instead of the reason for the
+        refusal. A sender that pauses for longer than a second is not waited for, and a sender that
+        waits for permission to send its body (Expect) is not given it.
         """
         length = _length(self._headers)
         if length is None or length > most or "expect" in self._headers:
@@ -63,9 +64,9 @@ class Incoming:
 
 
 async def read_body(receive: Receive, most: int) -> bytes | None:
-    """Return the whole body of a request; None if its sender has left or sends more than `most`.
+    """Return the complete body of a request; None if its sender left or sends more than `most`.
 
-    The time limit is that of the connection, which is closed when it is over.
+    The time limit is that of the connection, which is closed when the limit expires.
     """
     body = bytearray()
     while True:
@@ -90,13 +91,13 @@ def length_of(headers: Headers, most: int) -> int:
 
 
 def _length(headers: Headers) -> int | None:
-    """Return the announced length of a body, bytes, 0 without one; None if it is no such number."""
+    """Return the announced length of a body, bytes, 0 without one; None if it is no number."""
     length = headers.get("content-length", "0")
     return int(length) if length.isascii() and length.isdigit() and len(length) < 20 else None
 
 
 def replayed(body: bytes, receive: Receive) -> Receive:
-    """Return a `receive` that gives a body which was read already."""
+    """Return a `receive` that delivers a body which has already been read."""
     delivered = False
 
     async def again() -> Message:
@@ -110,7 +111,7 @@ def replayed(body: bytes, receive: Receive) -> Receive:
 
 
 async def check(body: bytes) -> None:
-    """Check the shape of a JSON body; see `check_json`."""
+    """Check the structure of a JSON body; see `check_json`."""
     if len(body) > _SMALL:
         await asyncio.to_thread(check_json, body)
     else:
@@ -118,12 +119,12 @@ async def check(body: bytes) -> None:
 
 
 def check_json(body: bytes) -> None:
-    """Check depth and number of values of JSON, in a time proportional to its length.
+    """Check the depth and the number of values of JSON, in time proportional to its length.
 
     Raises
     ------
     InputError
-        Too deep, or too many values.
+        If it is too deep, or has too many values.
     """
     if body.count(b"\\") > 2 * _MOST_ESCAPES or body.count(b'"') > 2 * MOST_VALUES:
         raise InputError(f"the body has more than {MOST_VALUES} values")

@@ -22,7 +22,7 @@ from heliotrope.store.people import BY_PROXY, ROLES, Account
 
 _Header = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9-]{0,63}$")]
 _Role = Annotated[str, Field(pattern=f"^({'|'.join(ROLES)})$")]
-#: Shortest secret, characters, and largest file that has it, bytes.
+#: Minimum length of the secret, characters, and maximum size of its file, bytes.
 _SHORTEST, _LARGEST = 32, 4096
 
 
@@ -41,7 +41,7 @@ class _ProxyFile(BaseModel):
 
 @dataclass(frozen=True)
 class Introduced:
-    """A person as the proxy names them, and the highest role of their groups; "" for none."""
+    """A person as identified by the proxy, and the highest role of their groups; "" for none."""
 
     name: str
     role: str
@@ -49,7 +49,7 @@ class Introduced:
 
 @dataclass(frozen=True)
 class ByProxy:
-    """How a trusted proxy names people.
+    """How a trusted proxy identifies users.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class ByProxy:
     roles
         Role by group.
     separator
-        Between groups; a group whose name has it is taken for two.
+        Separator between groups; a group whose name contains it counts as two.
     """
 
     person: str
@@ -72,12 +72,12 @@ class ByProxy:
 
     @classmethod
     def read(cls, path: Path) -> "ByProxy":
-        """Return the content of a file and of its secret's.
+        """Return the content of a file and of its secret file.
 
         Raises
         ------
         FormatError
-            If one cannot be used, or others may read the secret.
+            If one of them cannot be used, or others may read the secret.
         """
         document = read_document(path, "proxy", _ProxyFile, (_ProxyFile,))
         place = path.parent / document.secret_file
@@ -92,7 +92,7 @@ class ByProxy:
         return cls(*names, word, document.roles, document.separator)
 
     def sends(self, headers: Headers) -> bool:
-        """Whether the proxy has sent a request: it has the secret."""
+        """Whether the proxy has sent a request, which then carries the secret."""
         return hmac.compare_digest(headers.get(self.secret, "").encode(), self.word.encode())
 
     def introduced(self, headers: Headers) -> Introduced | None:
@@ -115,12 +115,12 @@ def _text(header: str) -> str:
 
 
 def check_account(who: Introduced, account: Account | None) -> None:
-    """Check that a person whom the proxy names may enter.
+    """Check that a person whom the proxy identifies may enter.
 
     Raises
     ------
     HTTPException
-        403 if no group gives a role, or the account has a password of its own, or is disabled.
+        403 if no group grants a role, or the account has its own password or is disabled.
     """
     if not who.role:
         raise HTTPException(403, f"{who.name}: none of your groups has a role here")

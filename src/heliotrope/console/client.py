@@ -8,7 +8,7 @@ import httpx
 
 from heliotrope.console.stream import LiveMessage, RemoteError, read_message
 
-#: Address of the console on this machine.
+#: Address of the console on this computer.
 HERE = "http://127.0.0.1:8080/"
 
 
@@ -81,7 +81,7 @@ class Client:
     def command(
         self, name: str, heliostats: Sequence[str] = (), values: Sequence[float] = ()
     ) -> Any:
-        """Give a command; return its state, see `TicketState`."""
+        """Send a command; return its state, see `TicketState`."""
         order = {"command": name, "heliostats": list(heliostats), "values": list(values)}
         return self.ask("POST", "commands", order)
 

@@ -26,25 +26,26 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from heliotrope.links.tls import TlsSource, context_of
 
 logger = logging.getLogger("heliotrope.console")
-#: Descriptors asked of the system, and those kept for files, the plant and the store.
+#: Number of descriptors requested from the system, and number reserved for files, the plant and the
+#: store.
 WANTED, RESERVE = 16_384, 128
-#: Connections accepted in one turn of the loop.
+#: Number of connections accepted in one turn of the event loop.
 _BURST = 32
-#: Time between two looks at the deadlines, and pause after a failure to accept, s.
+#: Interval between checks of the deadlines, and pause after a failure to accept, s.
 _LOOK, _PAUSE = 0.25, 0.25
-#: Least time between two looks for places that have become free, s.
+#: Minimum interval between two searches for free places, s.
 _SOON = 0.02
-#: Least rate of a known caller's body, bytes/s.
+#: Minimum rate of a known caller's body, bytes/s.
 _SLOWEST = 200_000.0
 _FULL = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
-#: Key of the caller in the scope of a request: each is looked up once.
+#: Key of the caller in the scope of a request, so that each caller is looked up once.
 FOUND = "heliotrope.caller"
 Key = tuple[Any, int]
 Protocols = Callable[[], asyncio.Protocol]
 
 
 class Stage(IntEnum):
-    """How far a connection is."""
+    """Stage of a connection."""
 
     HANDSHAKE = 0
     HEADER = 1
@@ -60,12 +61,12 @@ class Limits:
     Attributes
     ----------
     most
-        Connections.
+        Maximum number of connections.
     strangers, address
-        Those of strangers, and of strangers from one address.
+        Maximum number of connections of strangers, and of strangers from one address.
     handshake, header, body, idle, answer
         Time that a stranger's connection may spend in each stage, s. A known caller's body has the
-        time that its length needs.
+        time that its length requires.
     idle_known, answer_known
         The same for a connection of a known caller, s.
     """
@@ -82,7 +83,7 @@ class Limits:
     answer_known: float = 120.0
 
     def within(self, most: int) -> "Limits":
-        """Return the same limits with at most this many connections."""
+        """Return the same limits, with at most this many connections."""
         if most >= self.most:
             return self
         share = max(8, most) / self.most
@@ -99,11 +100,12 @@ class Connection:
     Attributes
     ----------
     address
-        Of the other side.
+        Address of the other end.
     stage, since
         Stage, and when it began, s.
     held
-        Since when it has held its place without progress, s; the end of a handshake is no progress.
+        Time since which it has held its place without progress, s; the end of a handshake is not
+        progress.
     known
         When a request of a known caller was last completed, s; None for a stranger.
     transport
@@ -126,7 +128,7 @@ class Connection:
 
     @property
     def present(self) -> bool:
-        """Whether a request of a known caller is at work."""
+        """Whether a request of a known caller is in progress."""
         return self.scope is not None and self.scope.get(FOUND) is not None
 
     def enter(self, stage: Stage, now: float) -> None:
@@ -146,7 +148,7 @@ class Connection:
         """Whether its stage has taken too long."""
         socket_open = self.scope is not None and self.scope["type"] == "websocket"
         if socket_open and self.present:
-            return False  # the server's pings watch it
+            return False  # the server's pings monitor it
         if self.known is None and not self.present:
             most = getattr(limits, self.stage.name.lower())
         elif self.stage is Stage.BODY:
@@ -164,14 +166,14 @@ class Listener:
     line
         Listening socket.
     app
-        The application for its requests.
+        Application that handles its requests.
     limits
         Limits of its connections.
     shared
-        Addresses behind which there are many callers: this machine, proxies. They have the places
-        of all strangers.
+        Addresses behind which there are many callers, such as this computer and proxies. They may
+        use the places of all strangers.
     monotonic
-        Returns the time, s.
+        Function that returns the time, s.
     """
 
     def __init__(
@@ -200,7 +202,7 @@ class Listener:
 
             def accept() -> None:
                 if not self._accept(loop, group, protocol, tls):
-                    # Accepting again at once would fail again, thousands of times a second.
+                    # Another attempt at once would fail again, thousands of times a second.
                     loop.remove_reader(line)
                     loop.call_later(_PAUSE, resume)
 
@@ -222,7 +224,7 @@ class Listener:
         self.sockets[0].close()
 
     async def wait_closed(self) -> None:
-        """Do nothing: the server waits for its connections by itself."""
+        """Do nothing, because the server itself waits for its connections."""
 
     def _accept(
         self,
@@ -231,7 +233,7 @@ class Listener:
         protocol: Protocols,
         tls: TlsSource,
     ) -> bool:
-        """Accept what waits; return whether the system had the means."""
+        """Accept waiting connections; return whether the system had the resources."""
         for _ in range(_BURST):
             try:
                 line, peer = self.sockets[0].accept()
@@ -259,8 +261,8 @@ class Listener:
         protocol: Protocols,
         tls: TlsSource,
     ) -> None:
-        """Shake hands with a new connection."""
-        limit = 10.0 * self.limits.handshake if tls is not None else None  # `look` is earlier
+        """Perform the handshake of a new connection."""
+        limit = 10.0 * self.limits.handshake if tls is not None else None  # `look` acts earlier
         try:
             made, _ = await loop.connect_accepted_socket(
                 protocol, connection.line, ssl=context_of(tls), ssl_handshake_timeout=limit
@@ -271,7 +273,7 @@ class Listener:
         connection.enter(Stage.HEADER, self._now())
 
     def _make_room(self, address: str) -> None:
-        """Close the connection whose place a new one gets, if the limits are reached."""
+        """Close the connection whose place a new connection gets, if the limits are reached."""
         fewest = min(self.limits.address, self.limits.strangers)
         if len(self._strangers) >= fewest or len(self) >= self.limits.most:
             self._sort()
@@ -289,7 +291,7 @@ class Listener:
             self._evict(self._strangers or self._known)
 
     def _evict(self, among: dict[Key, Connection]) -> None:
-        """Close the connection that has longest not completed a request of a known caller."""
+        """Close the connection that has gone longest without a known caller's complete request."""
         if not among:
             return
         key = min(among, key=lambda key: _rank(among[key]))
@@ -299,13 +301,13 @@ class Listener:
         connection.abort()
 
     def look(self, stalled: float = 0.0) -> None:
-        """Close connections that are late, and forget those that are gone.
+        """Close overdue connections, and forget those that have gone.
 
         Parameters
         ----------
         stalled
-            Time that the loop has just lost, s. Nothing was read meanwhile, so no caller is the
-            later for it.
+            Time that the event loop has just lost, s. Nothing was read in that time, so it does not
+            count against any caller.
         """
         self._sorted = -1.0
         self._sort()
@@ -319,7 +321,7 @@ class Listener:
                 kept.pop(key).abort()
 
     def _sort(self) -> None:
-        """Forget connections that are gone; those that a known caller uses are not strangers'."""
+        """Forget connections that have gone; move those that a known caller now uses."""
         now = self._now()
         if now - self._sorted < _SOON:
             return
@@ -361,7 +363,7 @@ def _close_unopened(connection: Connection, task: "asyncio.Task[None]") -> None:
 
 
 def _rank(connection: Connection) -> tuple[bool, float, int, float]:
-    """Return the order in which connections are closed: first those that wait for a request."""
+    """Return the order in which connections are closed: first those that await a request."""
     return (
         connection.present,
         connection.known or 0.0,
@@ -371,7 +373,7 @@ def _rank(connection: Connection) -> tuple[bool, float, int, float]:
 
 
 class Doors:
-    """The application in front of a listener's, which notes how far each request is.
+    """The wrapper around a listener's application, which notes the progress of each request.
 
     Parameters
     ----------
@@ -400,7 +402,7 @@ class Doors:
 
 
 def raise_descriptors() -> int:
-    """Raise the number of descriptors that this process may open; return how many are left."""
+    """Raise the number of descriptors that this process may open; return how many are available."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     limit = WANTED if hard == resource.RLIM_INFINITY else min(WANTED, hard)
     if soft != resource.RLIM_INFINITY and soft < limit:

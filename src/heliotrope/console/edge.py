@@ -12,9 +12,9 @@ from heliotrope.console.auth import Caller, Console, find_caller
 from heliotrope.console.headers import STRANGER, STRANGERS, network_of
 from heliotrope.local import Buckets
 
-#: Requests of one person; 1/s, and at once.
+#: Request limit of one person: rate, 1/s, and burst.
 KNOWN = (200.0, 1000.0)
-#: Large bodies at the same time: from all, and of one person.
+#: Number of large bodies at the same time: from all, and from one person.
 MOST_LARGE, OWN_LARGE = 4, 1
 
 
@@ -24,7 +24,7 @@ class Edge:
     Parameters
     ----------
     monotonic
-        Returns the time, s.
+        Function that returns the time, s.
     """
 
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -36,13 +36,13 @@ class Edge:
     async def find(self, console: Console, connection: HTTPConnection) -> Caller | None:
         """Return the caller, None for a stranger.
 
-        A known caller's request never counts with those of strangers, and what strangers send
-        from an address where somebody has signed in never with those from elsewhere.
+        A known caller's request never counts as a stranger's. Requests of strangers from an address
+        where someone has signed in never count with those from other addresses.
 
         Raises
         ------
         HTTPException
-            429 if requests come too often.
+            429 if there are too many requests.
         """
         who = await find_caller(console, connection)
         if who is None:
@@ -58,7 +58,7 @@ class Edge:
         Raises
         ------
         HTTPException
-            429 if requests come too often.
+            429 if there are too many requests.
         """
         _refuse(self._known.take(who.person.name))
 
@@ -69,7 +69,7 @@ class Edge:
         Raises
         ------
         HTTPException
-            429 if all are taken.
+            429 if all places are taken.
         """
         key = who.person.name
         if len(self._large) >= MOST_LARGE or self._large.count(key) >= OWN_LARGE:

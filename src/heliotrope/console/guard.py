@@ -24,13 +24,13 @@ from heliotrope.console.routes import FORM, LARGEST, TINY, RouteMatch, Routes
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.plant.operations.security import SecurityEvent
 
-#: Nothing from other origins, nothing inline.
+#: Content security policy: nothing from other origins, and nothing inline.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; font-src 'self'; form-action 'self'; base-uri 'none'; "
     "frame-ancestors 'none'"
 )
-#: The live stream answers strangers itself: the page reads its close code.
+#: The live stream refuses strangers itself, because the page reads its close code.
 LIVE = "/api/v1/live"
 
 
@@ -42,11 +42,11 @@ class Guard:
     app
         Application behind it.
     console
-        Returns the console.
+        Function that returns the console.
     routes
-        Its routes.
+        Routes of the application.
     edge
-        Counts the requests.
+        Limits on the requests.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Guard:
         except HTTPException as refusal:
             await _refuse(refusal, scope, incoming, reply)
         except HeliotropeError as error:
-            # The store cannot be read, so that nobody is known.
+            # The store cannot be read, so no caller can be identified.
             await _refuse(HTTPException(503, str(error)), scope, incoming, reply)
 
     async def _admit(self, console: Console, scope: Scope, receive: Receive, send: Send) -> None:
@@ -108,7 +108,7 @@ class Guard:
             return
         length = bodies.length_of(headers, route.largest)
         if length > FORM:
-            # What is longer than names and points of the whole field would only cost time.
+            # A body longer than the names and points of the whole field would only cost time.
             length = bodies.length_of(
                 headers, FORM + route.per_heliostat * await console.heliostats()
             )
@@ -129,7 +129,7 @@ class Guard:
         if route.status == 200:
             return route
         if who is None:
-            # Strangers do not learn which addresses there are.
+            # Strangers do not learn which addresses exist.
             if scope["path"].startswith("/api/"):
                 raise HTTPException(401, "sign in, or send a valid token")
             raise HTTPException(404, "nothing is at this address")
@@ -157,7 +157,7 @@ class Guard:
 
 
 def _urgent(console: Console, scope: Scope) -> str:
-    """Return the origin of the way for EMERGENCY alone, as the page reaches it."""
+    """Return the origin of the path for EMERGENCY alone, as the page reaches it."""
     host = parts_of(f"//{Headers(scope=scope).get('host', '')}").hostname or ""
     if not console.emergency_port or not host_known(console.settings, host):
         return ""
@@ -175,7 +175,7 @@ async def _check_body(scope: Scope, body: bytes) -> None:
 
 
 def _elsewhere(path: str, who: Caller | None) -> str | None:
-    """Return the page to which a caller must go before the one that was asked for."""
+    """Return the page to which a caller must go before the requested one."""
     if path not in PAGES or path == "/emergency":
         return None
     if who is None or who.by != "session":
@@ -190,7 +190,7 @@ def _is_emergency(scope: Scope) -> bool:
 async def _refuse(
     refusal: HTTPException, scope: Scope, incoming: bodies.Incoming, send: Send
 ) -> None:
-    """Answer a refused request; close the connection if its body is long."""
+    """Respond to a refused request; close the connection if its body is long."""
     if scope["type"] == "websocket":
         await incoming()
         await send({"type": "websocket.close", "code": 4403})

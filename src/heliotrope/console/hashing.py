@@ -1,4 +1,4 @@
-"""Queue for password hashing, which is costly: a few at a time, and few that wait.
+"""Queue for password hashing, which is costly: few checks at a time, and few waiting.
 
 Users who sign in from where they have signed in before take precedence, and have places that
 strangers cannot take, so guesses with ever new addresses and names cannot lock them out. A client
@@ -13,20 +13,20 @@ from dataclasses import dataclass, field
 from heliotrope.console._attempts import Pair
 from heliotrope.errors import HeliotropeError
 
-#: Checks at a time: each takes 50 ms of a core and 64 MiB.
+#: Number of checks at a time; each takes 50 ms of a core and 64 MiB.
 AT_WORK = 2
-#: Checks that wait: of strangers, and of people who are known at their address.
+#: Number of waiting checks: of strangers, and of users known at their address.
 STRANGERS, KNOWN = 8, 32
-#: Of these, strangers from one address, and a known name.
+#: Of these, from strangers at one address, and for one known name.
 OF_ADDRESS, OF_NAME = 4, 4
 
 
 class CrowdError(HeliotropeError):
-    """Too many wait for a check of their password."""
+    """Too many callers are waiting for a password check."""
 
 
 class GoneError(HeliotropeError):
-    """Whoever waited for a check has left."""
+    """The caller who was waiting for a check has left."""
 
 
 @dataclass(eq=False)
@@ -45,7 +45,7 @@ class Hashing:
     Parameters
     ----------
     at_work
-        Checks at a time.
+        Number of checks at a time.
     """
 
     def __init__(self, at_work: int = AT_WORK) -> None:
@@ -61,18 +61,18 @@ class Hashing:
         Parameters
         ----------
         pair
-            Name and address of whoever asks.
+            Name and address of the caller.
         gone
-            Returns whether they have left.
+            Function that returns whether the caller has left.
         known
-            Whether they have signed in there before.
+            Whether the caller has signed in there before.
 
         Raises
         ------
         CrowdError
-            If too many wait.
+            If too many callers are waiting.
         GoneError
-            If they have left before their turn.
+            If the caller left before their turn.
         """
         if not self._free:
             await self._wait(_Place(pair, known, gone))
@@ -107,7 +107,7 @@ class Hashing:
             raise _left(place)
 
     def _full(self, place: _Place) -> bool:
-        """Whether nobody like this one may wait too."""
+        """Whether the queue is full for callers of this kind."""
         alike = [other.pair for other in self._waiting if other.known == place.known]
         name, address = place.pair
         if place.known:
@@ -115,7 +115,7 @@ class Hashing:
         return len(alike) >= STRANGERS or sum(one[1] == address for one in alike) >= OF_ADDRESS
 
     def _pass_on(self) -> None:
-        """Give a turn to the first known one that waits, else to the first stranger."""
+        """Give a turn to the first known caller in the queue, else to the first stranger."""
         place = min(self._waiting, key=lambda one: not one.known, default=None)
         if place is None:
             self._free += 1

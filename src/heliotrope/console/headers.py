@@ -8,31 +8,31 @@ from starlette.requests import HTTPConnection
 from heliotrope.console.settings import ConsoleSettings
 
 _COOKIE = "heliotrope_session"
-#: A longer word is no session's or token's secret, characters.
+#: A longer word cannot be the secret of a session or token, characters.
 LONGEST_SECRET = 200
-#: Requests of strangers: from one address, and from all; 1/s, and at once.
+#: Request limits of strangers, from one address and from all addresses: rate, 1/s, and burst.
 STRANGER, STRANGERS = (50.0, 200.0), (300.0, 600.0)
 
 
 def host_known(settings: ConsoleSettings, netloc: str) -> bool:
-    """Whether a request names this machine by a known name."""
+    """Whether a request addresses this computer by a known name."""
     host = netloc.rpartition(":")[0] if netloc.rpartition(":")[2].isdigit() else netloc
     return host.lower() in settings.hosts
 
 
 def parts_of(url: str) -> SplitResult:
-    """Return the parts of a URL that a caller wrote; they are empty where it is none."""
+    """Return the parts of a URL that a caller wrote; empty parts if it is not a URL."""
     try:
         return urlsplit(url)
-    except ValueError:  # as http://[
+    except ValueError:  # for example http://[
         return urlsplit("")
 
 
 def address_of(settings: ConsoleSettings, connection: HTTPConnection) -> str:
-    """Return the address that a request comes from: what a trusted proxy says, or the other end's.
+    """Return the client address of a request: from a trusted proxy's header, or the other end's.
 
-    Each proxy adds the address that it saw at the end of ``X-Forwarded-For``, so the last one that
-    is no proxy's counts; what a caller writes there itself stands before.
+    Each proxy appends the address that it saw to ``X-Forwarded-For``, so the last address that is
+    not a proxy's counts; whatever a caller writes there precedes it.
     """
     address = connection.client.host if connection.client else ""
     if address in settings.proxies:
@@ -47,7 +47,7 @@ def address_of(settings: ConsoleSettings, connection: HTTPConnection) -> str:
 
 
 def network_of(address: str) -> str:
-    """Return the address that is counted: of IPv6 the /64, of which one machine has all."""
+    """Return the address that is counted; for IPv6 the /64, which one computer may own."""
     try:
         ip = ipaddress.ip_address(address)
     except ValueError:
@@ -62,8 +62,8 @@ def network_of(address: str) -> str:
 def cookie_of(settings: ConsoleSettings) -> str:
     """Return the name of the session's cookie.
 
-    A browser takes ``__Host-`` from this host alone, by TLS: neither a program on another port nor
-    another machine of the domain can put one in its place.
+    A browser accepts ``__Host-`` only from this host over TLS, so neither a program on another port
+    nor another computer in the domain can replace it.
     """
     return f"__Host-{_COOKIE}" if settings.secure else _COOKIE
 
@@ -71,7 +71,7 @@ def cookie_of(settings: ConsoleSettings) -> str:
 def secret_of(settings: ConsoleSettings, connection: HTTPConnection) -> tuple[str, str] | None:
     """Return kind and secret of the caller's token or session, whether valid or not; None for none.
 
-    A request with a token is never taken for one of a session.
+    A request with a token never counts as a request of a session.
     """
     bearer = connection.headers.get("authorization", "")
     if bearer:

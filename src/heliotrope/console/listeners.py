@@ -11,12 +11,12 @@ from dataclasses import replace
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
 
-#: Connections that may wait in the system.
+#: Number of connections that may wait in the system.
 _BACKLOG = 2048
 
 
 class Listeners:
-    """The sockets of the page and of the way for EMERGENCY alone.
+    """The sockets of the page and of the path for EMERGENCY alone.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class Listeners:
     Attributes
     ----------
     settings
-        The same, with the ports that are used once `open` has found them.
+        The same, with the actual ports once `open` has found them.
     """
 
     def __init__(self, settings: ConsoleSettings) -> None:
@@ -35,7 +35,7 @@ class Listeners:
         self._sockets: tuple[socket.socket, socket.socket] | None = None
 
     def open(self) -> tuple[socket.socket, socket.socket]:
-        """Return the sockets, those of the first call; from any thread.
+        """Return the sockets, always those of the first call; any thread may call it.
 
         Raises
         ------
@@ -60,7 +60,7 @@ class Listeners:
         return page, emergency
 
     def _open_way(self, page: int) -> socket.socket:
-        """Open the next port, or a free one if that is taken; the one that was asked for."""
+        """Open the requested port; by default the next port, or a free one if that is taken."""
         host, chosen = self.settings.host, self.settings.emergency_port
         if chosen is not None:
             return _taken(host, chosen, "--emergency-port")
@@ -72,7 +72,7 @@ class Listeners:
         return listening(host, 0)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         with self._turn:
             for line in self._sockets or ():
                 line.close()

@@ -24,13 +24,14 @@ from heliotrope.plant.interface import BusyError, frame_of
 from heliotrope.plant.operations.views import FieldFrame
 from heliotrope.plant.orders.authority import Person, Role
 
-#: Flags that come and go with every step or sun vector, which would change every row.
+#: Flags that change with every step or sun vector, and would change every row.
 _RESTLESS = sum(1 << meanings.FLAGS.index(name) for name in ("MOVING", "SUN_FRESH"))
-#: Flag of drives that are switched off at the mirror: it confirms *out of service*.
+#: Flag of drives that are switched off at the heliostat, which confirms *out of service*.
 _SWITCHED_OFF = 1 << meanings.FLAGS.index("LOCAL_SWITCH")
 
 
-#: Streams of one person, and share of all places that is kept for operators and engineers.
+#: Number of streams of one person, and fraction of all places that is reserved for operators and
+#: engineers.
 OWN, RESERVED = 20, 0.2
 
 
@@ -48,16 +49,16 @@ def rows_of(frame: FieldFrame) -> npt.NDArray[Any]:
 
 
 class Stream:
-    """The maker of the messages, which wakes the waiting viewers for each.
+    """Creates the messages, and wakes the waiting viewers for each message.
 
     Parameters
     ----------
     plant
-        The plant at work.
+        The running plant.
     period
-        Time between messages, s.
+        Interval between messages, s.
     most
-        Viewers at once.
+        Maximum number of simultaneous viewers.
     """
 
     def __init__(self, plant: RemotePlant, period: float = 1.0, most: int = 200) -> None:
@@ -67,13 +68,13 @@ class Stream:
         self._whole = b""
         self.news = b""
         self.tick = 0
-        #: Streams of each person.
+        #: Number of streams of each person.
         self._places = Counter[str]()
         self._turned, self._making = asyncio.Event(), asyncio.Lock()
         self._problem: str = ""
 
     async def run(self) -> None:
-        """Make a message each period while anybody is watching."""
+        """Create a message each period while anyone is watching."""
         due = time.monotonic()
         while True:
             await asyncio.sleep(0.1 * self._period)
@@ -84,12 +85,12 @@ class Stream:
                 await self.make()
 
     async def make(self) -> None:
-        """Make the next message."""
+        """Create the next message."""
         async with self._making:
             try:
                 value, blob = await self._plant.fetch("live")
             except HeliotropeError as error:
-                # A plant that cannot be read is not shown: the page judges by the age of the last
+                # A plant that cannot be read is not shown; the page judges by the age of the last
                 # message.
                 self._problem = str(error)
                 return
@@ -98,7 +99,8 @@ class Stream:
     def _take(self, value: dict[str, Any], blob: bytes) -> None:
         rows, header = rows_of(frame_of(value["frame"], blob)), value["overview"]
         self.tick += 1
-        # A viewer that joins now may get this one as the whole; it is encoded only if one does.
+        # A viewer that joins now may get this message as the whole field, which is encoded only if
+        # needed.
         header["tick"], header["problem"] = self.tick, self._problem
         news = rows if self._rows is None else changed(self._rows, rows)
         self.news = message({**header, "whole": self._rows is None}, news)
@@ -121,7 +123,7 @@ class Stream:
         Raises
         ------
         BusyError
-            If the person has as many as one may have, or all that they may take are taken.
+            If the person has the maximum number of places, or all places open to them are taken.
         """
         most = self._most if who.role >= Role.OPERATOR else round(self._most * (1.0 - RESERVED))
         if self._places[who.name] >= OWN:

@@ -10,7 +10,7 @@ from typing import Any
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-#: Bytes that a viewer may send at once, and in each second of its connection.
+#: Number of bytes that a viewer may send at once, and per second of its connection.
 AT_ONCE, A_SECOND = 4096, 100.0
 
 
@@ -22,7 +22,7 @@ class OneWaySocket(WebSocketsSansIOProtocol):
         self._opened, self._received = time.monotonic(), -1
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes from the viewer; the first are the request, which the server has read."""
+        """Accept bytes from the viewer; the first are the request, already read by the server."""
         if self._received < 0:
             self._received = 0
         else:

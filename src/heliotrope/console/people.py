@@ -21,7 +21,7 @@ def first_start(people: People, now: float) -> str | None:
 
     Returns
     -------
-    The account's password, to be printed once and changed at first use; None if its person has one.
+    The account's password, to be printed once and changed at first use; None if it already has one.
     """
     if not without_password(people, now):
         return None

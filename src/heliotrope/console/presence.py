@@ -8,7 +8,8 @@ count, because it renews the command authority every few seconds.
 from collections import OrderedDict
 from collections.abc import Callable
 
-#: Sessions that are remembered; the longest unused are dropped first, and count as new.
+#: Number of sessions that are remembered; the least recently used are dropped first, and then count
+#: as new.
 _MOST = 2000
 
 
@@ -18,9 +19,9 @@ class Presence:
     Parameters
     ----------
     idle_s
-        Time after which a person must confirm, s; 0: never.
+        Time after which a person must confirm their presence, s; 0: never.
     monotonic
-        Returns the time, s.
+        Function that returns the time, s.
     """
 
     def __init__(self, idle_s: float, monotonic: Callable[[], float]) -> None:
@@ -28,12 +29,12 @@ class Presence:
         self._last: OrderedDict[str, float] = OrderedDict()
 
     def away(self, secret: str) -> bool:
-        """Whether a session has ordered nothing for too long; a new one begins now."""
+        """Whether a session has ordered nothing for too long; an unknown session begins now."""
         now = self._now()
         return 0.0 < self._idle <= now - self._last.setdefault(secret, now)
 
     def seen(self, secret: str) -> None:
-        """Note that the person of a session is there."""
+        """Note that the person of a session is present."""
         self._last[secret] = self._now()
         self._last.move_to_end(secret)
         if len(self._last) > _MOST:

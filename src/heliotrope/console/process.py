@@ -23,15 +23,15 @@ from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import HeliotropeError
 from heliotrope.local import log_lines
 
-#: Time between two signs of life, s.
+#: Interval between two signs of life, s.
 BEAT = 1.0
-#: Time for the server to end, s.
+#: Time allowed for the server to end, s.
 _END = 1.0
 
 
 @dataclass(frozen=True)
 class ProcessInput:
-    """What a process is given: see the module."""
+    """The input of a process; see the docstring of this module."""
 
     folder: Path
     key: str
@@ -59,14 +59,14 @@ def main(work: Callable[[ProcessInput], Coroutine[Any, Any, None]], memory: int)
     Parameters
     ----------
     work
-        The work.
+        Coroutine function that does the work.
     memory
-        Most memory that the process may have, bytes: what others make it keep ends there, before
-        the plant or its machine has none left.
+        Maximum memory of the process, bytes. It bounds what others can make the process keep,
+        before the plant or its computer runs out of memory.
     """
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
-    # The plant stows its field after Ctrl-C, and people watch that here.
+    # The plant stows its field after Ctrl-C, and operators watch that on the page.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     log_lines.install()
     read = json.loads(sys.stdin.buffer.readline())
@@ -101,9 +101,9 @@ async def serve(
     server
         The server.
     connect
-        Keeps the connections to the plant up.
+        Maintains the connections to the plant.
     beat
-        Gives a sign of life, with the address of the server.
+        Function that sends a sign of life, with the address of the server.
     """
     loop = asyncio.get_running_loop()
     threading.Thread(target=_wait_for_the_end, args=(loop, server), daemon=True).start()
@@ -125,7 +125,7 @@ def _wait_for_the_end(loop: asyncio.AbstractEventLoop, server: Served) -> None:
 
 
 async def _beat(server: Served, beat: Callable[[str], Awaitable[Any]]) -> None:
-    """Give a sign of life every second, with the address."""
+    """Send a sign of life every second, with the address."""
     address = await server.address()
     while True:
         with contextlib.suppress(HeliotropeError):

@@ -17,7 +17,7 @@ from heliotrope.plant.orders.authority import Person
 from heliotrope.store.factors import Used
 from heliotrope.store.people import Account, ApiToken, Expired, Session
 
-#: Limit of an answer about people, s: the store may have to write.
+#: Timeout for replies about accounts, s, because the store may have to write.
 _STORE = 20.0
 
 
@@ -29,7 +29,7 @@ class RemotePlant:
     folder
         Folder of the sockets.
     key
-        Proves that this is the plant's console.
+        Key that authenticates the plant's console.
     """
 
     def __init__(self, folder: Path, key: str) -> None:
@@ -37,32 +37,32 @@ class RemotePlant:
         self._urgent = LocalConnection(folder / EMERGENCY, {"key": key}, 10.0)
 
     async def run(self) -> None:
-        """Keep both connections up until cancelled."""
+        """Maintain both connections until cancelled."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._ordinary.run())
             group.create_task(self._urgent.run())
 
     async def up(self) -> None:
-        """Wait until both connections stand."""
+        """Wait until both connections are established."""
         while not (self._ordinary.up and self._urgent.up):
             await asyncio.sleep(0.05)
 
     async def ask(self, call: str, who: Person | None = None, /, **arguments: Any) -> Any:
-        """Make a call on somebody's behalf; return its value.
+        """Make a call on behalf of a person; return its value.
 
         Raises
         ------
         HeliotropeError
-            The plant's error; `AwayError` if the plant does not answer.
+            The plant's error; `AwayError` if the plant does not reply.
         RuntimeError
-            If the call has failed in the plant by a mistake of the program.
+            If the call failed in the plant because of a program error.
         """
         return (await self.fetch(call, who, **arguments))[0]
 
     async def fetch(
         self, call: str, who: Person | None = None, blob: bytes = b"", /, **arguments: Any
     ) -> tuple[Any, bytes]:
-        """Make a call; return value and blob of its answer. See `ask`."""
+        """Make a call; return the value and blob of its reply. See `ask`."""
         known = CALLS.get(call)
         line = self._urgent if known is not None and known.urgent else self._ordinary
         behalf = None if who is None else {"name": who.name, "role": who.role.title}
@@ -88,9 +88,9 @@ class RemotePlant:
 
 
 class RemotePeople:
-    """Accounts, sessions and tokens in the plant's store, as `store.people.People` has them.
+    """Accounts, sessions and tokens in the plant's store, as in `store.people.People`.
 
-    Its methods wait for the plant's process, so they are called in threads.
+    The methods wait for the plant's process, so they are called in threads.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class RemotePeople:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def begin(self) -> None:
-        """Take the running loop as the one that makes the calls."""
+        """Use the running event loop for the calls."""
         self._loop = asyncio.get_running_loop()
 
     def _ask(self, call: str, **arguments: Any) -> Any:
@@ -117,13 +117,13 @@ class RemotePeople:
         return None if values is None else Account(**values)
 
     def accounts(self) -> tuple[Account, ...]:
-        """Return all accounts by name."""
+        """Return all accounts, sorted by name."""
         return tuple(Account(**values) for values in self._ask("accounts"))
 
     def add(
         self, name: str, password_hash: str, role: str, now: float, *, due: bool = False
     ) -> Account:
-        """Make an account; see `People.add`."""
+        """Create an account; see `People.add`."""
         values = {"name": name, "password_hash": password_hash, "role": role, "now": now}
         return Account(**self._ask("add", **values, due=due))
 
@@ -172,7 +172,7 @@ class RemotePeople:
         return str(self._ask("begin_factor", name=name, now=now))
 
     def confirm_factor(self, name: str, code: str, now: float) -> tuple[str, ...]:
-        """Put a second factor in force; see `Factors.confirm`."""
+        """Activate a second factor; see `Factors.confirm`."""
         return tuple(self._ask("confirm_factor", name=name, code=code, now=now))
 
     def check_factor(self, name: str, code: str, now: float) -> Used | None:
@@ -187,14 +187,14 @@ class RemotePeople:
     def add_token(
         self, name: str, label: str, role: str, now: float, lifetime: float | None = None
     ) -> tuple[ApiToken, str]:
-        """Make a token of an account; see `People.add_token`."""
+        """Create a token for an account; see `People.add_token`."""
         made, secret = self._ask(
             "add_token", name=name, label=label, role=role, now=now, lifetime=lifetime
         )
         return ApiToken(**made), str(secret)
 
     def tokens(self, name: str = "") -> tuple[ApiToken, ...]:
-        """Return the tokens of an account, or all, the oldest first."""
+        """Return the tokens of an account, or all tokens, oldest first."""
         return tuple(ApiToken(**values) for values in self._ask("tokens", name=name))
 
     def revoke_token(self, key: str) -> None:

@@ -16,11 +16,11 @@ from typing import Generic, TypeVar
 
 from heliotrope.errors import HeliotropeError
 
-#: A picture is trusted for this long, and for EMERGENCY alone, s.
+#: Time for which a snapshot is trusted, and for EMERGENCY alone, s.
 TRUSTED, LONG_TRUSTED = 5.0, 3600.0
-#: Least pause between two readings, and longest while nobody asks, s.
+#: Minimum pause between two reads, and maximum pause if there are no requests, s.
 _PAUSE, _PERIOD = 0.25, 2.5
-#: An EMERGENCY waits this long for a reading, s.
+#: An EMERGENCY waits this long for a read, s.
 _WAITS = 1.0
 
 T = TypeVar("T")
@@ -34,10 +34,10 @@ class Roster(Generic[T]):
     Parameters
     ----------
     read
-        Returns the owner of each, given the keys of the tokens that were used since the last
-        reading; raises `HeliotropeError` if the store cannot say.
+        Function that returns the owner of each, given the keys of the tokens used since the last
+        read; raises `HeliotropeError` if the store does not respond.
     monotonic
-        Returns the time, s.
+        Function that returns the time, s.
     """
 
     def __init__(
@@ -47,14 +47,14 @@ class Roster(Generic[T]):
     ) -> None:
         self._read, self._now = read, monotonic
         self._kept: Mapping[Key, T] = {}
-        #: When the reading of the picture began, and the earliest that would be good enough, s.
+        #: When the read of the snapshot began, and the earliest acceptable start of a read, s.
         self._at = self._least = -math.inf
         self._used = set[str]()
         self._wanted = asyncio.Event()
         self._waiting: list[asyncio.Future[None]] = []
 
     async def run(self) -> None:
-        """Read whenever somebody waits, and now and then, until cancelled."""
+        """Read whenever a request waits, and from time to time, until cancelled."""
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_PERIOD):
@@ -64,7 +64,7 @@ class Roster(Generic[T]):
             await asyncio.sleep(_PAUSE)
 
     async def _read_once(self) -> None:
-        """Read, and answer those that waited before."""
+        """Read, and answer the requests that were already waiting."""
         waiting, self._waiting = self._waiting, []
         used, self._used = self._used, set()
         begun, problem = self._now(), None
@@ -74,7 +74,7 @@ class Roster(Generic[T]):
             self._used |= used
             problem = error
         for one in waiting:
-            if one.done():  # whoever waited has left
+            if one.done():  # the waiting caller has left
                 continue
             if problem is None:
                 one.set_result(None)
@@ -87,7 +87,7 @@ class Roster(Generic[T]):
         Raises
         ------
         HeliotropeError
-            If the store cannot say.
+            If the store does not respond.
         """
         key = _key(by, secret)
         if key not in self._kept or self._at < max(self._now() - TRUSTED, self._least):
@@ -100,7 +100,7 @@ class Roster(Generic[T]):
         return self._kept.get(key)
 
     async def find_for_emergency(self, by: str, secret: str) -> T | None:
-        """Return the owner of a secret as `find` does; as last known if the store cannot say."""
+        """Return the owner of a secret like `find`; as last known if the store does not reply."""
         try:
             async with asyncio.timeout(_WAITS):
                 return await self.find(by, secret)
@@ -112,7 +112,7 @@ class Roster(Generic[T]):
             return last
 
     def forget(self) -> None:
-        """Answer nobody from the present picture: something has changed."""
+        """Accept nobody on the basis of the present snapshot, because something has changed."""
         self._least = self._now()
 
 

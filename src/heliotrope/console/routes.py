@@ -17,12 +17,12 @@ from heliotrope.calibration.flights import FlightDocument
 from heliotrope.console.auth import AtLeast, caller
 from heliotrope.plant.orders.authority import Role
 
-#: Largest body, bytes: of a stranger or where none is expected; of a form; of points or names for
+#: Largest body, bytes: from a stranger or if none is expected; of a form; of points or names for
 #: every heliostat of the largest field.
 TINY, FORM, LARGEST = 4096, 1 << 14, 16 << 20
-#: The same for each heliostat of a plant, bytes: the longest name, and a point with all its digits.
+#: The same per heliostat of a plant, bytes: the longest name, and a point with all its digits.
 EACH = 160
-#: The same of a drone's flight: 20 orientations with the errors that they share.
+#: The same for a drone flight: 20 orientations with the errors that they share.
 EACH_FLOWN = 1 << 14
 READ = ("GET", "HEAD")
 
@@ -34,13 +34,13 @@ class RouteMatch:
     Attributes
     ----------
     status
-        200, or 404 or 405 if there is none.
+        200, or 404 or 405 if there is no such route.
     role
-        Least role; None: open to all.
+        Minimum role; None: open to all.
     largest, per_heliostat
-        Largest body, and how much of it for each heliostat of the plant, bytes.
+        Largest body, and size allowed per heliostat of the plant, bytes.
     allow
-        Methods that the path has.
+        Methods available for the path.
     """
 
     status: int
@@ -56,11 +56,11 @@ class Routes:
     Parameters
     ----------
     routers
-        Those of the API.
+        Routers of the API.
     files
-        Paths open to all that can only be read.
+        Read-only paths that are open to all.
     own
-        Further paths that can only be read, with the least role.
+        Further read-only paths, with the minimum role.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ def _of(route: BaseRoute) -> RouteMatch:
 
 
 def least_role(dependant: Any) -> Role | None:
-    """Return the least role that the dependencies of a route ask for; None: open to all."""
+    """Return the minimum role that the dependencies of a route require; None: open to all."""
     roles = [least_role(dependency) for dependency in dependant.dependencies]
     if isinstance(dependant.call, AtLeast):
         roles.append(dependant.call.role)
@@ -106,7 +106,7 @@ def least_role(dependant: Any) -> Role | None:
 
 
 def _largest(model: Any) -> int:
-    """Return the largest body: that of a field where a model holds names or points."""
+    """Return the largest body of a model: large if it holds names or points, else a form's."""
     kinds = [model, *typing.get_args(model)]
     fields = [
         field.annotation for kind in kinds for field in getattr(kind, "model_fields", {}).values()

@@ -15,7 +15,7 @@ class ConsoleServer(Server):
     Parameters
     ----------
     plant, settings
-        As for `app.create`; the ports of the settings are those that are used, see `lines`.
+        As in `app.create`; the settings contain the actual ports, see `lines`.
     line
         Listening socket.
     """

@@ -23,7 +23,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class Server(uvicorn.Server):
-    """A server of one listener.
+    """A server for one listener.
 
     It leaves signals to the owner of the process.
 
@@ -34,11 +34,11 @@ class Server(uvicorn.Server):
     line
         Listening socket; it is closed at the end.
     limits
-        Limits of its connections where there are descriptors enough.
+        Limits of its connections if there are enough descriptors.
     settings
         Settings of the console.
     page
-        Whether the application has a life of its own, and sockets.
+        Whether the application has a lifespan, and web sockets.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Server(uvicorn.Server):
             server_header=False,
             proxy_headers=False,
             lifespan="on" if page else "off",
-            # It bounds the length of headers; the listener keeps the deadlines.
+            # It limits the length of headers; the listener enforces the deadlines.
             http="h11",
             timeout_keep_alive=3600,
             ws=OneWaySocket if page else "none",
@@ -73,7 +73,7 @@ class Server(uvicorn.Server):
             ssl_certfile=settings.certificate,
             ssl_keyfile=settings.key,
         )
-        # This reads modules and certificates from the disk, which no loop may wait for.
+        # This reads modules and certificates from the disk, for which no event loop may wait.
         config.load()
         limit()
         super().__init__(config)
@@ -85,7 +85,7 @@ class Server(uvicorn.Server):
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Leave them alone."""
+        """Leave signals alone."""
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -126,7 +126,7 @@ class Server(uvicorn.Server):
         Raises
         ------
         InputError
-            If it does not within some seconds.
+            If it does not listen within some seconds.
         """
         loop = asyncio.get_running_loop()
         until = loop.time() + within

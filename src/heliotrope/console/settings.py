@@ -13,43 +13,44 @@ _FILES = ("certificate", "key", "people_by_proxy")
 
 @dataclass(frozen=True)
 class ConsoleSettings:
-    """Where the console listens, and how strict it is.
+    """Address and limits of the console.
 
     Attributes
     ----------
     host, port
         Address to bind; port 0 takes a free one.
     names
-        Further names for this machine in a browser's address bar. A request for any other name is
-        refused, since a page from elsewhere may resolve its own name to this machine.
+        Further names of this computer in a browser's address bar. A request for any other name is
+        refused, because a foreign page may resolve its own name to this computer.
     certificate, key
         TLS certificate and its key, PEM files; None: plain HTTP.
     session_s
         Length of a session, s.
     period
-        Time between messages of the live stream, s.
+        Interval between messages of the live stream, s.
     viewers
-        Largest number of concurrent live streams; see `live` for those of one person.
+        Maximum number of concurrent live streams; see `live` for the limit per person.
     plain
-        Whether other machines may connect without TLS, behind a proxy that has it.
+        Whether other computers may connect without TLS, behind a proxy that provides it.
     proxies
         Addresses of trusted proxies: ``X-Forwarded-For`` names the caller of their requests.
     people_by_proxy
-        File that says how a trusted proxy names people, see `by_proxy`; None: it does not.
+        File that states how a trusted proxy identifies users, see `by_proxy`; None: it does not.
     second_factor
-        Least role that needs a second factor; "" for none.
+        Minimum role that needs a second factor; "" for none.
     emergency_port
         Port that serves EMERGENCY alone; None: the next one, or a free one if that is taken.
     idle_s
-        Time without an order after which a page's next one needs the password again, s; 0: never.
+        Time without an order after which a page's next order requires the password again, s; 0:
+        never.
     notice
-        Text for everybody who is about to sign in; "" for none.
+        Text shown before sign-in; "" for none.
 
     Raises
     ------
     InputError
-        An invalid port, a key without a certificate, a time that is not above 0; an address other
-        than this machine's own without TLS.
+        If a port is invalid, a key has no certificate, a time is not above 0, or an address other
+        than this computer's own lacks TLS.
     """
 
     host: str = "127.0.0.1"
@@ -78,7 +79,7 @@ class ConsoleSettings:
             if not getattr(self, name) > 0.0:
                 raise InputError(f"console: {name} of {getattr(self, name)} s must be above 0")
         if self.second_factor:
-            # The process of the way for EMERGENCY does without the store, and starts sooner.
+            # The process for the EMERGENCY path does not use the store, and so starts sooner.
             from heliotrope.store.people import ROLES
 
             if self.second_factor not in ROLES:
@@ -119,32 +120,32 @@ class ConsoleSettings:
 
     @property
     def tls(self) -> bool:
-        """Whether the console itself speaks TLS."""
+        """Whether the console itself uses TLS."""
         return self.certificate is not None
 
     @property
     def secure(self) -> bool:
-        """Whether browsers reach it by TLS: its own, or that of a proxy."""
+        """Whether browsers reach the console over TLS, either its own or that of a proxy."""
         return self.tls or self.plain
 
     @property
     def local(self) -> bool:
-        """Whether only this machine can connect."""
+        """Whether only this computer can connect."""
         return self.host == "localhost" or is_loopback(self.host)
 
     @property
     def for_one(self) -> bool:
-        """Whether a one-time link may sign in: only browsers of this machine come here.
+        """Whether a one-time link may sign in, because only browsers on this computer connect.
 
-        There is no TLS, no proxy that hides where a request comes from, and no second factor is
-        due.
+        This requires that there is no TLS, no proxy that hides the origin of a request, and no
+        second factor due.
         """
         asks = self.secure or self.proxies or self.second_factor
         return self.local and not asks
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Host names that a request may carry, in small letters."""
+        """Host names that a request may carry, in lower case."""
         own = {"127.0.0.1", "localhost", "[::1]", "::1"}
         return frozenset(own.union(name.lower() for name in (self.host, *self.names)))
 

@@ -41,14 +41,14 @@ async def log_in(
 
 
 async def enter(console: Console, person: Introduced, connection: HTTPConnection) -> str:
-    """Return the secret of a new session of somebody whom a trusted proxy has signed in.
+    """Return the secret of a new session for a person whom a trusted proxy has signed in.
 
     Raises
     ------
     HTTPException
-        403 if they may not enter.
+        403 if the person may not enter.
     HeliotropeError
-        If the account cannot be made or changed.
+        If the account cannot be created or changed.
     """
     name, role, people, now = person.name, person.role, console.people, console.now()
     account = await console.ask(lambda: people.account(name))
@@ -70,8 +70,8 @@ async def enter_once(console: Console, secret: str, connection: HTTPConnection) 
     Raises
     ------
     HTTPException
-        403 for a caller on another machine, who leaves the link valid; 410 if the link is not valid
-        any more.
+        403 for a caller on another computer, in which case the link remains valid; 410 if the link
+        is no longer valid.
     """
     if not is_loopback(console.address(connection)):
         await console.note(
@@ -98,7 +98,7 @@ async def _begin(
 
 
 def set_cookie(console: Console, response: Response, secret: str) -> None:
-    """Give a browser its session."""
+    """Set the session cookie in a browser."""
     response.set_cookie(
         cookie_of(console.settings),
         secret,
@@ -111,7 +111,7 @@ def set_cookie(console: Console, response: Response, secret: str) -> None:
 
 
 def drop_cookie(console: Console, response: Response) -> None:
-    """Take the session from a browser."""
+    """Remove the session cookie from a browser."""
     response.delete_cookie(
         cookie_of(console.settings),
         path="/",
@@ -122,7 +122,7 @@ def drop_cookie(console: Console, response: Response) -> None:
 
 
 async def _known(console: Console, name: str) -> str:
-    """Return a name if it is an account's: what else people type there may be a password."""
+    """Return a name if it is an account's, because other text typed there may be a password."""
     known = await console.ask(lambda: console.people.account(name))
     return name if known is not None else ""
 
@@ -167,7 +167,7 @@ async def checked(
         raise HTTPException(401, "name or password is wrong")
     if code is not None and account.factor:
         if not code:
-            attempts.undo(*keys)  # the password was right, and no code was guessed
+            attempts.undo(*keys)  # the password was correct, and no code was guessed
             raise HTTPException(428, "give the code of your second factor too")
         await _use_code(console, name, code, request, failure)
     attempts.good(*keys)
@@ -196,7 +196,7 @@ async def _use_code(
 async def confirm(
     console: Console, who: Caller, request: Request, password: str, code: str | None = None
 ) -> None:
-    """Check that a person is there: a session, and its owner's password (and code) once more.
+    """Check that a person is present: a session, and its owner's password (and code) again.
 
     Raises
     ------

@@ -34,22 +34,22 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.local import Buckets, CallError
 
 PATH = "/api/v1/emergency"
-#: Few connections with short deadlines: nothing but an order comes here.
+#: Few connections with short deadlines, because nothing but an order is expected here.
 LIMITS = Limits(
     most=64, strangers=48, address=32, handshake=2.0, header=2.0, body=2.0, idle=2.0, answer=12.0,
     idle_known=30.0, answer_known=12.0,
 )  # fmt: skip
-#: Time for the store to say who is valid, s.
+#: Time allowed for the store to report who is valid, s.
 _STORE = 1.0
 #: Largest body, bytes.
 _LARGEST = 2048
-#: A refused request may announce so much and still hear why it was refused, bytes.
+#: A refused request may announce up to this length and still receive the reason, bytes.
 _DISCARDED = 1 << 14
-#: What an order may say; the plant checks each.
+#: Fields that an order may have; the plant checks each.
 _SAID = frozenset({"act", "reason", "call", "csrf"})
 #: Statuses of refusals by the plant.
 _STATUS = {"input": 422, "refused": 409}
-#: Makes a call in the plant; returns value and blob.
+#: Function that makes a call in the plant and returns value and blob.
 Ask = Callable[..., Awaitable[tuple[Any, bytes]]]
 
 
@@ -59,14 +59,15 @@ class EmergencyWay:
     Parameters
     ----------
     ask
-        Makes a call by the plant's socket for emergencies, as `LocalConnection.ask`.
+        Function that makes a call over the plant's socket for emergencies, like
+        `LocalConnection.ask`.
     settings
-        Settings of the console; only from the page at its port may a browser send an order.
+        Settings of the console; a browser may send an order only from the page at its port.
 
     Attributes
     ----------
     roster
-        Whose sessions and tokens are valid; somebody runs it.
+        The valid sessions and tokens; the owner runs it.
     """
 
     def __init__(self, ask: Ask, settings: ConsoleSettings) -> None:
@@ -101,7 +102,7 @@ class EmergencyWay:
         return {(by, one["key"]): one for by in ("session", "token") for one in found[f"{by}s"]}
 
     async def _take(self, scope: Scope, receive: Receive, answer: dict[str, str]) -> Any:
-        """Give the order; return its view, and what the answer needs for the page's origin."""
+        """Issue the order; return its view, and set the reply headers for the page's origin."""
         connection, headers = HTTPConnection(scope), Headers(scope=scope)
         if not host_known(self._settings, headers.get("host", "")):
             raise HTTPException(421, "this machine is not known here by that name; see --name")
@@ -129,14 +130,14 @@ class EmergencyWay:
     async def _caller(
         self, connection: HTTPConnection, by: str, secret: str
     ) -> dict[str, Any] | None:
-        """Return the caller, None for a stranger; one known lately also if the store cannot say.
+        """Return the caller, None for a stranger; if the store does not respond, as last known.
 
         Raises
         ------
         HTTPException
-            429 if a stranger asks too often.
+            429 if a stranger sends too many requests.
         HeliotropeError
-            If the store cannot say who an unknown caller is.
+            If the store cannot identify an unknown caller.
         """
         found = await self.roster.find_for_emergency(by, secret) if secret else None
         if found is None:
@@ -149,13 +150,13 @@ class EmergencyWay:
         return found
 
     def _from_page(self, origin: str, host: str) -> bool:
-        """Whether an origin is the page of this console, at the name that the request names."""
+        """Whether an origin is the page of this console, under the name that the request uses."""
         page, own = parts_of(origin), parts_of(f"//{host}")
         try:
             port, name = page.port, page.hostname
         except ValueError:
             return False
-        # Behind a proxy the page has the proxy's port.
+        # Behind a proxy, the page has the proxy's port.
         behind = self._settings.plain and port is None
         return name is not None and name == own.hostname and (behind or port == self._settings.port)
 

@@ -13,16 +13,16 @@ from heliotrope.console.server import Server
 from heliotrope.console.urgent import LIMITS, EmergencyWay
 from heliotrope.local import EMERGENCY, LocalConnection
 
-#: Limit of an answer of the plant, s.
+#: Timeout for a reply from the plant, s.
 _ANSWER = 10.0
-#: Time for the connection to the plant, s: it is made anew where it has ended.
+#: Timeout for connecting to the plant, s; the connection is reopened when it has ended.
 _CONNECT = 5.0
-#: Most memory, bytes.
+#: Maximum memory, bytes.
 _MEMORY = 512 << 20
 
 
 def way_of(plant: LocalConnection, inputs: ProcessInput) -> EmergencyWay:
-    """Return the way; an order that comes before the plant is connected waits."""
+    """Return the path for EMERGENCY; an order waits until the plant is connected."""
 
     async def ask(call: str, arguments: dict[str, Any], **named: Any) -> tuple[Any, bytes]:
         until = time.monotonic() + _CONNECT
@@ -34,7 +34,7 @@ def way_of(plant: LocalConnection, inputs: ProcessInput) -> EmergencyWay:
 
 
 def server_of(way: EmergencyWay, inputs: ProcessInput) -> Server:
-    """Return the server of the way."""
+    """Return the server of the path for EMERGENCY."""
     return Server(way, inputs.line, LIMITS, inputs.settings, page=False)
 
 

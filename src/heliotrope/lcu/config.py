@@ -9,7 +9,7 @@ from .pointing import Pointing
 from .stepper import Axis
 
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such module
+if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such module
     from typing import Any
 
 #: Largest coordinate (m) or step count.
@@ -18,12 +18,12 @@ FAR, MOST_STEPS = 1e5, 1 << 29
 LEAST_DEFOCUS, MOST_DEFOCUS = 0.02, 1.6
 #: Points that fit in the item "way".
 MOST_POINTS = 4
-#: Microsteps of a full step that drivers have.
+#: Largest number of microsteps per full step that drivers have.
 MOST_MICROSTEPS = 256
 
 
 def is_place(point: "tuple[float, ...]") -> bool:
-    """Whether these are coordinates (m) that a plant can have."""
+    """Return whether these are coordinates (m) that a plant can have."""
     for value in point:  # noqa: SIM110 - a generator would allocate
         if not -FAR <= value <= FAR:
             return False
@@ -42,7 +42,7 @@ class Config:
     defocus, location, standby
         Angles (rad), and ENU points (m), the latter None while missing.
     path
-        ENU points (m) of the safe way from the ground to below the standby point, from SET_WAY;
+        ENU points (m) of the safe path from the ground to below the standby point, from SET_WAY;
         empty: see ``Motion``.
     azimuth_axis
         The axis (0, 1) that moves first when leaving stow and last when returning, from SET_WAY.
@@ -52,11 +52,11 @@ class Config:
     serial, firmware, address
         As in HERE.
     lease_ms, stow_wait_ms, silence_ms
-        Greatest age of the sun; time without it until a defocused mirror goes to stow; time
-        without any valid message until a mirror that holds a position is defocused.
+        Greatest age of the sun; time without it until a defocused heliostat goes to stow; time
+        without any valid message until a heliostat that holds a position is defocused.
     slot_ms, ahead_ms, stride
-        Of the ``Stepper``, and of the ``Journal``: no rate may make more steps than the stride in
-        the time that segments are emitted ahead.
+        Of the ``Stepper``, and of the ``Journal``: at no rate may an axis make more steps than the
+        stride in the time for which segments are emitted ahead.
     """
 
     def __init__(self) -> None:
@@ -92,14 +92,14 @@ class Config:
         return True
 
     def load(self, items: "dict[str, bytes]") -> bool:
-        """Take the journal's items; return False if one is invalid."""
+        """Load the journal's items; return False if one is invalid."""
         good = True
         for name in items:
             good = self.take(name, items[name]) and good
         return good
 
     def take(self, name: str, data: bytes) -> bool:
-        """Take an item of ``journal.ITEMS``; return False, and change nothing, if it is invalid."""
+        """Accept an item of ``journal.ITEMS``; if invalid, return False and change nothing."""
         was_complete = self.complete()
         before = self.pointing, self.drives[:], self.axes[:], self.biases, self.stow
         numbers = self._numbers[:]

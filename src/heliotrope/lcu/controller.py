@@ -39,7 +39,7 @@ from .motion import (
 )
 
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
+if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such modules
     from collections.abc import Callable
     from typing import Any
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 
 (SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, FEED, DRIVERS) = range(10)
 
-#: Faults; their texts, and the names of the flags' bits, are in ``names``.
+#: Faults; their texts, and the names of the flag bits, are in ``names``.
 (
     NO_FAULT,
     STUCK_PRIMARY,
@@ -61,11 +61,11 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     JOURNAL,
     LATCHED,
 ) = range(11)
-#: A cause that locks and is no fault: the drives are switched off at the mirror.
+#: A cause that locks but is no fault: the drives are switched off at the heliostat.
 SWITCH = 11
 
-#: States in which settings may change: those that move nothing, those of the pose, those of the
-#: machine. The last two change at rest only.
+#: States in which settings may change: settings that move nothing, pose settings, and machine
+#: settings. The last two change only at rest.
 HARMLESS = (
     states.UNCONFIGURED,
     states.STOWED,
@@ -76,15 +76,17 @@ HARMLESS = (
 )
 POSE = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT)
 MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
-#: Messages of class KEY that set neither the pose nor the machine, and those that set the pose.
+#: Messages of class KEY that change neither the pose nor the machine, and those that change the
+#: pose.
 HARMLESS_SETS = ("SET_POSITION", "SET_DEFOCUS", "SET_ADDRESS")
 POSE_SETS = ("SET_ARMATURE", "SET_BIAS")
 
-#: States that hold a position for as long as the cluster is heard.
+#: States that hold a position for as long as messages from the cluster arrive.
 HELD = (states.LOCKED, states.UNCONFIGURED)
 
-#: Motions that need the sun. The watchdog resets a board that is in one of them, or in a state that
-#: needs it, for longer than this (ms) beyond the lease: its program no longer does what it should.
+#: Motions that need the sun. If a board is in one of them, or in a state that needs the sun, for
+#: longer than this (ms) beyond the lease, its program no longer works as it should and the watchdog
+#: resets it.
 FOLLOWS, LATE_MS = (STANDBY, TRACK, SEARCH, APPROACH, RETURN), 1000
 #: Marks of the journal beside the state: locked at stow; turned away; on the way to stow.
 PARKED, TURNED, STOWS = 0x10, 0x20, 0x80
@@ -103,9 +105,9 @@ class Controller:
     now_ms
         The present tick; see ``ticks``.
     gate
-        Decides which frames may act; None where `on_message` is called directly.
+        Decides which frames may act; None if `on_message` is called directly.
     sensor
-        Tilt of the mirror; see ``Motion``.
+        Function that returns the tilt of the mirror; see ``Motion``.
 
     Attributes
     ----------
@@ -129,12 +131,12 @@ class Controller:
         self.supply_mv, self.temperature_degc, self.boots = 0, 0, 0
         self.out: list[tuple[Any, ...]] = []
         self._seen = now_ms
-        self._owed_ms = 0  # time that messages have charged and the motion has not yet had
+        self._owed_ms = 0  # time charged by messages but not yet passed to the motion
         self._uptime_s = self._uptime_ms = 0
         self._dark, self._heard = ticks.Deadline(), ticks.Deadline()
         self._dark.start(now_ms, config.stow_wait_ms)
         self._heard.start(now_ms, config.silence_ms)
-        self._sunless_ms = 0  # since the last sun; counted without the lease that it checks
+        self._sunless_ms = 0  # since the last sun vector; counted apart from the lease, to check it
         self._present = 0
         self._doubtful = self._aim_locked = False
         self._clock_jumped = self._ticks_jumped = False
@@ -181,7 +183,7 @@ class Controller:
             self.fault = LATCHED
         rested = state in (states.STOWED, states.FAULT)
         if looping or rested:
-            motion.blind = 0  # it was not on the receiver, or has turned away before
+            motion.blind = 0  # the beam was not on the receiver, or has turned away before
         if state == states.LOCKED:
             self._event("BOOT_LOCKED")
         elif self.fault != NO_FAULT:
@@ -197,11 +199,11 @@ class Controller:
     # Time.
 
     def _time(self, now_ms: int) -> None:
-        """Charge the time since the last call to everything that has a time limit."""
+        """Charge the time since the last call to everything with a time limit."""
         elapsed = ticks.diff(now_ms, self._seen)
         self._seen = now_ms
         if elapsed < 0:
-            # No clock is trusted after that, and no lease outlives it.
+            # After that no clock is trusted, and no lease survives.
             self._ticks_jumped = True
             self.clock.lose()
             self.sun.end()
@@ -212,7 +214,7 @@ class Controller:
         self._uptime_s = (self._uptime_s + self._uptime_ms // 1000) & 0xFFFFFFFF
         self._uptime_ms %= 1000
         fresh = self.sun.look(now_ms, elapsed)
-        if self._present >> SWITCH:  # when they are on again, nothing moves at once
+        if self._present >> SWITCH:  # when they are switched on again, nothing moves at once
             self._heard.start(now_ms, self.config.silence_ms)
         silent = self._heard.over(now_ms)
         goes_on = self.motion.following() and self.state != states.FAULT
@@ -236,10 +238,10 @@ class Controller:
             self._latched_lapses(silent, dark)
 
     def _latched_lapses(self, silent: bool, dark: bool) -> None:
-        """Leave without a cluster: the latch stays, the mirror goes.
+        """Handle lost contact with the cluster: the latch stays, but the heliostat leaves.
 
-        While the cause of a fault is present, nothing moves before the stow delay is over: the
-        supply may be falling.
+        While the cause of a fault is present, nothing moves until the stow delay has passed,
+        because the supply may be failing.
         """
         motion = self.motion
         if motion.parked or motion.at_stow() or motion.leaving():
@@ -255,7 +257,7 @@ class Controller:
             self._event("LAPSED")
 
     def on_tick(self, now_ms: int) -> "list[tuple[Any, ...]]":
-        """Advance in time; to be called more often than every ``ahead_ms`` during a motion."""
+        """Advance in time; call it more often than every ``ahead_ms`` during a motion."""
         self.out.clear()
         self._time(now_ms)
         elapsed, self._owed_ms = self._owed_ms, 0
@@ -275,8 +277,8 @@ class Controller:
                 self.out.insert(place, steps)
                 self._moving = True
             elif self._moving and motion.still() and not motion.following():
-                # A mirror that follows the sun stops several times a second: recording each stop in
-                # flash would wear it out in a year.
+                # A heliostat that tracks the sun stops several times a second. Recording each stop
+                # would wear out the flash within a year.
                 self._moving = False
                 self.out.append((AT_REST, primary, secondary))
             if motion.may_rest(elapsed) == self._powered:
@@ -292,7 +294,7 @@ class Controller:
     # Events.
 
     def _event(self, name: str) -> bool:
-        """Pass an event to the state table; False if it is refused, and nothing has changed."""
+        """Pass an event to the state table; False means that it was refused and nothing changed."""
         change = states.transition(self.state, name)
         if change is None:
             return False
@@ -305,7 +307,7 @@ class Controller:
         return True
 
     def _mark(self) -> None:
-        """Write changes that must outlast a reset to the journal."""
+        """Write changes that must survive a reset to the journal."""
         motion = self.motion
         if motion.kind not in (HOLD, DEFOCUS):
             motion.aside = None
@@ -327,9 +329,10 @@ class Controller:
         self.out.append((NOTE, self._marked, data, self.motion.aside or ()))
 
     def on_fault(self, number: int, now_ms: int, halt: bool) -> "list[tuple[Any, ...]]":
-        """Latch a fault that the caller has found; ``halt`` stops the motors at once.
+        """Latch a fault that the caller has detected; ``halt`` stops the motors at once.
 
-        SWITCH locks instead, and while it is present nothing makes a step; the lock outlasts it.
+        SWITCH locks instead. While it is present no step is made; the lock remains after it has
+        gone.
         """
         self.out.clear()
         self._time(now_ms)
@@ -348,11 +351,11 @@ class Controller:
         self._event("FAULTED")
 
     def fault_gone(self, number: int) -> None:
-        """Note that the cause of a fault is gone; the fault itself stays until CLEAR_FAULT."""
+        """Note that the cause of a fault has gone; the fault itself remains until CLEAR_FAULT."""
         self._present &= ~(1 << number)
 
     def halted(self, primary: int, secondary: int) -> "list[tuple[Any, ...]]":
-        """After a fault with ``halt``: take back signed steps that were emitted and not made."""
+        """After a fault with ``halt``, subtract signed steps that were emitted but not made."""
         self.out.clear()
         self.motion.halted(primary, secondary)
         self._moving = False
@@ -370,7 +373,7 @@ class Controller:
     # Messages.
 
     def on_frame(self, frame: "Frame", now_ms: int) -> "list[tuple[Any, ...]]":
-        """Take a whole frame."""
+        """Handle a complete frame."""
         self.out.clear()
         if not frame.for_address(self.config.address):
             return self.out
@@ -392,20 +395,20 @@ class Controller:
         now_ms: int,
         reply: bool,
     ) -> "list[tuple[Any, ...]]":
-        """Take a message.
+        """Handle a message.
 
         Parameters
         ----------
         number, sequence
-            Of the message.
+            Number and sequence number of the message.
         values, payload
-            Its numbers, and the bytes that they were read from; both with the head.
+            Its numbers, and the bytes from which they were read; both include the head.
         verdict
-            Of the gate: ``messages.DONE`` if it may act.
+            Verdict of the gate: ``messages.DONE`` if it may act.
         now_ms
             The present tick.
         reply
-            Whether it came to this address alone, so that an answer is wanted.
+            Whether it was sent to this address alone, so that a reply is expected.
         """
         self.out.clear()
         self._time(now_ms)
@@ -424,7 +427,7 @@ class Controller:
     ) -> None:
         who, name = messages.who_of(number), messages.name_of(number)
         if who == messages.ANYONE:
-            # Never refused, whatever the verdict, except by drives without power.
+            # These are never refused, whatever the verdict, except by drives without power.
             result = messages.DONE
             if not self._present >> SWITCH:
                 self._event(name)
@@ -438,12 +441,13 @@ class Controller:
             result = messages.BAD_VALUE
         else:
             if who != messages.ASK or self.gate is None or not self.gate.keyed():
-                # Anybody can ask a question: where frames are signed, it holds no mirror in place.
+                # Anyone can send a query, so where frames are signed, a query keeps no heliostat in
+                # place.
                 self._heard.start(now_ms, self.config.silence_ms)
                 if self.motion.kind == HOLD and self.state != states.FAULT:
-                    self.motion.aside = None  # it may be held for long, and the sun goes on
+                    self.motion.aside = None  # it may be held for long, while the sun moves on
             if who == messages.ASK:
-                if reply or name == "DISCOVER":  # if all answered at once, none was understood
+                if reply or name == "DISCOVER":  # if all replied at once, no reply could be read
                     self._answer(name, values)
                 return
             if who == messages.CLUSTER:
@@ -457,7 +461,7 @@ class Controller:
             self.out.append((ANSWER, 0x0D, (sequence, number, result)))
 
     def _hear(self, name: str, values: "tuple[Any, ...]", now_ms: int) -> None:
-        """Take TIME or SUN."""
+        """Handle TIME or SUN."""
         if name == "TIME":
             if abs(self.clock.set(values[0], values[1])) > CLOCK_JUMP_MS:
                 self._clock_jumped = True
@@ -556,7 +560,7 @@ class Controller:
             and self.state == states.DEFOCUSED
             and not (motion.ready and self.sun.fresh())
         ):
-            # It would hold, with its beam wherever that is by now.
+            # The heliostat would hold its position, wherever its beam is by then.
             return messages.REFUSED_STATE
         if result == messages.DONE:
             self._event(name)
@@ -581,7 +585,7 @@ class Controller:
         return messages.DONE
 
     def _may_go(self, up: bool) -> int:
-        """Whether the mirror may leave stow (``up``), or go straight from standby to its aim."""
+        """Return whether the heliostat may leave stow (``up``), or go straight to its aim."""
         motion = self.motion
         if not (
             (up or motion.ready) and motion.known and self.sun.fresh() and self.fault == NO_FAULT
@@ -607,7 +611,7 @@ class Controller:
         return messages.DONE
 
     def _adjust(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
-        """Set aim, standby point or stepping: no change of state."""
+        """Set aim, standby point or stepping, without a change of state."""
         motion, config = self.motion, self.config
         if name in ("LOCK_AIM", "ROUGH"):
             if values[0] > 1:
@@ -636,7 +640,7 @@ class Controller:
     # Stored settings.
 
     def _set(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
-        """Take a setting, in a safe state and at rest; return the result for ACK."""
+        """Accept a setting, in a safe state and at rest; return the result for ACK."""
         allowed: tuple[int, ...] = MACHINE
         if name in HARMLESS_SETS:
             allowed = HARMLESS
@@ -668,7 +672,7 @@ class Controller:
             if item != "edition" and not config.take(item, items[item]):
                 return messages.BAD_VALUE
         if allowed is not HARMLESS:
-            motion.hold()  # a defocused mirror does not go on with the sun from another pose
+            motion.hold()  # in another pose, a defocused heliostat must not continue with the sun
         if name != "SET_ADDRESS":
             motion.rebuild()
         if known and not motion.known:

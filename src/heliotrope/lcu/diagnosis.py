@@ -1,37 +1,37 @@
-"""Motion diagnosis: whether the tilt of the mirror follows when an axis moves a little."""
+"""Motion diagnosis: whether the tilt of the mirror changes when an axis moves a little."""
 
 import math
 
 from .config import Config
 
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such module
+if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such modules
     from typing import Any
 
-#: Angle by which an axis is moved, and least change of tilt that the sensor detects, rad.
+#: Angle by which an axis is moved, and smallest change of tilt that the sensor detects, rad.
 NUDGE, NOTICED = 0.02, 0.002
 
-#: Results, bits.
+#: Result bits.
 MOVED_PRIMARY, MOVED_SECONDARY, STUCK_PRIMARY, STUCK_SECONDARY, NO_SENSOR = 1, 2, 4, 8, 16
 
 
 class Diagnosis:
-    """One diagnosis: before, with the primary axis moved, with the secondary axis moved, back.
+    """One diagnosis: at home, with the primary axis moved, with the secondary one moved, at home.
 
-    An accelerometer sees an axis turn except for the part about the plumb line: where less than
-    ``NOTICED`` is to be expected, neither MOVED nor STUCK is reported.
+    An accelerometer detects the rotation of an axis except for the component about the vertical. If
+    less than ``NOTICED`` is to be expected, neither MOVED nor STUCK is reported.
 
     Parameters
     ----------
     config
         A complete configuration.
     home
-        Step counts of the mirror's position.
+        Step counts of the heliostat's position.
 
     Attributes
     ----------
     over
-        Whether the last motion is the one back.
+        Whether the last motion is the one back home.
     result
         (bits, steps moved of the two axes, last change of tilt x, y in rad).
     """
@@ -43,7 +43,7 @@ class Diagnosis:
         self._tilts: list[tuple[float, float] | None] = []
 
     def advance(self, tilt: "tuple[float, float] | None") -> "list[int]":
-        """Take the tilt at rest; return the step counts to go to next."""
+        """Accept the tilt at rest; return the step counts to go to next."""
         self._tilts.append(tilt)
         stage = len(self._tilts)
         steps = [self.home[0], self.home[1]]
@@ -80,7 +80,8 @@ class Diagnosis:
             moved[i] = self._nudged(i) - self.home[i]
             angle = drive.angle(self.home[i])
             turn = abs(drive.angle(self.home[i] + moved[i]) - angle)
-            # Gravity, seen from the mirror, turns with it, except for the part along the axis.
+            # In the frame of the mirror, gravity turns with the axis, except for its component
+            # along it.
             expected = turn * math.sqrt(axis[0] * axis[0] + axis[1] * axis[1])
             tilt = after[0] - before[0], after[1] - before[1]
             if expected > NOTICED:

@@ -14,7 +14,7 @@ from .vectors import finite
 
 ROTARY, JACK_RISING, JACK_FALLING = 0, 1, 2
 
-#: Indices of the ten numbers.
+#: Indices of the ten parameters.
 ZERO, RATE, STROKE, OFFSET, RADIUS, SCALE, WORM_COS, WORM_SIN, WORM_RATIO, SAG = range(10)
 
 
@@ -63,7 +63,7 @@ class Drive:
         self.folded = self._triangle(k)
 
     def _triangle(self, length: float) -> float:
-        """Angle at the joint, by the half-angle: exact for folded and stretched jacks."""
+        """Return the angle at the joint by the half-angle; exact for folded and stretched jacks."""
         c, r = self.numbers[OFFSET], self.numbers[RADIUS]
         above = (length - (c - r)) * (length + (c - r))
         below = ((c + r) - length) * ((c + r) + length)
@@ -95,7 +95,7 @@ class Drive:
         c, r = n[OFFSET], n[RADIUS]
         angle = self.folded - self.sense * (phi - n[ZERO])
         half = math.sin(0.5 * min(math.pi, max(0.0, angle)))
-        # (c − r)² + 4 c r sin²(Φ/2) keeps the digits where the jack is folded.
+        # (c − r)² + 4 c r sin²(Φ/2) keeps its precision when the jack is folded.
         length = math.sqrt((c - r) * (c - r) + 4.0 * c * r * half * half)
         return (length - n[STROKE]) / n[RATE]
 

@@ -37,7 +37,7 @@ import struct
 from binascii import crc32
 
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such module
+if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such modules
     from typing import Any, Protocol
 
     class Storage(Protocol):
@@ -79,7 +79,7 @@ ITEMS = (
 SIZE_OF = {row[0]: struct.calcsize("<" + row[1]) for row in ITEMS}
 CODES_OF = {row[0]: "<" + row[1] for row in ITEMS}
 
-#: The item that a message of class KEY sets; of two names, the one of its axis.
+#: The item that a message of class KEY sets; if there are two, the one for its axis.
 TARGETS = {
     "SET_ARMATURE": ("armature",),
     "SET_DRIVES": ("drive_primary", "drive_secondary"),
@@ -95,10 +95,10 @@ TARGETS = {
 }
 
 MAGIC, LAYOUT = 0x48, 2
-SLOT_HEAD = "<BBHI"  # magic, layout, which items are there, counter
+SLOT_HEAD = "<BBHI"  # magic, layout, bits of the items present, counter
 SLOT_HEAD_SIZE = 8
 SLOT_SIZE = SLOT_HEAD_SIZE + sum(SIZE_OF.values()) + 4
-#: Sizes of records of firmware without the last item, or the last two; they are read too.
+#: Record sizes of firmware without the last item, or the last two, which can also be read.
 FORMER_SIZES = (SLOT_SIZE - 32, SLOT_SIZE - 37)
 
 #: counter, primary, secondary, aim, state, flags, boots; then the CRC.
@@ -106,15 +106,15 @@ RING_RECORD = "<Iii12sBBH"
 RING_SIZE = 32
 FIRST_RING_BLOCK = 2
 BLANK = b"\xff" * RING_SIZE
-#: Of the byte of the state: the state itself; a motion is under way to the goals; a record of them.
+#: Parts of the state byte: the state itself; a motion is under way to its goals; a record of goals.
 STATE, TURNING, GOALS = 0x0F, 0x40, 0x0F
 REST, AIM = 0x80, 0x40  # flags; the lower bits: three of doubts, three of boots
 
-#: Greatest distance of the true step counts from those in flash, steps.
+#: Greatest distance of the true step counts from the counts in flash, steps.
 STRIDE = 1000
 #: From this many unhealthy boots in a row, the controller stays in FAULT.
 BOOT_LIMIT = 5
-#: A boot is healthy after this time, ms; the caller then reports it.
+#: A boot is healthy after this time, ms; then the caller reports it.
 HEALTHY_MS = 60000
 MOST = 7
 
@@ -132,7 +132,7 @@ def items_of(name: str, payload: bytes) -> "dict[str, bytes]":
     Raises
     ------
     ValueError
-        A message that stores nothing, or an axis that is not 0 or 1.
+        If the message stores nothing, or the axis is not 0 or 1.
     """
     if name not in TARGETS:
         raise ValueError(f"{name}: stores nothing")
@@ -167,25 +167,25 @@ class Journal:
     storage
         NOR flash; see the docstring of this module.
     stride
-        Greatest distance of the true step counts from those in flash, steps.
+        Greatest distance of the true step counts from the counts in flash, steps.
 
     Attributes
     ----------
     items
         Stored items, as bytes, by name; without names that were never stored.
     damaged
-        Whether flash held something but no whole record of stored items.
+        Whether flash held data but no complete record of stored items.
     primary, secondary
         Step counts of the newest record.
     rest
         Whether the newest record written since ``load`` says that nothing moves.
     doubts
-        How often the counts may have gone wrong by up to ``stride``; 7 for 7 times or more, and
-        where there was no record of counts at all.
+        How often the counts may have been falsified by up to ``stride``; 7 means 7 times or more,
+        or that there was no record of counts at all.
     state
         State of the newest record, with the controller's marks.
     goals
-        Goals of the motion that it was in, as step counts, or ().
+        Goals of the motion under way, as step counts, or ().
     aim
         Aim of the newest record as bytes (three ``f``), or None.
     boots
@@ -227,7 +227,7 @@ class Journal:
     # Stored items.
 
     def load(self) -> "dict[str, bytes]":
-        """Read the newest whole records, and return ``items``. Nothing is written."""
+        """Read the newest complete records, and return ``items``. Nothing is written."""
         self._clear()
         intact = False
         for slot in (0, 1):
@@ -256,14 +256,14 @@ class Journal:
         return items
 
     def store(self, changes: "dict[str, bytes]") -> None:
-        """Store items, all of them or, at a cut, none; other items stay as they are.
+        """Store items: all of them or, if interrupted, none; other items stay unchanged.
 
         Raises
         ------
         ValueError
-            An unknown name, or a wrong length.
+            If a name is unknown, or a length is wrong.
         OSError
-            Flash does not hold what was written. The old record is then still whole.
+            If flash does not hold what was written. The old record is then still complete.
         """
         for name in changes:
             if name not in SIZE_OF or len(changes[name]) != SIZE_OF[name]:
@@ -306,16 +306,16 @@ class Journal:
 
     @property
     def doubt(self) -> int:
-        """Greatest error of the counts, steps; -1 if they are unknown."""
+        """Greatest error of the counts, steps; -1 if the counts are unknown."""
         return self.doubts * self.stride if self.doubts < MOST else -1
 
     @property
     def looping(self) -> bool:
-        """Whether the controller boots again and again without a healthy minute."""
+        """Whether the controller keeps rebooting without a healthy minute."""
         return self.unhealthy >= BOOT_LIMIT
 
     def boot(self) -> None:
-        """Count a boot. From here on there is always room for a last record."""
+        """Count a boot. From then on there is always room for a last record."""
         self.boots = (self.boots + 1) & 0xFFFF
         self.unhealthy = min(self.unhealthy + 1, MOST)
         self._append(self.primary, self.secondary, True)
@@ -329,7 +329,7 @@ class Journal:
     def before_steps(
         self, primary: int, secondary: int, next_primary: int, next_secondary: int
     ) -> None:
-        """Ensure, before steps are emitted, that flash will be right to within ``stride``.
+        """Ensure, before steps are emitted, that flash stays correct to within ``stride``.
 
         Parameters
         ----------
@@ -341,7 +341,7 @@ class Journal:
         Raises
         ------
         ValueError
-            More than ``stride`` steps at once.
+            If more than ``stride`` steps are requested at once.
         """
         if self._far(next_primary, primary) or self._far(next_secondary, secondary):
             raise ValueError(
@@ -363,7 +363,7 @@ class Journal:
             self._erase_next()
 
     def brown_out(self, primary: int, secondary: int) -> bool:
-        """Write the last record while the supply falls: no erasure, one write of 32 bytes.
+        """Write the last record while the supply fails: no erasure, one write of 32 bytes.
 
         Returns whether it was written; after ``boot`` there is always room.
         """
@@ -373,7 +373,7 @@ class Journal:
         return self._write(primary, secondary, True)
 
     def zero(self, primary: int, secondary: int, doubts: int = 0) -> None:
-        """Declare the present counts: no doubt is left; with ``MOST``, nothing is known of them."""
+        """Declare the present counts: no doubt remains; with ``MOST``, the counts are unknown."""
         self.doubts = doubts
         self._append(primary, secondary, True)
 
@@ -442,7 +442,7 @@ class Journal:
 
     def _append(self, primary: int, secondary: int, rest: bool) -> None:
         if self.goals:
-            # Near every record, so that no erasure leaves one without the other.
+            # Close to every record, so that no erasure removes one without the other.
             goals, state, self.goals, self.state = self.goals, self.state, (), GOALS
             self._append(goals[0], goals[1], rest)
             self.goals, self.state = goals, state
@@ -451,7 +451,7 @@ class Journal:
                 self._erase_next()
             self._advance()
             if self._write(primary, secondary, rest):
-                # Room for the next record must be there before it is needed in a hurry.
+                # There must be room for the next record before it is needed in a hurry.
                 if self._place >= self._places and not self._next_ready:
                     self._erase_next()
                 return

@@ -4,23 +4,24 @@ from . import ticks
 
 #: Units: the sun's components 2^-30, its rate 2^-28 a second.
 UNIT, RATE_FACTOR = 1 << 30, 4
-#: A vector may be this far (ms) ahead of the clock: the cluster sends it for a full second.
+#: A vector may be this far (ms) ahead of the clock, because the cluster sends it for a full second.
 AHEAD_MS = 2000
-#: Below this height (2^-30) there is no sun to reflect.
+#: Below this height (2^-30) the sun is too low to reflect.
 NIGHT = -UNIT // 50
 MODULO = 1 << 32
-#: No sun moves faster, rad/ms: 15.05 arcsec/s (a turn in 86,164 s), seen from the earth's axis.
+#: The sun never moves faster than this, rad/ms: 15.05 arcsec/s (one turn in 86,164 s), seen from
+#: the earth's axis.
 FASTEST = 7.3e-8
-#: For this long after its second a vector shows where the sun is, to 4 mrad, ms.
+#: For this long after its second, a vector shows the sun's direction to 4 mrad, ms.
 RECENT_MS = 60_000
-#: Time that tells apart the vectors of a whole day, ms.
+#: Time that distinguishes the vectors of a whole day, ms.
 LONGEST_MS = 1 << 29
 
 
 class Clock:
     """GPS time between two TIME messages, advanced by ticks.
 
-    ``second`` is None until TIME has come, and again after the ticks ran backwards.
+    ``second`` is None until TIME has arrived, and again after the ticks ran backwards.
     """
 
     def __init__(self) -> None:
@@ -28,7 +29,7 @@ class Clock:
         self.ms = 0
 
     def set(self, week: int, time_of_week_ms: int) -> int:
-        """Take TIME; return the jump in ms, 0 at the first."""
+        """Accept TIME; return the jump in ms, 0 for the first."""
         second, ms = week * 604_800 + time_of_week_ms // 1000, time_of_week_ms % 1000
         jump = 0 if self.second is None else 1000 * (second - self.second) + ms - self.ms
         self.second, self.ms = second % MODULO, ms
@@ -46,30 +47,31 @@ class Clock:
         self.second = None
 
     def since(self, second: int) -> int:
-        """Milliseconds since a GPS second, negative before it; the clock must be set."""
+        """Return the milliseconds since a GPS second, negative before it; the clock must be set."""
         now = self.second or 0
         seconds = (now - second + MODULO // 2) % MODULO - MODULO // 2
         return 1000 * max(-1_000_000, min(1_000_000, seconds)) + self.ms
 
 
 class SunLease:
-    """The sun's direction and the lease that it gives.
+    """The sun's direction and the lease that it grants.
 
-    Only a vector for a later second than any before renews the lease; the time that it was under
-    way is deducted. The lease ends early, never late, if ticks jump.
+    Only a vector for a later second than all before renews the lease; its time in transit is
+    deducted. If ticks jump, the lease ends early, never late.
 
-    While the lease runs, a vector must follow from the last one: the sun cannot have gone further
-    than `FASTEST` allows in the ticks since, with a margin of one lease for the time under way.
-    After a lapse, and after a start, there is nothing to go by, and any vector is taken.
+    While the lease runs, a vector must be consistent with the last one: the sun cannot have moved
+    further than `FASTEST` allows in the ticks since, with a margin of one lease for the time in
+    transit. After a lapse or a start there is no reference, and any vector is accepted.
 
     Attributes
     ----------
     since_ms
-        Time since the second of the vector, at most 1,000,000, as before the first.
+        Time since the second of the vector, at most 1,000,000, which is also the value before the
+        first.
     bad
-        Vectors that were refused.
+        Number of refused vectors.
     leaps
-        Vectors that did not follow from the last one, refused or, after a lapse, taken.
+        Number of vectors inconsistent with the last one, refused or, after a lapse, accepted.
     """
 
     def __init__(self, span_ms: int) -> None:
@@ -82,7 +84,7 @@ class SunLease:
         self.bad = self.leaps = 0
 
     def take(self, values: "tuple[int, ...]", clock: Clock, now: int) -> bool:
-        """Take SUN; return False, and renew nothing, if it is stale, repeated or not a sun."""
+        """Accept SUN; if it is stale, repeated or not a sun vector, return False, renew nothing."""
         second = values[0]
         delay = 0 if clock.second is None else clock.since(second)
         lapsed = self._left.over(now)
@@ -109,7 +111,7 @@ class SunLease:
         return True
 
     def _follows(self, values: "tuple[int, ...]") -> bool:
-        """Whether the sun can have come from the last vector to this one."""
+        """Return whether the sun can have moved from the last vector to this one."""
         gap = 0.0
         for i in (0, 1, 2):
             part = (values[1 + i] - self._sun[i]) / UNIT
@@ -118,17 +120,17 @@ class SunLease:
         return gap <= reach * reach
 
     def look(self, now: int, elapsed: int) -> bool:
-        """Charge the time that has passed, and return whether the lease runs."""
+        """Charge the elapsed time, and return whether the lease runs."""
         self.since_ms = min(self.since_ms + elapsed, 1_000_000)
         self._passed_ms = min(self._passed_ms + elapsed, LONGEST_MS)
         return not self._left.over(now)
 
     def fresh(self) -> bool:
-        """Whether the lease ran at the last look."""
+        """Whether the lease ran at the last check."""
         return self._left.left > 0
 
     def age_ms(self) -> int:
-        """Age of the vector; the greatest number if there is no fresh one."""
+        """Age of the vector; the largest number if there is no fresh vector."""
         return self.span_ms - self._left.left if self._left.left > 0 else 0xFFFFFFFF
 
     def end(self) -> None:
@@ -136,7 +138,7 @@ class SunLease:
         self._left.end()
 
     def vector(self, ahead_ms: int) -> tuple[float, float, float]:
-        """Return the direction to the sun, of length near 1, some time from now."""
+        """Return the direction to the sun, of length near 1, ``ahead_ms`` from now."""
         ms = self.since_ms + ahead_ms
         east, north, up = [self._sun[i] + self._rate[i] * ms // 1000 for i in (0, 1, 2)]
         return east / UNIT, north / UNIT, up / UNIT

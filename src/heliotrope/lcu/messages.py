@@ -2,109 +2,101 @@
 
 A row: number, name, who may send it, codes of the payload, names of its fields, traits. Codes are
 those of ``struct``, little-endian; ``s`` alone means the remaining bytes. A field of several
-numbers has a code with a count ("18d"). Names of fields end in their unit. The meaning of a message
-is in the comment above its row, from where ``docs/reference/wire.md`` takes it (on a
-microcontroller a comment costs no memory).
+numbers has a code with a count ("18d"). Field names end in their unit. The meaning of a message is
+in the comment above its row, from which ``docs/reference/wire.md`` takes it (on a microcontroller a
+comment costs no memory).
 
 Who may send a message:
 
-ANYONE     accepted from anyone at any time: the messages that make the field safe
-AUTHORITY  moves the mirror: token of the one authority, and expires
-KEY        changes stored settings: a truncated HMAC and an edition besides
-CLUSTER    from the cluster controller, about every second: time, sun, session
-ASK        a question of the cluster controller; it changes nothing
-NODE       an answer of a local controller
+ANYONE accepted from anyone at any time: the messages that make the field safe AUTHORITY moves the
+heliostat: carries the authority's token, and expires KEY changes stored settings: also carries a
+truncated HMAC and an edition CLUSTER from the cluster controller, about every second: time, sun,
+session ASK a query from the cluster controller; it changes nothing NODE a reply from a local
+controller
 
 Payloads of AUTHORITY and KEY messages begin with a head, which their rows leave out: the
-authority's ``token``; ``expires_s``, the GPS second after which the command is void; and for
-KEY the ``edition``, a number that only rises, kept in the journal, so that a stored value
-cannot be set again by a recorded message, whatever was reset in between.
+authority's ``token``; ``expires_s``, the GPS second after which the command is void; and for KEY
+the ``edition``, a number that only increases, kept in the journal, so that a recorded message
+cannot set a stored value again, whatever was reset in between.
 
 GPS seconds count from 6 January 1980 without leap seconds, modulo 2^32.
 
-Traits, which plant and clusters need, and boards do not:
+Traits, needed by the plant and the clusters but not by boards:
 
-moves      moves the heliostat by its parameters
-joins      brings its beam to the aim
-standby    brings its beam to the standby point
-counts     moves it by step counts, from where it stands
-sliced     goes to many heliostats in slices
-releases   ends a lock or a fault
-stands     an idle heliostat stands still after it, and follows no standby point
-point      gives a point; only the last one counts
-setting    changes how it moves later; it takes no heliostat out of a visit
-harmless   moves nothing, now or later
-stops      only stops the heliostat: it is taken where no motion may begin
-relative   acts again in a second frame
-again      its goal looks like the state before it; a second frame does no harm
-stored     written to flash before it is acknowledged
-operator   an operator may give it; the others of AUTHORITY and KEY need an engineer
-manual     a person who gives it takes the heliostat from automatic control
-automatic  a person who gives it gives the heliostat to automatic control
+moves moves the heliostat by its parameters joins brings its beam to the aim standby brings its beam
+to the standby point counts moves it by step counts, from its present position sliced goes to many
+heliostats in slices releases ends a lock or a fault stands an idle heliostat stands still after it,
+and tracks no standby point point sets a point; only the last one counts setting changes how it
+moves later; it removes no heliostat from a visit harmless moves nothing, now or later stops only
+stops the heliostat; accepted even when no motion may begin relative takes effect again in a second
+frame again its goal looks like the state before it; a second frame does no harm stored written to
+flash before it is acknowledged operator an operator may send it; other AUTHORITY and KEY messages
+need an engineer manual an operator who sends it takes the heliostat from automatic control
+automatic an operator who sends it hands the heliostat to automatic control
 """
 
 ANYONE, AUTHORITY, KEY, CLUSTER, NODE, ASK = 0, 1, 2, 3, 4, 5
 
-#: Codes and names of the fields that begin every payload of a class.
+#: Codes and names of the fields at the beginning of every payload of a class.
 HEADS = {AUTHORITY: ("II", "token expires_s"), KEY: ("III", "token expires_s edition")}
 
 MESSAGES = (
-    # Ask for step counts.
+    # Query the step counts.
     (0x01, "QUERY_STEPS", ASK, "", "", ""),
     # Step counts and their goals.
     (0x02, "STEPS", NODE, "iiii", "primary secondary primary_goal secondary_goal", ""),
-    # Ask for state and flags.
+    # Query the state and the flags.
     (0x03, "QUERY_STATUS", ASK, "", "", ""),
     # State, flags and health.
     (0x04, "STATUS", NODE, "BIBIIHbIH",
      "state flags fault uptime_s sun_age_ms supply_mv temperature_degc armature_crc boots", ""),
-    # Ask for the heliostat's location.
+    # Query the heliostat's location.
     (0x05, "QUERY_POSITION", ASK, "", "", ""),
     # The heliostat's location, ENU.
     (0x06, "POSITION", NODE, "fff", "east_m north_m up_m", ""),
-    # Ask for the last diagnosis of movement.
+    # Query the last motion diagnosis.
     (0x07, "QUERY_DIAGNOSIS", ASK, "", "", ""),
-    # Whether the mirror moved as ordered, by accelerometer or limit switch.
+    # Whether the heliostat moved as ordered, by accelerometer or limit switch.
     (0x08, "DIAGNOSIS", NODE, "Biiff",
      "result moved_primary moved_secondary tilt_x_rad tilt_y_rad", ""),
-    # Ask for a stored item, by its number in the journal.
+    # Query a stored item, by its number in the journal.
     (0x09, "QUERY_STORED", ASK, "B", "item", ""),
     # A stored item.
     (0x0A, "STORED", NODE, "Bs", "item data", ""),
-    # Ask all controllers with a serial number in a range to answer, in slots drawn at random.
+    # Ask all controllers with a serial number in a range to reply, in randomly drawn slots.
     (0x0B, "DISCOVER", ASK, "II", "low high", ""),
     # Serial number, firmware and address.
     (0x0C, "HERE", NODE, "IHH", "serial firmware address", ""),
     # Result of a command.
     (0x0D, "ACK", NODE, "HBB", "sequence_of type_of result", ""),
-    # Ask for what a signed session needs.
+    # Query what a signed session needs.
     (0x0E, "QUERY_BUS", ASK, "", "", ""),
     # A number drawn by the local controller, over which the next SESSION to its address must be
-    # signed, and the fingerprints of the keys of the bus that it has (0: none).
+    # signed, and the fingerprints of the bus keys that it holds (0: none).
     (0x0F, "BUS", NODE, "IIII", "number_high number_low key old_key", ""),
     # GPS time.
     (0x10, "TIME", CLUSTER, "HIB", "week time_of_week_ms quality", ""),
-    # Unit vector to the sun at a GPS second, in 2^-30, and its rate, in 2^-28 a second (the
-    # sun's 7.3e-5 rad/s would not fit 16 bits of 2^-30); the only thing that renews the lease.
+    # Unit vector to the sun at a GPS second, in 2^-30, and its rate, in 2^-28 per second (the sun's
+    # 7.3e-5 rad/s would not fit 16 bits of 2^-30). Only this message renews the lease.
     (0x11, "SUN", CLUSTER, "Iiiihhh", "time_s east north up east_rate north_rate up_rate", ""),
-    # The sender's session: its epoch, which rises with every start; the upper bits of its
-    # sequence; and the token of the authority that commands through it (0: nobody).
+    # The sender's session: its epoch, which increases with every start; the upper bits of its
+    # sequence number; and the token of the authority that commands through it (0: none).
     (0x12, "SESSION", CLUSTER, "IHI", "epoch rollover token", ""),
     # Take the beam off the receiver, now.
     (0x20, "DEFOCUS", ANYONE, "", "", "manual"),
     # Go to the stow position: one heliostat, or all by broadcast.
     (0x21, "STOW", ANYONE, "", "", "manual"),
-    # Leave stow for standby by the safe way.
+    # Leave stow for standby by the safe path.
     (0x30, "APPROACH", AUTHORITY, "", "", "operator moves standby automatic sliced"),
     # Hold position, ready.
     (0x31, "IDLE", AUTHORITY, "", "", "operator moves standby manual"),
     # Track the sun onto the aim.
     (0x32, "TRACK", AUTHORITY, "", "", "operator moves joins automatic"),
-    # Back from defocus to the aim.
+    # Return from defocus to the aim.
     (0x33, "REFOCUS", AUTHORITY, "", "", "operator moves joins automatic"),
-    # Release a lock.
+    # Remove a lock.
     (0x34, "UNLOCK", AUTHORITY, "", "", "operator releases stands"),
-    # Leave FAULT once its cause is gone.
+    # Leave FAULT once its cause has gone.
     (0x35, "CLEAR_FAULT", AUTHORITY, "", "", "releases stands"),
     # Stop and hold position.
     (0x36, "LOCK", AUTHORITY, "", "", "operator harmless stops stands manual"),
@@ -116,8 +108,8 @@ MESSAGES = (
     (0x42, "JOG", AUTHORITY, "Bi", "axis steps", "moves counts stands relative manual"),
     # Move to step counts.
     (0x43, "GOTO", AUTHORITY, "ii", "primary secondary", "moves counts stands again manual"),
-    # Rough (1) or fine (0) stepping: by full steps of the motors where SET_STEPPING has told them,
-    # else by 16 steps at a time.
+    # Rough (1) or fine (0) stepping: by full motor steps if SET_STEPPING has specified them, else
+    # by 16 steps at a time.
     (0x44, "ROUGH", AUTHORITY, "B", "rough", "harmless setting"),
     # Move the beam in a spiral about its aim until the target's camera finds it.
     (0x45, "SEARCH", AUTHORITY, "ff", "pitch_rad radius_rad", "operator moves joins again manual"),
@@ -145,15 +137,15 @@ MESSAGES = (
     # Angles by which the axes turn when defocused.
     (0x58, "SET_DEFOCUS", KEY, "ff", "primary_rad secondary_rad", ""),
     # The safe path from stow: the axis (0 or 1) that moves first when leaving and last when
-    # returning, the number of points (0: the path is found without them), and the points
-    # that the beam passes on its way from the ground to the standby point, ENU.
+    # returning, the number of points (0: the path is found without them), and the points that the
+    # beam passes on its way from the ground to the standby point, ENU.
     (0x59, "SET_WAY", KEY, "BB12f", "azimuth_axis points path_m", ""),
-    # Microsteps of a full step of each motor, and whether the drivers rest (0, 1): then stepping is
-    # rough from the start, motions that follow the sun end on full steps, and the drivers are off
-    # between them.
+    # Microsteps per full step of each motor, and whether the drivers rest (0, 1). If they do,
+    # stepping is rough from the start, motions that track the sun end on full steps, and the
+    # drivers are off in between.
     (0x5A, "SET_STEPPING", KEY, "HHB", "microsteps_primary microsteps_secondary rests", ""),
-    # Key of the bus, encrypted under the key of the local controller; it needs no session and no
-    # clock. The present key again ends the one before; zeros end both.
+    # Bus key, encrypted under the key of the local controller; it needs no session and no clock.
+    # Sending the present key again ends the previous one; zeros end both.
     (0x5B, "SET_BUS_KEY", KEY, "4I", "key", ""),
 )  # fmt: skip
 
@@ -163,7 +155,7 @@ def having(trait: str) -> "frozenset[str]":
     return frozenset([row[1] for row in MESSAGES if trait in row[5].split()])
 
 
-#: Commands that anyone may give at any time.
+#: Commands that anyone may send at any time.
 SAFE = frozenset([row[1] for row in MESSAGES if row[2] == ANYONE])
 #: Commands that need the command authority.
 ORDERS = frozenset([row[1] for row in MESSAGES if row[2] in (AUTHORITY, KEY)])
@@ -215,7 +207,7 @@ def codes_of(number: int) -> str:
     Raises
     ------
     KeyError
-        The table has no such number.
+        If the table has no such number.
     """
     start = _start(number)
     if start < 0:

@@ -1,8 +1,8 @@
 """Motion: how the actions of the state table move the two axes.
 
-One motion runs at a time; starting another replaces it. Leaving stow, the azimuth moves first and
-the elevation last; the beam then travels along the ground to the foot of the tower and up to
-standby, and returns by the same path.
+One motion runs at a time; starting another replaces it. When the heliostat leaves stow, the azimuth
+moves first and the elevation last; the beam then travels along the ground to the foot of the tower
+and up to standby. It returns by the same path.
 """
 
 import math
@@ -15,7 +15,7 @@ from .stepper import BOTH, PRIMARY_FIRST, SECONDARY_FIRST, Stepper
 from .vectors import cross, minus, norm
 
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
+if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such modules
     from collections.abc import Callable
     from typing import Any
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 #: Motions.
 HOLD, MOVE, DEFOCUS, APPROACH, RETURN, STOW, STANDBY, TRACK, SEARCH, DIAGNOSE = range(10)
 
-#: Interval at which goals are renewed, ms; interval at which poses are computed, with
-#: interpolation between them while the angles change by at most this (rad; the chord is then off
-#: by at most 1e-6 rad).
+#: Interval at which goals are renewed, ms; and interval at which poses are computed, ms. Between
+#: the poses, goals are interpolated as long as the angles change by at most this (rad; the chord is
+#: then off by at most 1e-6 rad).
 RENEW_MS, KNOT_MS, KNOT_LIMIT = 200, 4000, 1e-3
-#: A path is followed by poses that divide each straight line evenly. In the mean their beams are at
-#: most this far apart, rad; where the line passes nearest, further.
+#: A path is followed through poses that divide each straight line evenly. On average their beams
+#: are at most this far apart, rad; where the line passes nearest, they are further apart.
 PIECE = 0.1
-#: A way back on which an axis would have to turn by more than this (rad) to the next point is left:
-#: such a turn, in the keyhole or the long way about a stop, carries the beam far off the line.
+#: A path back is abandoned if an axis would have to turn by more than this (rad) to the next point:
+#: such a turn, in the keyhole or the long way around a stop, carries the beam far off the line.
 FAR = 1.6
-#: An armature that stands farther than this (m) from the one before belongs to another mirror.
+#: An armature that is farther than this (m) from the previous one belongs to another heliostat.
 ELSEWHERE = 0.5
-#: Time that the spiral rests on a point, ms.
+#: Time for which the spiral stays at a point, ms.
 DWELL_MS = 2000
-#: Rough stepping waits for this many steps, where a full step is not known.
+#: Rough stepping accumulates this many steps if the full step is unknown.
 ROUGH_STEPS = 16
-#: Drivers that rest are off after this rest of the motors, ms.
+#: Drivers that rest are switched off after the motors have rested for this long, ms.
 RELEASE_MS = 200
 #: Rest before a diagnosis reads the sensor, ms.
 SETTLE_MS = 500
@@ -56,7 +56,8 @@ class Motion:
     sun
         The lease.
     sensor
-        Returns the mirror's tilt measured by an accelerometer as (x, y), rad, or None.
+        Function that returns the mirror's tilt measured by an accelerometer as (x, y), rad, or
+        None.
 
     Attributes
     ----------
@@ -65,17 +66,17 @@ class Motion:
     aim
         ENU, m, or None before the first.
     ready
-        Whether the standby point was reached by the safe way since stow was left.
+        Whether the standby point was reached by the safe path since leaving stow.
     known
         Whether the step counts are known.
     parked
-        Whether the mirror was locked at stow: neither DEFOCUS nor STOW moves it, wherever the stow
-        position is by now.
+        Whether the heliostat was locked at stow: neither DEFOCUS nor STOW moves it, even if the
+        stow position has changed since.
     aside
-        Goals of the defocus that has begun, as step counts; () once it has ended, and the mirror
+        Goals of the defocus that has begun, as step counts; () once it has ended, and the beam
         rests beside its aim or moves with the sun; None: another motion has begun since.
     blind
-        Way (1, -1) in which a mirror with unknown counts may turn away; 0: it has done so.
+        Direction (1, -1) in which a heliostat with unknown counts may turn away; 0: it has done so.
     cut, unreachable
         Whether the last goals were beyond the limits, or the last aim beyond the axes.
     diagnosis
@@ -102,8 +103,8 @@ class Motion:
         self._near = [0.0, 0.0]
         self._start, self._slope = [0.0, 0.0], [0.0, 0.0]
         self._knot_ms = self._renew_ms = self._since_ms = 0
-        self._base = HOLD  # what a defocus turns away from
-        self._offset = config.defocus  # by how much: new angles count from the next defocus on
+        self._base = HOLD  # the motion that a defocus turns away from
+        self._offset = config.defocus  # by how much; new angles apply from the next defocus on
         self._path: list[tuple[float, float, float]] = []
         self._place = 0
         self._spiral: Spiral | None = None
@@ -120,7 +121,7 @@ class Motion:
     def rebuild(self) -> None:
         """Apply the settings; new limits only at rest.
 
-        The counts of one mirror say nothing about another one, where its board is now.
+        The counts of one heliostat say nothing about another one to which its board has been moved.
         """
         config = self.config
         if config.pointing is not None:
@@ -167,12 +168,12 @@ class Motion:
         return self.stepper is None or self.stepper.still()
 
     def following(self) -> bool:
-        """Whether the mirror follows the sun, so that its beam stays in place."""
+        """Whether the heliostat tracks the sun, so that its beam stays in place."""
         kind = self._base if self.kind == DEFOCUS else self.kind
         return kind in (STANDBY, TRACK, SEARCH) and self.sun.fresh()
 
     def at_stow(self) -> bool:
-        """Whether the mirror is at stow."""
+        """Whether the heliostat is at stow."""
         stow = self.config.stow
         return (
             self.known
@@ -187,9 +188,10 @@ class Motion:
         return self.kind in (STOW, RETURN) or (self.kind == DEFOCUS and bool(self.aside))
 
     def may_rest(self, elapsed_ms: int) -> bool:
-        """Whether the drivers may be off: full steps hold without current.
+        """Return whether the drivers may be off: full steps hold without current.
 
-        Between full steps a motor without current turns to the nearest one, unseen by the counts.
+        Between full steps, a motor without current turns to the nearest full step, which the counts
+        do not register.
         """
         full = self.config.microsteps
         at_rest = self.still() and (self.rough > 0 or not self.following())
@@ -201,10 +203,10 @@ class Motion:
         return self._resting_ms >= RELEASE_MS
 
     def halted(self, primary: int, secondary: int) -> None:
-        """After an emergency stop: take back these signed steps, emitted but not made."""
+        """After an emergency stop, subtract these signed steps, which were emitted but not made."""
         self.kind = HOLD
         if self._turns == 1 and not self.still():
-            self.blind = -1  # a limit switch has ended the blind turn: the other way is left
+            self.blind = -1  # a limit switch ended the blind turn; only the other direction is left
         self._turns = 0
         if self.stepper is not None:
             self.stepper.undone(primary, secondary)
@@ -212,7 +214,7 @@ class Motion:
     # Poses.
 
     def pose(self, aim: tuple[float, float, float], ahead_ms: int) -> "Pose | None":
-        """Return the pose for an aim, some time from now; None if none within the stops fits."""
+        """Return the pose for an aim, some time from now; None if no pose lies within the stops."""
         pointing = self.config.pointing
         if pointing is None or self.stepper is None:
             return None
@@ -226,14 +228,14 @@ class Motion:
         return pose if pose.status == OK else None
 
     def reaches(self, points: "list[tuple[float, float, float]]") -> bool:
-        """Whether the beam can be sent to all these points now."""
+        """Return whether the beam can be sent to all these points now."""
         for point in points:  # noqa: SIM110 - a generator would allocate
             if self.pose(point, 0) is None:
                 return False
         return True
 
     def _go_angles(self, angles: "list[float]", order: int) -> None:
-        """Go to joint angles, by ``follow`` where order is −1."""
+        """Go to joint angles, by ``follow`` if order is −1."""
         stepper, steps = self.stepper, [0, 0]
         if stepper is None:
             return
@@ -250,9 +252,9 @@ class Motion:
         self.cut = not inside
 
     def _follow(self, aim: tuple[float, float, float]) -> bool:
-        """Keep the beam on an aim while time goes on; return False if no pose reaches it."""
+        """Keep the beam on an aim as time passes; return False if no pose reaches it."""
         if self._knot_ms <= 0:
-            # Goals hold until the next renewal: they are right at its middle.
+            # Goals hold until the next renewal, so they are exact at the middle of the interval.
             pose = self.pose(aim, RENEW_MS // 2)
             if pose is None:
                 return False
@@ -274,7 +276,7 @@ class Motion:
         return True
 
     def _away(self, i: int, angle: float) -> float:
-        """Return an angle turned away by the defocus; the other way where a stop is near."""
+        """Return an angle turned away by the defocus, in the other direction if a stop is near."""
         offset = self._offset[i]
         low, high = self._stops[i]
         for away in (angle + offset, angle - offset):
@@ -283,13 +285,14 @@ class Motion:
         return low if angle - low > high - angle else high
 
     def _turn(self) -> "list[float] | None":
-        """Choose by how much a defocus turns; return the angles in which one from standby ends.
+        """Choose by how much a defocus turns; return the final angles of one from standby.
 
-        From standby, held there too, it goes down the safe way, and on the way up back as it has
-        come, until an axis has turned by its angle or the ground is reached. No other place is
-        known to be off the receiver: the aim may be on a target. From an aim, the axes turn away
-        from standby, which is beside the receiver. A mirror that is held elsewhere, where a person
-        has left it, turns off the aim. Without a recent sun, by the angles.
+        From standby, even if held there, the beam goes down the safe path, and on the way up it
+        goes back along its path, until an axis has turned by its angle or the beam reaches the
+        ground. No other place is known to be off the receiver, because the aim may be on a target.
+        From an aim, the axes turn away from standby, which is beside the receiver. A heliostat held
+        elsewhere, where a person has left it, turns off the aim. Without a recent sun vector, the
+        angles alone decide.
         """
         primary, secondary = self._offset = self.config.defocus
         if not self.known or self.sun.since_ms > RECENT_MS:
@@ -306,7 +309,7 @@ class Motion:
             first, second = abs(near[0] - pose.angles[0]), abs(near[1] - pose.angles[1])
             if max(first, second) > FAR:
                 break
-            # The next pose overwrites this one, even where the beam cannot follow.
+            # The next pose overwrites this one, even if the beam cannot follow.
             chosen, self._target, self._offset = list(pose.angles), point, (0.0, 0.0)
             if first >= primary or second >= secondary or point[2] <= points[0][2]:
                 break
@@ -327,16 +330,16 @@ class Motion:
             self.stepper.stop()
 
     def lock(self) -> None:
-        """Stand still, a motion that takes the beam off excepted: it goes on to its end."""
+        """Stand still, except for a motion that takes the beam off, which continues to its end."""
         if self.leaving():
             self._base = HOLD
         else:
             self.hold()
 
     def defocus(self) -> None:
-        """Turn away from the present position; where the counts are unknown, once, by as much.
+        """Turn away from the present position; with unknown counts, once, by the same amount.
 
-        A turn that an emergency stop or a reset has interrupted goes on to the same goals.
+        A turn that was interrupted by an emergency stop or a reset continues to the same goals.
         """
         if self.kind in (DEFOCUS, STOW):
             return
@@ -344,7 +347,7 @@ class Motion:
             self.kind = HOLD
             self.stow_directly()
             return
-        # At stow an approach may have begun that has not made its first step.
+        # At stow, an approach may have begun without having made its first step.
         still = self.parked or self.at_stow()
         if still or self.stepper is None or None in self.config.drives:
             self.hold()
@@ -360,8 +363,8 @@ class Motion:
             if sense == 0 or not self.still():
                 self.hold()
                 return
-            # The middle of the range stands for the unknown counts: the steps are of the right
-            # size for a rotary drive, about right for a jack.
+            # The middle of the range represents the unknown counts; the step size is then correct
+            # for a rotary drive, and about right for a jack.
             first, second = self.stepper.axes
             self.declare((first.low + first.high) // 2, (second.low + second.high) // 2, False)
             self.blind, self._turns = 0, sense
@@ -375,13 +378,14 @@ class Motion:
             assert drive is not None
             angle = drive.angle(self.place(i))
             away = self._away(i, angle)
-            # The other way is twice as far: past the place where the first turn began.
+            # In the other direction it is twice as far, beyond the position where the first turn
+            # began.
             angles[i] = away if sense > 0 else 3.0 * angle - 2.0 * away
         self._go_angles(angles if down is None else down, BOTH)
         self.aside = (self.goal(0), self.goal(1)) if self.known else None
 
     def stow(self) -> None:
-        """Return by the way of the approach, as far as the sun allows, and go to stow."""
+        """Return by the path of the approach, as far as the sun allows, and go to stow."""
         if not (self.sun.fresh() and self.config.complete()):
             self.stow_directly()
             return
@@ -392,7 +396,7 @@ class Motion:
             if self.kind in (TRACK, SEARCH) and self.aim is not None:
                 points = self._pieces([self.aim] + points)[1:]
             elif self.kind == DEFOCUS:
-                # Beside the receiver: down from there, not across it.
+                # From beside the receiver, go down, not across it.
                 top = self.config.standby[2]
                 if self._target is not None:
                     top = min(top, self._target[2])
@@ -413,7 +417,7 @@ class Motion:
             return
         stow = self.config.stow
         if not self.known or self.stepper is None or stow is None or not self.config.fits():
-            self.defocus()  # stow cannot be found, but the beam can go
+            self.defocus()  # stow cannot be found, but the beam can leave
             return
         self.kind = STOW
         order = SECONDARY_FIRST if self.config.azimuth_axis == 0 else PRIMARY_FIRST
@@ -462,7 +466,7 @@ class Motion:
 
     def move(self) -> None:
         """Go to the prepared step counts."""
-        self.kind, self._target = MOVE, None  # one that is held there does not stand at standby
+        self.kind, self._target = MOVE, None  # a heliostat held there does not stand at standby
         if self.stepper is not None:
             self.stepper.go(self._home[0], self._home[1], BOTH)
 
@@ -482,7 +486,7 @@ class Motion:
             self._target = self.config.standby
 
     def set_rough(self, steps: int) -> None:
-        """Wait for this many steps before following; 0 is fine stepping."""
+        """Accumulate this many steps before following; 0 means fine stepping."""
         self.rough = steps
         if self.stepper is not None:
             self.stepper.rough = steps
@@ -491,7 +495,7 @@ class Motion:
         self.kind, self._target = kind, target
         self._knot_ms = self._renew_ms = 0
 
-    # The safe way.
+    # The safe path.
 
     def way(self) -> "list[tuple[float, float, float]]":
         """Return points from the ground to standby, close enough to each other."""
@@ -516,7 +520,7 @@ class Motion:
     def _pieces(
         self, points: "list[tuple[float, float, float]]"
     ) -> "list[tuple[float, float, float]]":
-        """Return the points, with more between them; see ``PIECE``."""
+        """Return the points with intermediate points; see ``PIECE``."""
         pointing = self.config.pointing
         assert pointing is not None
         path = [points[0]]
@@ -539,7 +543,7 @@ class Motion:
         return path
 
     def _on_path(self) -> str:
-        """Advance along the path; return an event at its end or where no pose reaches it."""
+        """Advance along the path; return an event at its end or if no pose reaches it."""
         if not self.still():
             return ""
         self._place += 1
@@ -547,7 +551,7 @@ class Motion:
             pose = self.pose(self._path[self._place], 0)
             if pose is None:
                 return "UNREACHABLE"
-            # `pose` keeps the turn of each axis from where it was asked for last.
+            # `pose` keeps the turn of each axis from the last call.
             if self.kind == RETURN:
                 for i in (0, 1):
                     if abs(pose.angles[i] - self._near[i]) > FAR:
@@ -595,12 +599,13 @@ class Motion:
                 and self.following()
                 and not self._follow(self._target)
             ):
-                # It stands now, and the beam of a standing mirror moves with the sun.
+                # The heliostat stands still now, and the beam of a heliostat at rest moves with the
+                # sun.
                 self._base = HOLD
         return ""
 
     def _spin(self, elapsed_ms: int) -> str:
-        """The search: from point to point."""
+        """Advance the search from point to point."""
         self._wait_ms -= elapsed_ms
         if self._wait_ms > 0 or self._spiral is None or self.aim is None:
             return ""
@@ -615,7 +620,7 @@ class Motion:
         return ""
 
     def _diagnose(self, elapsed_ms: int) -> None:
-        """The diagnosis: a motion, a rest, the next motion."""
+        """Advance the diagnosis: a motion, a rest, the next motion."""
         stepper = self.stepper
         if stepper is None:
             return
@@ -625,7 +630,7 @@ class Motion:
         self._wait_ms = SETTLE_MS
         diagnosis = self._diagnosis
         if diagnosis is None:
-            from .diagnosis import Diagnosis  # rare: it need not always fill a board's memory
+            from .diagnosis import Diagnosis  # rare, so it need not always occupy a board's memory
 
             diagnosis = self._diagnosis = Diagnosis(self.config, [self.place(0), self.place(1)])
         steps = diagnosis.advance(self.sensor())

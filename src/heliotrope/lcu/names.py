@@ -2,7 +2,8 @@
 
 from . import states
 
-#: Who causes an event: anyone at any time; the command authority, fresh; the controller itself.
+#: Source of an event: anyone at any time; the command authority, with a fresh frame; the controller
+#: itself.
 SAFE, COMMAND, INTERNAL = range(3)
 
 #: Event: kind, meaning.

@@ -35,7 +35,7 @@ from .controller import Controller
 from .journal import HEALTHY_MS, Journal, item_name
 
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
+if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such modules
     from collections.abc import Callable
     from typing import Any, Protocol
 
@@ -43,20 +43,20 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     from .signing import BusKeys
 
     class StepTimer(Protocol):
-        """Hardware that makes the steps of two axes."""
+        """Hardware that makes the steps of the two axes."""
 
         def play(self, axis: int, direction: int, count: int, interval_us: int) -> None:
-            """Queue ``count`` steps of ``axis`` (0, 1), ``direction`` being 1 or -1.
+            """Queue ``count`` steps of ``axis`` (0, 1), with ``direction`` 1 or -1.
 
-            The steps come after those already queued for the axis, ``interval_us`` apart. The
-            two axes run independently. It never blocks.
+            The steps follow those already queued for the axis, ``interval_us`` apart. The two axes
+            run independently. The call never blocks.
             """
 
         def stop(self) -> "tuple[int, int]":
-            """Stop both axes at once; return the signed steps queued and not made, by axis."""
+            """Stop both axes at once; return the signed steps queued but not made, by axis."""
 
 
-#: Slots in which HERE answers DISCOVER: their number, and the length of each (ms).
+#: Slots in which HERE replies to DISCOVER: their number, and the length of each (ms).
 HERE_SLOTS, HERE_SLOT_MS = 32, 20
 ACK, HERE, STORED = 0x0D, 0x0C, 0x0A
 QUERY_BUS, BUS, SET_BUS_KEY = 0x0E, 0x0F, 0x5B
@@ -65,16 +65,16 @@ HEALTHY = -1
 
 
 def no_sensor() -> "tuple[float, float] | None":
-    """Return no tilt: no accelerometer is fitted."""
+    """Return no tilt, because no accelerometer is fitted."""
     return None
 
 
 def no_watchdog() -> None:
-    """Feed nothing."""
+    """Do nothing, because there is no watchdog."""
 
 
 def no_enable(on: bool) -> None:
-    """Switch nothing: the motors' drivers are always on."""
+    """Do nothing, because the motors' drivers are always on."""
 
 
 class Node:
@@ -86,7 +86,7 @@ class Node:
         NOR flash: ``block_size``, ``blocks``, ``read``, ``write``, ``erase``; see ``journal``.
     timer
         Step timer: ``play(axis, direction, count, interval_us)``, and ``stop()``, which returns
-        the signed steps that were queued and not made.
+        the signed steps that were queued but not made.
     write
         Sends bytes to the cluster controller.
     now_ms
@@ -96,20 +96,20 @@ class Node:
     sha256
         The hash, ``sha256(data) -> 32 bytes``; None: nothing can be stored.
     key
-        Of this controller; b"": nothing can be stored.
+        Key of this controller; b"": nothing can be stored.
     sensor
-        Returns the mirror's tilt (x, y), rad, or None; see ``Motion``.
+        Function that returns the mirror's tilt (x, y), rad, or None; see ``Motion``.
     feed
-        Feeds the hardware's watchdog.
+        Function that feeds the hardware watchdog.
     drivers
-        Switches the motors' drivers on (True) or off; they are on at the start.
+        Function that switches the motors' drivers on (True) or off; they are on at start-up.
 
     Attributes
     ----------
     controller, gate, journal, reader, timer
         The parts.
     trouble
-        The error of flash that has failed, empty if it has not.
+        The error of flash that has failed, empty if there is none.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class Node:
         edition = journal.numbers("edition")
         self.gate = wire.Gate(sha256, key, edition[0] if edition else 0)
         self.controller = Controller(config, now_ms, self.gate, sensor)
-        self._address = self._sequence = 0  # of the answers to the frame in hand
+        self._address = self._sequence = 0  # of the replies to the current frame
         self._here: tuple[Any, ...] = ()  # a HERE that waits for its slot
         self._slot, self._well = ticks.Deadline(), ticks.Deadline()
         self._well.start(now_ms, HEALTHY_MS)
@@ -164,18 +164,18 @@ class Node:
         self._obey(actions, now_ms)
         if self.trouble or not good:
             self.on_fault(controller.JOURNAL, now_ms, False)
-            if not self.trouble:  # what was lost can be stored again
+            if not self.trouble:  # lost settings can be stored again
                 self.controller.fault_gone(controller.JOURNAL)
 
     def on_bytes(self, data: bytes, now_ms: int) -> None:
-        """Take received bytes, in pieces of any size."""
+        """Accept received bytes, in pieces of any size."""
         for frame in self.reader.feed(data):
             self.on_frame(frame, now_ms)
 
     def on_frame(self, frame: "wire.Frame", now_ms: int) -> None:
-        """Take a whole frame; a simulated bus may read it once for many nodes."""
+        """Handle a complete frame; a simulated bus may parse it once for many nodes."""
         own = self.controller
-        # A new address takes effect after the answer.
+        # A new address takes effect after the reply.
         self._address, self._sequence = own.config.address, frame.sequence
         if frame.number in (QUERY_BUS, SET_BUS_KEY):
             if frame.to == self._address:
@@ -194,10 +194,10 @@ class Node:
             self._obey([(HEALTHY,)], now_ms)
 
     def on_fault(self, number: int, now_ms: int, halt: bool) -> None:
-        """Latch a fault (of ``controller``) that the board has found; ``halt`` stops the motors.
+        """Latch a fault (of ``controller``) that the board has detected; ``halt`` stops the motors.
 
         The cause counts as present until ``fault_gone``. ``controller.SWITCH``, always with
-        ``halt``, is no fault: the drives have been switched off at the mirror, and it is locked.
+        ``halt``, is no fault: the drives have been switched off at the heliostat, and it is locked.
         """
         undone = self.timer.stop() if halt else (0, 0)
         self._obey(self.controller.on_fault(number, now_ms, halt), now_ms)
@@ -205,14 +205,14 @@ class Node:
             self._obey(self.controller.halted(undone[0], undone[1]), now_ms)
 
     def fault_gone(self, number: int) -> None:
-        """Note that the cause of a fault is gone; the fault stays until CLEAR_FAULT."""
+        """Note that the cause of a fault has gone; the fault remains until CLEAR_FAULT."""
         self.controller.fault_gone(number)
 
     def on_supply_failing(self, now_ms: int) -> bool:
-        """Stop and store the step counts: the supply falls and milliseconds are left.
+        """Stop and store the step counts, because the supply is failing and milliseconds are left.
 
-        Returns whether flash holds the counts. The fault SUPPLY is latched; when the supply has
-        come back without a reset, call ``fault_gone``.
+        Returns whether flash holds the counts. The fault SUPPLY is latched; if the supply comes
+        back without a reset, call ``fault_gone``.
         """
         undone = self.timer.stop()
         motion = self.controller.motion
@@ -233,10 +233,10 @@ class Node:
         self.controller.supply_mv = min(max(supply_mv, 0), 0xFFFF)
         self.controller.temperature_degc = min(max(temperature_degc, -128), 127)
 
-    # The key of the bus.
+    # The bus key.
 
     def _begin_bus(self, sha256: "Callable[[bytes], bytes]") -> "BusKeys":
-        """Return the keys of the bus, whose module is loaded when it is first needed."""
+        """Return the bus keys, whose module is loaded when it is first needed."""
         from .signing import BusKeys
 
         if self._bus is None:
@@ -263,7 +263,7 @@ class Node:
                 self.gate.edition = values[2]
                 bus.take(stored)
                 if not keyed:
-                    self.gate.replay.epoch = -1  # anybody may have set it
+                    self.gate.replay.epoch = -1  # anyone may have set it
             else:
                 result = messages.NOT_STORED
         self._answer(ACK, (self._sequence, frame.number, result), True, now_ms)
@@ -314,7 +314,7 @@ class Node:
             return False
         return True
 
-    # Answers.
+    # Replies.
 
     def _answer(self, number: int, values: "tuple[Any, ...]", kept: bool, now_ms: int) -> None:
         if number == ACK and values[2] == messages.DONE and not kept:
@@ -326,7 +326,7 @@ class Node:
         self._slot.start(now_ms, self._draw(now_ms) * HERE_SLOT_MS)
 
     def _draw(self, now_ms: int) -> int:
-        """Return a slot, different for each controller and each time: xorshift of Marsaglia."""
+        """Draw a slot, different for each controller and each time; Marsaglia's xorshift."""
         chance = self._chance ^ now_ms or 1
         chance ^= (chance << 13) & 0xFFFFFFFF
         chance ^= chance >> 17

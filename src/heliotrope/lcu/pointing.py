@@ -14,15 +14,15 @@ import math
 
 from .vectors import about, across, add, cross, dot, finite, minus, norm, times, turn_between, unit
 
-#: How a solution ended: as in ``heliotrope.mechanism.tracking.TrackingStatus``.
+#: How a solution ended, as in ``heliotrope.mechanism.tracking.TrackingStatus``.
 OK, UNREACHABLE, STOPPED, NOT_CONVERGED, DEGENERATE = range(5)
 
-#: Largest miss of the beam at its aim, m, where precision allows it.
+#: Largest distance by which the beam misses its aim, m, as far as precision allows.
 TOLERANCE = 2e-10
-#: Newton replaces the fixed point when a step gains less than this factor.
+#: Newton replaces the fixed-point iteration if a step reduces the error by less than this factor.
 SLOW = 0.3
 STEPS, NEWTON_STEPS, TRIALS = 20, 60, 20
-#: Source and aim closer to opposite than this (rad), or aim nearer to the vertex (m).
+#: Source and aim are closer to opposite than this (rad), or the aim is nearer to the vertex (m).
 DEGENERATE_LIMIT = 1e-6
 #: A pose on the branch of the last one that moves less than this (rad) is taken at once.
 CLOSE = 0.05
@@ -39,7 +39,7 @@ def epsilon(number: float) -> float:
 
 
 def into_stops(theta: float, low: float, high: float, near: float) -> tuple[float, bool]:
-    """(angle, inside): theta + 2πk within the stops nearest to ``near``, or the nearer stop."""
+    """(angle, inside): theta + 2πk within the stops and nearest to ``near``, or the nearer stop."""
     turn = 2.0 * math.pi
     theta += turn * math.floor((near - theta) / turn + 0.5)
     if theta < low - STOP_SLACK:
@@ -118,11 +118,11 @@ class Pointing:
     def turned(
         self, turn: tuple[float, float, float, float], u: tuple[float, float, float]
     ) -> tuple[float, float, float]:
-        """Vector ``u`` of the mirror at turn (sin θ₁, cos θ₁, sin θ₂, cos θ₂)."""
+        """Return the mirror's vector ``u`` after a turn (sin θ₁, cos θ₁, sin θ₂, cos θ₂)."""
         return about(self.axis_1, turn[0], turn[1], about(self.axis_2, turn[2], turn[3], u))
 
     def vertex(self, turn: tuple[float, float, float, float]) -> tuple[float, float, float]:
-        """Vertex from the primary origin, m, at a turn."""
+        """Return the vertex relative to the primary origin, m, at a turn."""
         arm = add(self.elbow, about(self.axis_2, turn[2], turn[3], self.arm))
         return about(self.axis_1, turn[0], turn[1], arm)
 
@@ -135,20 +135,20 @@ class Pointing:
     ) -> Pose:
         """Return the pose that sends light from the sun to the aim.
 
-        Of the two branches, the one within the stops that moves least; if neither reaches the
-        aim, the nearest pose, whose status and residual say so. The pose is overwritten by
-        the next call.
+        It is the branch within the stops that moves least. If neither branch reaches the aim, it is
+        the nearest pose, with status and residual set accordingly. The next call overwrites the
+        pose.
 
         Parameters
         ----------
         sun
-            To the sun, ENU; of length near 1.
+            Vector to the sun, ENU, of length near 1.
         aim
             ENU, m.
         stops
             [[low, high] of θ₁, the same of θ₂], rad; may be infinite.
         near
-            Joint angles now, rad.
+            Present joint angles, rad.
         """
         last = self.last
         self.solve_branch(last, sun, aim, stops, near)
@@ -181,7 +181,7 @@ class Pointing:
         stops: list[list[float]],
         near: list[float],
     ) -> None:
-        """Solve one branch into ``pose``; beyond the stops it is STOPPED, without angles."""
+        """Solve one branch into ``pose``; beyond the stops it becomes STOPPED, without angles."""
         s, p = unit(sun), minus(aim, self.origin)
         turn = self._fixed_point(pose, s, p)
         if pose.status == DEGENERATE:
@@ -203,7 +203,7 @@ class Pointing:
         stops: list[list[float]],
         near: list[float],
     ) -> None:
-        """Nearest pose on the border of the stops' rectangle."""
+        """Find the nearest pose on the border of the stops' rectangle."""
         s, p = unit(sun), minus(aim, self.origin)
         for axis in (0, 1):
             for held in stops[axis]:
@@ -275,7 +275,7 @@ class Pointing:
             new = self.vertex(turn)
             moved = minus(new, m)
             if reached:
-                # The ray leaves parallel to the old path: motion along it misses nothing.
+                # The ray leaves parallel to the old path; motion along the path causes no miss.
                 moved = across(moved, path)
             m = new
             size = norm(moved)
@@ -303,7 +303,7 @@ class Pointing:
         p: tuple[float, float, float],
         turn: tuple[float, float, float, float],
     ) -> float:
-        """Angle of the normal from the bisector at a turn, rad."""
+        """Return the angle between the normal and the bisector at a turn, rad."""
         gap, _, distance = self._gap(s, p, turn)
         if distance == 0.0:
             return math.pi
@@ -316,9 +316,9 @@ class Pointing:
         p: tuple[float, float, float],
         turn: tuple[float, float, float, float],
     ) -> bool:
-        """Whether the beam at a turn passes the aim within tolerance and rounding."""
+        """Return whether the beam at a turn passes the aim within tolerance and rounding."""
         gap, _, distance = self._gap(s, p, turn)
-        # A normal that is off by x sends the beam off by 2x.
+        # A normal that is off by x deflects the beam by 2x.
         limit = self.tolerance + 16.0 * self.eps * distance
         return distance > 0.0 and 2.0 * distance * norm(gap) <= limit
 
@@ -377,7 +377,7 @@ class Pointing:
                 damping = 10.0 * damping
             damping = max(0.1 * damping, self.eps)
             if not cost < before * (1.0 - 64.0 * self.eps):
-                # A minimum with a remainder: no pose near here sends the beam to p.
+                # A minimum with a remainder means that no pose near here sends the beam to p.
                 pose.status = OK if self._strikes(s, p, turn) else UNREACHABLE
                 return turn
         return turn

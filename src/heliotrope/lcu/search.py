@@ -4,7 +4,7 @@ import math
 
 
 class Spiral:
-    """Points of an Archimedean spiral, as far apart along it as its turns are.
+    """Points of an Archimedean spiral, spaced along it as far apart as its turns.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Spiral:
         self.over = False
 
     def advance(self) -> bool:
-        """Go on to the next point, in ``offset`` (right, up); return False at the end."""
+        """Advance to the next point, in ``offset`` (right, up); return False at the end."""
         if self.over:
             return False
         per_radian = self.pitch / (2.0 * math.pi)

@@ -1,4 +1,4 @@
-"""The sender's side of the bus protocol: numbers, frames and signs. Boards do not contain it."""
+"""The sender's side of the bus protocol: numbers, frames, signatures. Boards do not contain it."""
 
 import struct
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 class Sender:
-    """Numbers and frames the messages of one sender: the counterpart of ``Gate``.
+    """Numbers and frames the messages of one sender; the counterpart of ``Gate``.
 
     Parameters
     ----------
     address
-        Of the sender.
+        Address of the sender.
     epoch
         Greater than at any earlier start: the GPS second of the start.
     sha256
@@ -27,9 +27,10 @@ class Sender:
     Attributes
     ----------
     epoch, count
-        Of the last frame made.
+        Epoch and count of the last frame created.
     sign
-        Returns the tag of bytes under the key of the bus (`signing.tag`); None: nothing is signed.
+        Function that returns the tag of bytes under the bus key (`signing.tag`); None: nothing is
+        signed.
     """
 
     def __init__(
@@ -57,12 +58,12 @@ class Sender:
     def session(self, token: int) -> bytes:
         """Return a SESSION for all, to be sent once a second; ``token`` 0: no authority.
 
-        Within the last 65536 numbers of an epoch the next one is begun.
+        Within the last 65536 numbers of an epoch, the next epoch begins.
         """
         return self._session(wire.BROADCAST, token, self.sign)
 
     def session_to(self, address: int, token: int, number: bytes, sign: "Sign") -> bytes:
-        """Return a SESSION for one address, signed over the number that it has drawn."""
+        """Return a SESSION for one address, signed over the number that the receiver drew."""
         return self._session(address, token, sign, number)
 
     def _session(self, to: int, token: int, sign: "Sign | None", number: bytes = b"") -> bytes:

@@ -26,7 +26,7 @@ import struct
 from . import messages, wire
 
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
+if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such modules
     from collections.abc import Callable
     from typing import Any
 
@@ -38,7 +38,7 @@ NO_KEY = bytes(KEY_SIZE)
 
 
 def pads_of(key: bytes) -> "Pads":
-    """Return the two padded keys of HMAC; they are kept, which saves half of its time here."""
+    """Return the two padded HMAC keys, which are kept because that saves half of the time here."""
     key += bytes(64 - len(key))
     return bytes([byte ^ 0x36 for byte in key]), bytes([byte ^ 0x5C for byte in key])
 
@@ -49,19 +49,19 @@ def tag(sha256: "Hash", pads: "Pads", data: bytes) -> bytes:
 
 
 def counted(epoch: int, count: int) -> bytes:
-    """Return the freshness value of a frame by its place among those of its sender."""
+    """Return the freshness value of a frame, from its position among its sender's frames."""
     return struct.pack("<II", epoch, count & 0xFFFFFFFF)
 
 
 def fingerprint(sha256: "Hash", pads: "Pads") -> int:
-    """Return a number that identifies a key and reveals nothing about it; 0 is none."""
+    """Return a number that identifies a key and reveals nothing about it; 0 means none."""
     return int(struct.unpack("<I", tag(sha256, pads, b"id")[:4])[0]) or 1
 
 
 def wrapped(sha256: "Hash", own_key: bytes, edition: int, key: bytes) -> bytes:
-    """Return the bus's key as SET_BUS_KEY carries it, or undo that.
+    """Return the bus key in the form that SET_BUS_KEY carries, or undo that.
 
-    It is added, modulo 2, to HMAC-SHA256 of the edition under the key of the one local controller.
+    It is combined by XOR with HMAC-SHA256 of the edition under the key of the one local controller.
     An edition is used once, so this is a one-time pad; the MAC of the message protects it.
     """
     pad = wire.hmac_sha256(sha256, own_key, struct.pack("<I", edition))
@@ -69,16 +69,16 @@ def wrapped(sha256: "Hash", own_key: bytes, edition: int, key: bytes) -> bytes:
 
 
 class BusKeys:
-    """The keys of the bus at a local controller: the newest, and while it is replaced an old one.
+    """The bus keys of a local controller: the newest, and an old one during a key change.
 
     Parameters
     ----------
     sha256
         The hash.
     own_key
-        Of the local controller, under which it is given keys of the bus.
+        Key of the local controller, under which bus keys are sent to it.
     serial, boots
-        Of the local controller, for the numbers that it draws.
+        Serial number and boot count of the local controller, for the numbers that it draws.
 
     Attributes
     ----------
@@ -107,8 +107,8 @@ class BusKeys:
     def with_key(self, payload: bytes) -> bytes:
         """Return the record to store after a SET_BUS_KEY.
 
-        A new key comes before the present one, the present one again ends an old one, and zeros
-        end all.
+        A new key goes before the present one, the present key sent again ends the old one, and
+        zeros end both.
         """
         edition = struct.unpack("<I", payload[8:12])[0]
         key = wrapped(self._sha256, self._own_key, edition, payload[12:])
@@ -127,7 +127,7 @@ class BusKeys:
         return high, low, prints[0], prints[1]
 
     def judge(self, frame: "wire.Frame", values: "tuple[Any, ...]", replay: "wire.Replay") -> int:
-        """Return DONE if a frame is signed as it must be; without a key every frame is."""
+        """Return DONE if a frame is signed as required; without a key, every frame passes."""
         if not self._pads:
             return messages.DONE
         alone = frame.number == wire.SESSION and frame.to != wire.BROADCAST

@@ -1,8 +1,9 @@
 """States of a local controller, and all its transitions as one table.
 
 A line: state, event, new state, motion that starts (if any). An event that is not in the table is
-refused and changes nothing. A motion that starts replaces any other. ``names`` describes the events
-and motions. The table is text, because on a microcontroller a tuple per line would take 7 kB more.
+refused and changes nothing. A motion that starts replaces any other motion. ``names`` describes the
+events and motions. The table is text, because on a microcontroller a tuple per line would take 7 kB
+more.
 """
 
 STATES = (
@@ -30,7 +31,7 @@ STATES = (
     FAULT,
 ) = range(10)
 
-#: States that need a fresh sun to enter and to stay in: LAPSED leaves them.
+#: States that need a fresh sun vector to enter and to remain in: LAPSED leaves them.
 NEED_SUN = (APPROACHING, TRACKING, SEARCHING)
 
 #: States in which a beam is at its aim.
@@ -47,7 +48,7 @@ LEAVING = (DEFOCUSED, STOWING)
 TO_STOW = (STOWED, STOWING)
 #: States in which a beam is off and a command brings it out again.
 AWAY = (STOWED, DEFOCUSED)
-#: States that STOW does not change, though the mirror may turn away or go to stow in them.
+#: States that STOW does not change, although the heliostat may turn away or go to stow in them.
 KEPT = (UNCONFIGURED, LOCKED, FAULT)
 
 TABLE = """
@@ -143,7 +144,7 @@ FAULT FAULTED FAULT
 
 
 def transition(state: int, event: str) -> "tuple[int, str] | None":
-    """Return (new state, motion or ""), or None where the event is refused."""
+    """Return (new state, motion or ""), or None if the event is refused."""
     key = "\n" + STATES[state] + " " + event + " "
     start = TABLE.find(key)
     if start < 0:

@@ -34,7 +34,7 @@ def root(square: int) -> int:
 
 
 def stopping(speed: int, change: int) -> int:
-    """Return the distance of a slot at ``speed`` and of the slots of slowing down after it."""
+    """Return the distance of a slot at ``speed`` plus the slots of slowing down after it."""
     m = speed // change
     return (m + 1) * speed - change * m * (m + 1) // 2
 
@@ -59,8 +59,8 @@ class Axis:
     rate, acceleration
         steps/s, steps/s².
     backlash
-        Steps past a goal that is approached from above, so that it is always
-        reached from below.
+        Steps past a goal that is approached from above, so that the goal is always reached from
+        below.
     slot_ms
         Length of a slot.
 
@@ -81,15 +81,15 @@ class Axis:
         self.rate, self.acceleration = rate, acceleration
         self.slot_us = 1000 * slot_ms
         self.shortest_us = -(-1_000_000 // rate)
-        # Intervals are whole microseconds: a slot holds no more steps than fit in it, or the
-        # hardware would fall behind.
+        # Intervals are whole microseconds, so a slot may hold no more steps than fit in it;
+        # otherwise the hardware would fall behind.
         room = self.slot_us * SCALE // self.shortest_us
         self.top = max(1, min(rate * slot_ms * SCALE // 1000, room))
         self.change = max(1, acceleration * slot_ms * slot_ms * SCALE // 1_000_000)
         self.count = self.goal = self.leg = 0
         self.speed = self.phase = 0
         self.direction = 1
-        #: Set ahead of a goal that goes down; see Stepper.follow.
+        #: Set ahead of a goal that moves down; see Stepper.follow.
         self.led = False
         self.braking = False
 
@@ -107,24 +107,24 @@ class Axis:
         return cut == goal
 
     def stop_distance(self) -> int:
-        """Return the most steps that slowing down from the present speed takes."""
+        """Return the largest number of steps needed to slow down from the present speed."""
         if self.speed <= self.change:
             return 0
         return stopping(self.speed - self.change, self.change) // SCALE + 1
 
     def brake(self) -> None:
-        """Slow down and stop, giving the goal up."""
+        """Slow down and stop, abandoning the goal."""
         self.braking = True
         if self.speed == 0:
             self.stand()
 
     def stand(self) -> None:
-        """Take the present count for the goal: a stopped axis has no other."""
+        """Make the present count the goal, because a stopped axis has no other goal."""
         self.goal = self.leg = self.count
         self.braking = False
 
     def slot(self, held: bool) -> int:
-        """Advance by one slot, or slow down if held; return its steps, of sign ``direction``."""
+        """Advance by one slot, or slow down if held; return its steps, signed by ``direction``."""
         if self.speed == 0:
             self.phase = 0
             if self.count == self.leg:
@@ -169,7 +169,7 @@ class Stepper:
         self.slot_ms, self.ahead_ms = slot_ms, max(slot_ms, ahead_ms)
         self.order = BOTH
         self.rough = 0
-        #: Microsteps of a full step by axis: rough stepping then ends on full steps.
+        #: Microsteps per full step by axis; rough stepping then ends on full steps.
         self.full: tuple[int, ...] = (1, 1)
         self.queued_ms = 0
 
@@ -180,11 +180,11 @@ class Stepper:
         return self.axes[1].aim(secondary) and first
 
     def follow(self, primary: int, secondary: int) -> bool:
-        """Stay on goals that move slowly, without passing them by the backlash every time.
+        """Follow goals that move slowly, without passing them by the backlash every time.
 
-        An axis that must go down is set ahead by an eighth of its backlash and waits until the
-        goal has gone by as much. In rough stepping an axis goes to the nearest full step, or
-        waits for ``rough`` steps where a full step is one.
+        An axis that must go down is set ahead by an eighth of its backlash and waits until the goal
+        has moved by as much. In rough stepping an axis goes to the nearest full step; if the full
+        step is unknown, it waits until ``rough`` steps have accumulated.
         """
         self.order = BOTH
         inside = True
@@ -210,7 +210,7 @@ class Stepper:
             axis.brake()
 
     def undone(self, primary: int, secondary: int) -> None:
-        """After an emergency stop: take back signed steps emitted but not made; all stands."""
+        """After an emergency stop, subtract signed steps emitted but not made; both axes stand."""
         for axis, steps in zip(self.axes, (primary, secondary)):  # noqa: B905
             axis.count -= steps
             axis.speed = axis.phase = 0
@@ -226,7 +226,7 @@ class Stepper:
         self.queued_ms -= elapsed_ms
         if self.queued_ms < 0:
             for axis in self.axes:
-                # The hardware ran dry, so the motors stand: they start from rest.
+                # The hardware queue ran empty, so the motors stand still and start from rest.
                 axis.speed = axis.phase = 0
                 if axis.braking:
                     axis.stand()

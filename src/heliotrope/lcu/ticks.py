@@ -15,7 +15,7 @@ def add(tick: int, delta: int) -> int:
 
 
 def diff(later: int, earlier: int) -> int:
-    """Return how far ``later`` lies after ``earlier``: negative if it lies before."""
+    """Return by how much ``later`` follows ``earlier``; negative if it precedes it."""
     return ((later - earlier + HALF) & (PERIOD - 1)) - HALF
 
 
@@ -23,18 +23,18 @@ class Deadline:
     """A span of time that ends on time or too early, never too late (invariant 9).
 
     It stores the time left, not the instant of the end, so it stays right when the counter wraps.
-    Every step of the counter between two looks is charged with its size, whatever its sign: a
-    jump, forwards or backwards, can only shorten the span. Once over, it stays over until
-    ``start`` is called. It is over when made.
+    Every step of the counter between two checks is charged with its size, whatever its sign, so a
+    jump forwards or backwards can only shorten the span. Once over, it stays over until ``start``
+    is called. A new object is over.
 
-    It must be looked at at least once in 2^29 ticks: a counter that wrapped unseen cannot be
+    It must be checked at least once in 2^29 ticks, because a counter that wrapped unseen cannot be
     distinguished from one that stood still. Ending a loop that hangs for longer, or a counter that
     stands still, is up to the hardware watchdog.
 
     Attributes
     ----------
     left
-        Ticks left at the last look.
+        Ticks left at the last check.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class Deadline:
         Raises
         ------
         ValueError
-            A span that the counter cannot measure. The old span is then over.
+            If the counter cannot measure the span. The old span is then over.
         """
         self.left = 0
         if not 0 <= span < HALF:
@@ -63,7 +63,7 @@ class Deadline:
         self.left = span
 
     def look(self, now: int) -> int:
-        """Charge the time since the last look, and return the time left (0: over)."""
+        """Charge the time since the last check, and return the time left (0: over)."""
         step = diff(now, self._seen)
         self._seen = now
         self.left = max(0, self.left - abs(step))

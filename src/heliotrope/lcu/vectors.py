@@ -49,7 +49,7 @@ def unit(a: tuple[float, float, float]) -> tuple[float, float, float]:
 def across(
     a: tuple[float, float, float], axis: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """The part of a perpendicular to the unit axis."""
+    """The component of a perpendicular to the unit axis."""
     along = dot(a, axis)
     return a[0] - along * axis[0], a[1] - along * axis[1], a[2] - along * axis[2]
 
@@ -57,7 +57,7 @@ def across(
 def about(
     axis: tuple[float, float, float], sine: float, cosine: float, u: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """Turn u about the unit axis by the angle of known sine and cosine (Rodrigues)."""
+    """Rotate u about the unit axis by the angle of known sine and cosine (Rodrigues)."""
     along = (1.0 - cosine) * dot(axis, u)
     return (
         cosine * u[0] + sine * (axis[1] * u[2] - axis[2] * u[1]) + along * axis[0],
@@ -71,7 +71,7 @@ def turn_between(
     u: tuple[float, float, float],
     v: tuple[float, float, float],
 ) -> float:
-    """Angle (rad) of the turn about the unit axis that brings u as near to v as can be."""
+    """Angle (rad) of the rotation about the unit axis that brings u as near to v as possible."""
     flat = across(u, axis)
     return math.atan2(dot(axis, cross(flat, v)), dot(flat, v))
 

@@ -37,29 +37,29 @@ from binascii import crc32
 from . import messages, ticks
 
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # for the type checker only: a microcontroller has neither module
+if TYPE_CHECKING:  # for the type checker only; a microcontroller has neither module
     from collections.abc import Callable
     from typing import Any, Protocol
 
     class Signatures(Protocol):
-        """Keys of the bus; see ``signing``."""
+        """Bus keys; see ``signing``."""
 
         @property
         def keyed(self) -> bool:
             """Whether there is a key."""
 
         def judge(self, frame: "Frame", values: "tuple[Any, ...]", replay: "Replay") -> int:
-            """Return DONE if a frame is signed as it must be."""
+            """Return DONE if a frame is signed as required."""
 
 
 VERSION = 2
-#: Version of a frame that is signed with the key of the bus; see ``signing``.
+#: Version of a frame that is signed with the bus key; see ``signing``.
 SIGNED = 3
 CLUSTER_ADDRESS = 0
 SESSION = 0x12
 BROADCAST = 0xFFFF
 
-#: Longest frame with its stuffing and its zero, and the longest payload that it leaves, bytes.
+#: Longest frame with its stuffing and its zero, and the longest payload that this leaves, bytes.
 FRAME_LIMIT = 250
 MAC_SIZE = 8
 HEADER = "<BHHHB"
@@ -67,10 +67,10 @@ HEADER_SIZE = 8
 CRC_SIZE = 4
 PAYLOAD_LIMIT = FRAME_LIMIT - 2 - HEADER_SIZE - CRC_SIZE
 
-#: Longest life of a command, s. It is short enough that fewer than half the sequence numbers
-#: are used in it on the fastest bus: an earlier command is old by its number or has expired.
+#: Longest life of a command, s. On the fastest bus, fewer than half of the sequence numbers are
+#: used in this time, so an earlier command is either old by its number or expired.
 HORIZON_S = 30
-#: After this silence of a sender its next frame must be a SESSION, ms.
+#: After this much silence from a sender, its next frame must be a SESSION, ms.
 SILENCE_MS = 10000
 
 RANGES = {
@@ -86,7 +86,7 @@ LARGEST_DOUBLE = 1.7976931348623157e308
 
 
 def stuff(data: bytes) -> bytes:
-    """Return ``data`` without zeros (consistent overhead byte stuffing), without an end."""
+    """Return ``data`` without zeros (consistent overhead byte stuffing), without a terminator."""
     out = bytearray()
     start = 0
     while True:
@@ -138,7 +138,7 @@ def _single(codes: str) -> str:
 
 
 def _refusal(code: str, value: "Any") -> str:
-    """Return the reason for which a value does not fit a code, or ""."""
+    """Return the reason why a value does not fit a code, or ""."""
     if code == "s":
         return "" if isinstance(value, (bytes, bytearray)) else f"{value!r} is not bytes"
     if code in RANGES:
@@ -165,7 +165,7 @@ def pack(name: str, *values: "Any") -> bytes:
     Raises
     ------
     ValueError
-        An unknown name, a wrong number of values, or a value that its code cannot hold.
+        If the name is unknown, the number of values is wrong, or a code cannot hold its value.
         (``struct`` of MicroPython would truncate it silently.)
     """
     number = messages.NUMBER_OF.get(name)
@@ -223,15 +223,15 @@ def unpack(number: int, payload: bytes) -> "tuple[Any, ...] | None":
 
 
 class Frame:
-    """A whole frame.
+    """A complete frame.
 
     Attributes
     ----------
     to, sender, sequence, number
         As in the header; ``number`` is the type of the message.
     payload
-        Bytes with the head, without the MAC. A known message has a length that fits; in an
-        unknown one it is everything before the CRC.
+        Bytes with the head, without the MAC. In a known message its length is valid; in an unknown
+        one it is everything before the CRC.
     mac
         8 bytes in messages of class KEY and in signed frames, else b"".
     version
@@ -263,7 +263,7 @@ class Frame:
         return messages.name_of(self.number)
 
     def values(self) -> "tuple[Any, ...] | None":
-        """Return the payload's numbers; see ``unpack``. They are read once."""
+        """Return the payload's numbers; see ``unpack``. They are parsed once."""
         if self._values is None:
             self._values = unpack(self.number, self.payload)
         return self._values
@@ -295,7 +295,7 @@ def authenticate(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -
     Raises
     ------
     ValueError
-        An empty key.
+        If the key is empty.
     """
     if not key:
         raise ValueError(f"{frame.name or frame.number}: needs a key to be sent")
@@ -308,9 +308,9 @@ def verify(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -> bool
 
 
 def same(expected: bytes, mac: bytes) -> bool:
-    """Return whether two MACs are the same.
+    """Return whether two MACs are equal.
 
-    All bytes are compared whatever the first ones say, so timing reveals nothing.
+    All bytes are compared whatever the first bytes are, so timing reveals nothing.
     """
     if len(mac) != MAC_SIZE:
         return False
@@ -326,8 +326,8 @@ def encode(frame: Frame) -> bytes:
     Raises
     ------
     ValueError
-        An address, sequence or type out of range; a payload that does not fit the message or
-        the frame; a MAC missing in a message of class KEY, or present in another.
+        If an address, sequence or type is out of range; if a payload does not fit the message or
+        the frame; if a MAC is missing in a message of class KEY, or present in another message.
     """
     what = frame.name or f"message {frame.number}"
     header = (("to", frame.to), ("from", frame.sender), ("sequence", frame.sequence))
@@ -350,20 +350,20 @@ def encode(frame: Frame) -> bytes:
 
 
 def sealed(frame: Frame) -> bytes:
-    """Return the bytes on the wire of a frame that is known to be right."""
+    """Return the wire bytes of a frame that is known to be valid."""
     data = frame.body() + frame.mac
     return stuff(data + struct.pack("<I", crc32(data))) + b"\0"
 
 
 class Reader:
-    """Bytes in any pieces in, whole frames out; at most one frame's bytes are kept.
+    """Bytes in pieces of any size in, complete frames out; at most one frame's bytes are kept.
 
     Attributes
     ----------
     good, crc, cobs, length, version
-        Counts: whole frames; wrong checksums; impossible stuffing; frames too
-        long, too short or of a length that does not fit their message; frames of another
-        version. A frame that is counted under anything but ``good`` changes nothing else.
+        Counts: complete frames; wrong checksums; invalid stuffing; frames that are too long, too
+        short, or of a length that does not fit their message; frames of another version. A frame
+        that is not counted under ``good`` changes nothing else.
     """
 
     def __init__(self) -> None:
@@ -376,7 +376,7 @@ class Reader:
         self._too_long = False
 
     def feed(self, data: bytes) -> "list[Frame]":
-        """Take received bytes, and return the frames that ended in them."""
+        """Accept received bytes, and return the frames that they complete."""
         data = bytes(data)
         frames: list[Frame] = []
         start = 0
@@ -436,19 +436,19 @@ class Reader:
 
 
 def expired(expires_s: int, now_s: "int | None") -> bool:
-    """Return whether a command is void by the clock.
+    """Return whether a command has expired by the clock.
 
     Parameters
     ----------
     expires_s
         Last GPS second at which it is valid, modulo 2^32.
     now_s
-        The present GPS second, modulo 2^32; None if it is not known: then every command is void.
+        The present GPS second, modulo 2^32; None if unknown, in which case every command is void.
 
     Notes
     -----
-    A command valid for more than ``HORIZON_S`` is void too: with 32 bits that wrap, long ago and
-    far ahead are the same.
+    A command valid for more than ``HORIZON_S`` is void too, because 32-bit numbers that wrap cannot
+    distinguish long ago from far ahead.
     """
     return now_s is None or ((expires_s - now_s) & 0xFFFFFFFF) > HORIZON_S
 
@@ -468,16 +468,16 @@ class Replay:
         self._heard = ticks.Deadline()
 
     def session(self, epoch: int, rollover: int, sequence: int, tick: int) -> bool:
-        """Take a SESSION, and return whether it is new.
+        """Accept a SESSION, and return whether it is new.
 
         Parameters
         ----------
         epoch, rollover
-            Of its payload.
+            From its payload.
         sequence
-            Of its header.
+            From its header.
         tick
-            When it came, in ms; see ``ticks``.
+            When it arrived, in ms; see ``ticks``.
         """
         count = (rollover << 16) | sequence
         if self.epoch >= 0:
@@ -490,15 +490,15 @@ class Replay:
         return True
 
     def look(self, tick: int) -> bool:
-        """Return whether the sender was heard recently; see ``ticks.Deadline`` for how often."""
+        """Return whether the sender was heard recently; see ``ticks.Deadline`` on how often."""
         return not self._heard.over(tick)
 
     def silent(self) -> bool:
-        """Return whether the sender was silent too long at the last look."""
+        """Return whether the sender had been silent for too long at the last check."""
         return self._heard.left == 0
 
     def fresh(self, sequence: int, tick: int) -> bool:
-        """Return whether any other frame is new, and if it is, record it."""
+        """Return whether any other frame is new, and if so, record it."""
         if not self.look(tick):
             return False
         ahead = (sequence - self.count) & 0xFFFF
@@ -515,22 +515,22 @@ class Gate:
     Parameters
     ----------
     sha256
-        The hash, or None where nothing may be stored.
+        The hash, or None if nothing may be stored.
     key
         Key of this local controller; b"": nothing can be stored.
     edition
         Edition of the last stored message, from the journal.
     sender
-        Address that commands come from.
+        Address from which commands come.
 
     Attributes
     ----------
     bus
-        Keys of the bus; None: there are none, and no frame needs to be signed.
+        Bus keys; None: there are none, and no frame needs to be signed.
     token
-        Of the one authority, 0 if nobody has it.
+        Token of the authority, 0 if nobody holds it.
     edition
-        Of the last stored message; the caller stores it together with the message's items.
+        Edition of the last stored message; the caller stores it together with the message's items.
     """
 
     def __init__(
@@ -556,9 +556,9 @@ class Gate:
         frame
             A frame meant for this address.
         tick
-            When it came, in ms.
+            When it arrived, in ms.
         now_s
-            The present GPS second, or None if not known.
+            The present GPS second, or None if unknown.
         """
         who = messages.who_of(frame.number)
         self.replay.look(tick)
@@ -569,7 +569,7 @@ class Gate:
             return messages.BAD_VALUE
         if frame.sender != self._sender:
             return messages.REFUSED_AUTHORITY
-        # A frame that anybody can have made must not count as the last one.
+        # A frame that anyone can have created must not count as the last one.
         refusal = messages.DONE
         if who == messages.KEY:
             refusal = self.judge_key(frame, values[2])
@@ -603,7 +603,7 @@ class Gate:
         return self.keyed() and (self.replay.epoch < 0 or self.replay.silent())
 
     def judge_key(self, frame: Frame, edition: int) -> int:
-        """Return DONE if a frame carries the MAC of the own key and a new edition."""
+        """Return DONE if a frame carries the MAC of this controller's key and a new edition."""
         if self._sha256 is None or not verify(self._sha256, self._key, frame):
             return messages.REFUSED_KEY
         if edition <= self.edition:

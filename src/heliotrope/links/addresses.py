@@ -15,7 +15,7 @@ _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 
 
 class Table(BaseModel):
-    """A table of a configuration file: unknown keys are refused."""
+    """A table of a configuration file, in which unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -53,7 +53,7 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
 
 
 def check_encryption(path: Path, host: str, where: str, accepted: bool) -> None:
-    """Refuse a link to another machine that is not encrypted, unless that is accepted.
+    """Refuse an unencrypted link to another computer, unless that is accepted.
 
     Parameters
     ----------
@@ -62,12 +62,12 @@ def check_encryption(path: Path, host: str, where: str, accepted: bool) -> None:
     host
         Host or address of the other end, or the address listened on.
     accepted
-        Whether the link is encrypted, or the file says that it need not be.
+        Whether the link is encrypted, or the file states that it need not be.
 
     Raises
     ------
     FormatError
-        Clear text beyond this machine.
+        If the link would carry clear text to another computer.
     """
     try:
         local = ip_address(host).is_loopback

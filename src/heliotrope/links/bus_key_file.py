@@ -19,12 +19,12 @@ _MOST = 2
 
 
 def read_bus_keys(path: Path) -> LinkKeys:
-    """Return the keys of a bus, the newest first.
+    """Return the keys of a bus, newest first.
 
     Raises
     ------
     FormatError
-        If others may read the file, or its content is another.
+        If others may read the file, or its content is invalid.
     """
     raw = read_toml(path, "a file of a bus's key")
     refuse_others(path)
@@ -43,7 +43,7 @@ def _key(path: Path, value: object) -> bytes:
     except ValueError:
         key = b""
     if len(key) != KEY_SIZE or key == NO_KEY:
-        # The value is not shown: it would end up in a log.
+        # The value is not shown, because it would end up in a log.
         raise FormatError(
             path,
             f"not a key; give {KEY_SIZE} bytes in hexadecimal, as heliotrope keys bus new makes",
@@ -53,7 +53,7 @@ def _key(path: Path, value: object) -> bytes:
 
 
 class BusKeyFile:
-    """The file of a bus's key, to be changed; every change is written whole, or not at all.
+    """The bus key file, which may be changed; every change is written completely or not at all.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class BusKeyFile:
     Attributes
     ----------
     keys
-        The newest first.
+        Keys, newest first.
 
     Raises
     ------
@@ -77,12 +77,12 @@ class BusKeyFile:
         self.keys: LinkKeys = read_bus_keys(path) if path.exists() else ()
 
     def new(self) -> None:
-        """Make the first key.
+        """Create the first key.
 
         Raises
         ------
         InputError
-            If there is one.
+            If there is a key already.
         """
         if self.keys:
             raise InputError(
@@ -92,12 +92,12 @@ class BusKeyFile:
         self._write(secrets.token_bytes(KEY_SIZE))
 
     def rotate(self) -> None:
-        """Make a new key beside the present one.
+        """Create a new key beside the present one.
 
         Raises
         ------
         InputError
-            If there is none, or two.
+            If there is no key, or there are two.
         """
         if not self.keys:
             raise InputError(f"{self.path}: it has no key; say heliotrope keys bus new")
@@ -114,14 +114,14 @@ class BusKeyFile:
         Raises
         ------
         InputError
-            If there is none.
+            If there is no old key.
         """
         if len(self.keys) < _MOST:
             raise InputError(f"{self.path}: it has no old key beside a new one; nothing to end")
         self._write(self.keys[0])
 
     def off(self) -> None:
-        """Remove all keys: the cluster takes them from its local controllers too."""
+        """Remove all keys; the cluster then removes them from its local controllers too."""
         self._write()
 
     def _write(self, *keys: bytes) -> None:

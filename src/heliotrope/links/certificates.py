@@ -24,11 +24,12 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from heliotrope.errors import FormatError, InputError
 from heliotrope.links.keys import refuse_others, write_private
 
-#: Names of the authority's files, and of a server's by default.
+#: Names of the authority's files, and of a server's files by default.
 AUTHORITY, SERVER = "ca", "console"
-#: Validity of an authority, days. Browsers take certificates of servers for 825 at most.
+#: Validity of an authority, and maximum validity of a server certificate that browsers accept,
+#: days.
 _TEN_YEARS, LONGEST = 3650, 825
-#: Clocks of clients may be this much behind.
+#: Clients' clocks may be slow by this much.
 _EARLIER = timedelta(hours=1)
 
 
@@ -44,16 +45,16 @@ class Certified:
 def certify(
     folder: Path, names: Sequence[str], now: datetime, *, days: int = LONGEST, server: str = SERVER
 ) -> Certified:
-    """Make or renew the certificate of a server, signed by the authority of a folder.
+    """Create or renew a server certificate, signed by the authority in a folder.
 
     Parameters
     ----------
     folder
-        An authority is made in it if it has none.
+        Folder of the authority, which is created if missing.
     names
-        Host names and addresses, the first for people.
+        Host names and addresses, starting with the name for display.
     now
-        Beginning of the validity.
+        Start of the validity.
     days
         Validity, 1 to `LONGEST`.
     server
@@ -62,9 +63,9 @@ def certify(
     Raises
     ------
     InputError
-        No name, one that is none, or a file that cannot be written.
+        If there is no name, a name is invalid, or a file cannot be written.
     FormatError
-        A key that cannot be used.
+        If a key cannot be used.
     """
     if not 1 <= days <= LONGEST:
         raise InputError(f"keys tls: {days} days; give 1 to {LONGEST}, which browsers take")
@@ -94,7 +95,7 @@ def certify(
 
 
 def request(folder: Path, names: Sequence[str], *, server: str = SERVER) -> Certified:
-    """Make a request for a certificate, to be signed by another authority; see `certify`."""
+    """Create a certificate request, to be signed by another authority; see `certify`."""
     subject, alternative = _subject(names)
     place, key = _key(folder, server)
     made = (
@@ -109,7 +110,7 @@ def request(folder: Path, names: Sequence[str], *, server: str = SERVER) -> Cert
 
 
 def _subject(names: Sequence[str]) -> tuple[x509.Name, x509.SubjectAlternativeName]:
-    """Return the subject, and the names that a client compares with the address it was given."""
+    """Return the subject, and the names that a client compares with the address it uses."""
     if not names:
         raise InputError("keys tls: give the name that people type, as --name plant.example.org")
     general = [_general(name) for name in names]
@@ -133,7 +134,7 @@ def _general(name: str) -> x509.GeneralName:
 
 
 def _authority(folder: Path, now: datetime) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """Return the authority of a folder with its key; both are made if neither is there."""
+    """Return the authority in a folder with its key; both are created if neither exists."""
     file = folder / f"{AUTHORITY}.pem"
     if file.exists():
         key = _read(folder / f"{AUTHORITY}.key")
@@ -168,7 +169,7 @@ def _authority(folder: Path, now: datetime) -> tuple[x509.Certificate, ec.Ellipt
 
 
 def _key(folder: Path, name: str) -> tuple[Path, ec.EllipticCurvePrivateKey]:
-    """Return the key of a folder with its place; it is made if it is not there."""
+    """Return a key in a folder with its path; it is created if missing."""
     file = folder / f"{name}.key"
     if file.exists():
         return file, _read(file)

@@ -27,7 +27,7 @@ T = TypeVar("T")
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 WEEK = 604800
 
-#: GPS minus UTC in s, from each date on. IERS Bulletin C announces changes half a year ahead.
+#: GPS minus UTC in s, from each date on. IERS Bulletin C announces changes half a year in advance.
 LEAP_SECONDS = (
     (datetime(1980, 1, 6, tzinfo=UTC), 0), (datetime(1981, 7, 1, tzinfo=UTC), 1),
     (datetime(1982, 7, 1, tzinfo=UTC), 2), (datetime(1983, 7, 1, tzinfo=UTC), 3),
@@ -49,7 +49,7 @@ class Clock(Protocol):
     """A source of monotonic time and UTC."""
 
     def monotonic(self) -> float:
-        """Return seconds since an arbitrary instant; never runs backwards, never jumps."""
+        """Return seconds since an arbitrary instant; they never run backwards and never jump."""
         ...
 
     def utc(self) -> datetime:
@@ -227,7 +227,8 @@ def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> dateti
 # -- virtual time ----------------------------------------------------------------------
 
 
-#: The simulated program that a task belongs to, "" if it belongs to none; see `VirtualLoop.freeze`.
+#: The simulated program to which a task belongs, "" if it belongs to none; see
+#: `VirtualLoop.freeze`.
 PROGRAM: ContextVar[str] = ContextVar("PROGRAM", default="")
 
 
@@ -239,7 +240,7 @@ def context_of(program: str) -> Context:
 
 
 class _Drawn(deque[asyncio.Handle]):
-    """Ready callbacks, taken in random order; those of frozen programs wait."""
+    """Ready callbacks, taken in random order; callbacks of frozen programs wait."""
 
     def __init__(self, chance: random.Random, nothing: asyncio.Handle) -> None:
         super().__init__()
@@ -260,9 +261,10 @@ class _Drawn(deque[asyncio.Handle]):
 
 
 class _NumberedTask(asyncio.Task[Any]):
-    """A task with its number as hash.
+    """A task whose hash is its number.
 
-    A `TaskGroup` cancels a set of tasks in the order of their hashes, which are else addresses.
+    A `TaskGroup` cancels a set of tasks in the order of their hashes, which would otherwise be
+    addresses.
     """
 
     def __init__(self, coro: Coroutine[Any, Any, Any], number: int, **options: Any) -> None:
@@ -281,7 +283,7 @@ class _NoWait(selectors.SelectSelector):
         self.now = 0.0
 
     def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
-        if self.get_map():  # the first one is the loop's own pipe for signals and threads
+        if self.get_map():  # the first is the loop's own pipe for signals and threads
             raise RuntimeError(
                 "virtual time has no sockets, files or processes: use memory links, or the real "
                 "loop"
@@ -336,8 +338,8 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def freeze(self, program: str) -> None:
         """Stop a program, like a stopped process or a suspended computer, until `thaw`.
 
-        None of its code runs, while time goes on. Its tasks are those of `context_of`; the loop
-        needs a seed.
+        None of its code runs, while time continues. Its tasks are those created in `context_of`;
+        the loop needs a seed.
         """
         self._ready.held.setdefault(program, [])
 
@@ -351,7 +353,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         Pending work is not done: no task takes another step, and no timer wakes a task.
         """
         for handle in self._ready.held.get(program, ()):
-            # Group and tasks of the program must still learn that they end.
+            # The program's task groups and tasks must still be notified of their end.
             owner = getattr(handle._callback, "__self__", None)  # type: ignore[attr-defined] # noqa: SLF001
             if isinstance(owner, asyncio.Task):
                 owner.cancel()

@@ -9,7 +9,7 @@ from zlib import crc32
 
 from heliotrope.safety import Limits, Watcher, conditions, limited, watched_by
 
-#: What a row of the safety table does; its texts may differ between editions of the program.
+#: What a row of the safety table does; its texts may differ between versions of the program.
 _ROW = ("trips", "releases", "delay", "clear_for", "stale_after", "then_stow", "act", "scope")
 
 
@@ -22,11 +22,11 @@ class CommonSettings:
     steps_every
         Interval at which the step counts of each heliostat are requested, in s.
     silence
-        Time without an answer after which a heliostat is reported, in s.
+        Time without a reply after which a heliostat is reported, in s.
     delta_t
         TT − UT1, in s; None: from the date.
     limits
-        Numbers of the safety table that the plant sets; only rows that clusters watch count.
+        Limits of the safety table that the plant sets; only rows that clusters evaluate count.
     """
 
     steps_every: int = 1
@@ -38,15 +38,15 @@ class CommonSettings:
 def settings_checksum(common: CommonSettings) -> str:
     """Return the checksum of common settings, eight hexadecimal digits.
 
-    It is the CRC-32 of ASCII text with a line ``name=value`` for each setting, in the order of the
-    names, each line ended by a newline. A value is the shortest decimal that gives the same
-    binary64 number ("inf" for never), or "default".
+    It is the CRC-32 of ASCII text with a line ``name=value`` for each setting, sorted by name, each
+    line terminated by a newline. A value is the shortest decimal that gives the same binary64
+    number ("inf" for never), or "default".
 
-    The settings are those of ``[polling]``, ΔT of the site, and the numbers of the rows of the
-    safety table that a cluster watches. Not among them: name, heliostats, phase, keys; ports, and
-    the answer times that depend on the bus; the rest of the site, which each status carries in
-    full; and the longest autonomy, which follows from the emergency line that a cluster has or has
-    not. Where that is less than the plant grants, the cluster says so (`autonomy_limited`).
+    The settings are those of ``[polling]``, ΔT of the site, and the limits of the safety-table rows
+    that a cluster evaluates. The checksum does not cover name, heliostats, phase and keys; ports,
+    and reply times that depend on the bus; the rest of the site, which each status carries in full;
+    and the longest autonomy, which depends on whether a cluster has an emergency line. If that is
+    less than the plant grants, the cluster reports it (`autonomy_limited`).
     """
     values: dict[str, float | None] = {
         "delta_t_s": common.delta_t,

@@ -36,7 +36,7 @@ class Carrier(Protocol):
         ...
 
     async def ready(self) -> None:
-        """Wait until the next write would go out at once."""
+        """Wait until the next write would be sent at once."""
         ...
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
@@ -121,14 +121,14 @@ class CarriedLink:
         return max(0.0, self._until(-math.inf) - self._clock.monotonic())
 
     def _until(self, opened: float) -> float:
-        """Return when the connection ends unless something is heard."""
-        # The other end reports what it has heard with its own heartbeat, up to a period later.
+        """Return when the connection ends unless something is received."""
+        # The other end reports what it has received with its own heartbeat, up to a period later.
         heard = max(opened, self._talk.heard_at) + self._settings.period
         return min(max(opened, self._talk.alive_at), heard) + self._settings.deadline
 
     @property
     def behind(self) -> bool:
-        """Whether it is connected but the other end has not yet shown that it has the new key."""
+        """Whether it is connected but the other end has not yet shown that it holds the new key."""
         return self.connected and self._talk.behind
 
     @property
@@ -207,7 +207,7 @@ class CarriedLink:
             If the link is closed.
         """
         self._check(data, expires, hold)
-        # After the deadline the connection is gone, so waiting longer is useless.
+        # After the deadline the connection is lost, so waiting longer is useless.
         patience = self._settings.deadline
         if expires is not None:
             patience = max(0.0, expires - self._clock.monotonic())
@@ -304,8 +304,8 @@ class CarriedLink:
             await self._carrier.close()
 
     async def _until_lost(self, part: Coroutine[None, None, None], lost: asyncio.Event) -> None:
-        # It raises nothing: a TaskGroup that fails at the instant of its cancellation loses the
-        # cancellation (before Python 3.13), and the link would not close.
+        # It raises nothing, because a TaskGroup that fails at the instant of its cancellation loses
+        # the cancellation (before Python 3.13), and the link would not close.
         try:
             await part
         except (LinkLostError, OSError) as error:
@@ -327,7 +327,8 @@ class CarriedLink:
                 self._up.set()
 
     async def _beat(self) -> None:
-        # A heartbeat that cannot go out within a period is skipped; the watch ends such a line.
+        # A heartbeat that cannot be sent within a period is skipped; supervision ends such a
+        # connection.
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.period), self._sending:
                 await self._carrier.ready()

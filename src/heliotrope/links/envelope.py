@@ -22,16 +22,16 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.link import LinkSettings, Statistics
 
 _BEAT, _DATA = 0x11, 0x12
-#: Kind; sender's session; session it has heard; count; sender's time; latest time it has heard,
-#: and how long ago; time to live (0: no expiry). Times in µs.
+#: Kind; sender's session; session that it has received; count; sender's time; latest time that it
+#: has received, and how long ago; time to live (0: no expiry). Times in µs.
 _HEADER = struct.Struct("<BQQQQQII")
 _MAC_SIZE = 16
 _LONGEST = 0xFFFFFFFF
 #: Bytes that an envelope adds to a message.
 OVERHEAD = _HEADER.size + _MAC_SIZE
-#: Two clocks are assumed to agree in rate within this: twice the largest slew of NTP.
+#: The rates of two clocks are assumed to agree within this, twice the largest slew of NTP.
 _DRIFT = 1e-3
-#: Returns the keys of a connection now, the newest first; never empty.
+#: Function that returns the present keys of a connection, newest first; never empty.
 SealKeys = Callable[[], tuple[bytes, ...]]
 
 
@@ -41,11 +41,11 @@ def _mac(key: bytes, data: bytes) -> bytes:
 
 @dataclass(slots=True)
 class _Peer:
-    """The other end of a conversation, as last heard."""
+    """The other end of a conversation, as of its last envelope."""
 
     session: int
     stamp: int = 0  # its time, in µs
-    at: float = 0.0  # when that came, by our clock
+    at: float = 0.0  # when that arrived, by our clock
     count: int = 0
     bound: float = -math.inf  # our time minus its time is at least this
     bound_at: float = 0.0
@@ -105,15 +105,15 @@ class Conversation:
 
     @property
     def behind(self) -> bool:
-        """Whether the other end has not yet shown that it has the newest key."""
+        """Whether the other end has not yet shown that it holds the newest key."""
         keys = self._keys()
         return len(keys) > 1 and self._proved != keys[0]
 
     def _sealing(self) -> tuple[bytes, ...]:
-        """Return the keys for heartbeats: the newest that both ends have, and newer ones.
+        """Return the keys for heartbeats: the newest key that both ends hold, and newer ones.
 
-        The last is the one for messages. Both stand in each other's list while a new key takes
-        over, so a newer one is offered with every heartbeat until the other end uses it.
+        The last key is the one for messages. Both ends have both keys in their lists during a key
+        change, so a newer key is offered with every heartbeat until the other end uses it.
         """
         keys = self._keys()
         return keys[: keys.index(self._proved) + 1] if self._proved in keys else keys
@@ -158,7 +158,7 @@ class Conversation:
         return header + message + _mac(key, header + message)
 
     def _opens(self, body: bytes, mac: bytes) -> bool:
-        """Whether an envelope is sealed with one of the keys; note the newest that was used."""
+        """Return whether an envelope is sealed with one of the keys; note the newest key used."""
         keys = self._keys()
         for key in keys:
             if hmac.compare_digest(mac, _mac(key, body)):
@@ -206,7 +206,7 @@ class Conversation:
         return (body[_HEADER.size :], expires), first
 
     def _unproved(self, kind: int, session: int, stamp: int, count: int, now: float) -> bool:
-        """Take an envelope of unknown age: it does not show that its sender has heard us."""
+        """Handle an envelope of unknown age: it does not show that its sender received from us."""
         if kind == _DATA:
             self._statistics.refused += 1
             return False
@@ -224,7 +224,7 @@ class Conversation:
                 return peer
             self._statistics.repeated += 1
             return None
-        # A new session is believed if it heard us later than the old one was alive.
+        # A new session is believed if it received from us later than the old session was alive.
         if proof > now or (peer is not None and proof <= self.alive_at):
             self._statistics.refused += 1
             return None

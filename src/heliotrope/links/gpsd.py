@@ -26,29 +26,30 @@ from heliotrope.links.link import Backoff, until_closed
 
 PORT = 2947
 _WATCH = b'?WATCH={"enable":true,"json":true};\n'
-#: A line from gpsd has a few kB at most; a longer one does not come from gpsd.
+#: A line from gpsd has a few kB at most; a longer line does not come from gpsd.
 _LONGEST_LINE = 65536
-#: Lowest modes of a TPV report with a fix, and with height.
+#: Lowest modes of a TPV report with a fix, and with a height.
 _FIX_2D, _FIX_3D = 2, 3
 #: A fix older than this counts as lost, s.
 _FRESH = 5.0
-#: The quickest of this many reports shows how far the clock is ahead: any may be read late.
+#: The fastest of this many reports shows how far the clock is ahead, because any report may be read
+#: late.
 _REPORTS = 10
-#: A missing fix is a problem after this long, s: opening the receiver takes a moment.
+#: A missing fix is a problem after this time, s, because opening the receiver takes a moment.
 _PATIENCE = 10.0
-#: A connection silent for this long is reopened, s: gpsd reports at least once a second.
+#: A connection silent for this long is reopened, s, because gpsd reports at least once a second.
 _SILENCE = 30.0
 _OPEN_LIMIT = 3.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
 
 
 def gpsd_at(path: Path, text: str, key: str) -> tuple[str, int]:
-    """Return host and port of gpsd, as a key of a file gives them.
+    """Return host and port of gpsd, from a key of a configuration file.
 
     Raises
     ------
     FormatError
-        Another text.
+        If the text is not a host with a port.
     """
     try:
         parts = urlsplit(f"//{text}")
@@ -67,15 +68,15 @@ class SatelliteReceiver:
     Attributes
     ----------
     device
-        As gpsd names it.
+        Name of the device in gpsd.
     mode
         0 or 1: no fix; 2: without height; 3: with height.
     utc_s
         POSIX seconds of the last fix; nan: none yet.
     latitude_deg, longitude_deg, height_m
-        Of the last fix, height above the ellipsoid; nan where not known.
+        Position of the last fix, with height above the ellipsoid; nan if unknown.
     used, seen
-        Satellites.
+        Number of satellites.
     """
 
     device: str = ""
@@ -108,11 +109,11 @@ class GpsdReader:
     Attributes
     ----------
     receiver
-        As last reported.
+        Last reported state.
     error
-        Last error reported by gpsd; empty without one.
+        Last error reported by gpsd; empty if there is none.
     refused
-        Count of lines that do not come from gpsd.
+        Number of lines that do not come from gpsd.
     """
 
     def __init__(self) -> None:
@@ -122,7 +123,7 @@ class GpsdReader:
         self._rest = b""
 
     def feed(self, data: bytes) -> bool:
-        """Take bytes, and return whether a new fix was among them."""
+        """Accept bytes, and return whether they contained a new fix."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > _LONGEST_LINE:
             self._rest, self.refused = b"", self.refused + 1
@@ -146,7 +147,7 @@ class GpsdReader:
         return False
 
     def _take_fix(self, report: dict[str, Any]) -> bool:
-        """Take a TPV report; return whether its time is new."""
+        """Accept a TPV report; return whether its time is new."""
         mode = int(report.get("mode", 0))
         device = str(report.get("device", self.receiver.device))
         if mode < _FIX_2D or "time" not in report:
@@ -172,15 +173,15 @@ class Gpsd:
     Parameters
     ----------
     host, port
-        Where gpsd listens.
+        Address on which gpsd listens.
     clock
-        Its monotonic time measures the age of a fix.
+        Clock whose monotonic time measures the age of a fix.
     """
 
     def __init__(self, clock: Clock, host: str = "localhost", port: int = PORT) -> None:
         self._clock, self._host, self._port = clock, host, port
         self._reader = GpsdReader()
-        #: UTC of each of the last fixes minus the monotonic time at which it came, s.
+        #: UTC of each of the last fixes minus the monotonic time of its arrival, s.
         self._offsets: deque[float] = deque(maxlen=_REPORTS)
         self._fixed_at = -math.inf
         self._begun = clock.monotonic()
@@ -189,7 +190,7 @@ class Gpsd:
 
     @property
     def receiver(self) -> SatelliteReceiver:
-        """State of the receiver; one without a fresh fix says so."""
+        """State of the receiver, without a fix in ``mode`` if there is no fresh fix."""
         receiver = self._reader.receiver
         return receiver if self._fresh else replace(receiver, mode=min(receiver.mode, 1))
 
@@ -199,9 +200,9 @@ class Gpsd:
 
     @property
     def ahead(self) -> float | None:
-        """How far the computer's clock is ahead of the receiver, s; None without a fresh fix.
+        """Time by which the computer's clock is ahead of the receiver, s; None without a fresh fix.
 
-        Includes the delay of the quickest of the last reports: some tenths of a second.
+        It includes the delay of the fastest of the last reports, some tenths of a second.
         """
         if not self._fresh:
             return None
@@ -210,7 +211,7 @@ class Gpsd:
 
     @property
     def problem(self) -> str:
-        """Why there is no fix; empty with a fix, and during the time that the first one takes."""
+        """Why there is no fix; empty with a fix, and while the first fix may still be pending."""
         now = self._clock.monotonic()
         if now - max(self._fixed_at, self._begun) <= _PATIENCE:
             return ""
@@ -222,7 +223,7 @@ class Gpsd:
         return f"{where}: the receiver has no fix; does its antenna see the sky?"
 
     def hear(self, data: bytes) -> None:
-        """Take bytes just received from gpsd."""
+        """Accept bytes just received from gpsd."""
         reader = self._reader
         if reader.feed(data):
             now = self._clock.monotonic()

@@ -125,7 +125,7 @@ class MemoryLine:
         self.faults = faults or Faults()
         self.reachable = True
         self.generation = 0
-        #: Who has each end: a newcomer takes it over, as at a broker.
+        #: The owner of each end; a new one takes it over, as at a broker.
         self.holders: list[object] = [None, None]
         chance = random.Random(seed)
         self.lanes = (
@@ -184,12 +184,12 @@ class _MemoryCarrier:
         self._generation = -1
 
     async def open(self) -> SealKeys:
-        """Connect, unless the line refuses."""
+        """Connect, unless the line refuses the connection."""
         if not self._line.reachable:
             raise LinkError("the line is not reachable")
         self._generation = self._line.generation
         self._line.holders[self._end] = self
-        self._in.news.set()  # whoever had it notices
+        self._in.news.set()  # the previous owner notices
         return lambda: (b"",)
 
     def _check(self) -> None:
@@ -199,7 +199,7 @@ class _MemoryCarrier:
             raise LinkLostError("another program has taken the line over")
 
     async def ready(self) -> None:
-        """Return at once: there is nothing to wait for."""
+        """Return at once, because there is nothing to wait for."""
         self._check()
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
@@ -216,7 +216,7 @@ class _MemoryCarrier:
             item = self._in.take()
             if isinstance(item, bytes):
                 return item
-            # At least 1 µs: a remainder left by rounding would not advance a virtual clock.
+            # At least 1 µs, because a remainder left by rounding would not advance a virtual clock.
             remaining = None if item is None else max(1e-6, item - self._in.clock.monotonic())
             try:
                 async with asyncio.timeout(remaining):

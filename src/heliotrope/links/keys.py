@@ -26,10 +26,10 @@ from heliotrope.files.documents import read_toml
 
 _SHORTEST_KEY, _LONGEST_KEY = 16, 64
 _SIZE = 32
-#: The new key and the one before.
+#: The new key and the previous one.
 _MOST = 2
 _OTHERS = 0o077
-#: Tables of keys: of a plant's file, and of a cluster's.
+#: Tables of keys in a plant's file, and in a cluster's file.
 CLUSTERS, HELIOSTATS = "clusters", "heliostats"
 _MISSING = {
     HELIOSTATS: "the cluster has no such heliostat",
@@ -37,7 +37,7 @@ _MISSING = {
 }
 _LONGEST_NAME = 64
 
-#: Keys of one link, the newest first.
+#: Keys of one link, newest first.
 LinkKeys = tuple[bytes, ...]
 
 
@@ -65,7 +65,7 @@ def ring_of(name: str, key: bytes | KeyRing) -> KeyRing:
     Raises
     ------
     InputError
-        A key of less than 16 bytes, or a name that is empty or longer than 64 bytes.
+        If a key has less than 16 bytes, or a name is empty or longer than 64 bytes.
     """
     ring = key if isinstance(key, KeyRing) else KeyRing(key)
     for secret in ring.keys or (b"",):
@@ -81,7 +81,7 @@ def ring_of(name: str, key: bytes | KeyRing) -> KeyRing:
 
 @dataclass
 class BrokerPassword:
-    """The broker's password; where it is replaced, the next connection takes the new one."""
+    """The broker's password; after a change, the next connection uses the new password."""
 
     word: str = field(repr=False)
 
@@ -116,7 +116,7 @@ class Keys:
         self.members: dict[str, LinkKeys] = {}
         if path is None:
             return
-        # An empty file has no keys; members without a key are refused later.
+        # An empty file has no keys; members without a key are rejected later.
         empty = path.is_file() and path.stat().st_size == 0
         raw = {} if empty else read_toml(path, "a key file")
         refuse_others(path)
@@ -145,7 +145,7 @@ class Keys:
         text = value if isinstance(value, str) else ""
         good = set(text) <= set(string.hexdigits) and len(text) % 2 == 0
         if not (good and _SHORTEST_KEY <= len(text) // 2 <= _LONGEST_KEY):
-            # The value is not shown: it would end up in a log.
+            # The value is not shown, because it would end up in a log.
             raise FormatError(
                 self._path,
                 f"a key of {len(text)} characters; give {_SHORTEST_KEY} to {_LONGEST_KEY} bytes "
@@ -179,7 +179,7 @@ def refuse_others(path: Path) -> None:
 
 
 def fingerprint(key: bytes) -> str:
-    """Return a short name of a key that reveals nothing about it."""
+    """Return a short identifier of a key that reveals nothing about it."""
     return hashlib.sha256(b"heliotrope key " + key).hexdigest()[:8]
 
 
@@ -187,12 +187,12 @@ def fingerprint(key: bytes) -> str:
 
 
 class KeyFile:
-    """A key file to be changed; every change is written whole, with mode 600, or not at all.
+    """A key file to be changed; every change is written completely, with mode 600, or not at all.
 
     Parameters
     ----------
     path
-        The file; a missing or empty one has no keys.
+        The file; a missing or empty file has no keys.
 
     Raises
     ------
@@ -211,14 +211,14 @@ class KeyFile:
 
     @property
     def links(self) -> dict[str, LinkKeys]:
-        """The keys of links, by name: of clusters, or ``plant`` of a cluster's own file."""
+        """The link keys by name: by cluster, or ``plant`` in a cluster's own file."""
         if self._held is None:
             return {}
         own = {"plant": self._held.plant} if self._held.plant else {}
         return own if self._table else {**own, **self._held.members}
 
     def new(self, clusters: Sequence[str]) -> dict[str, bytes]:
-        """Make a key for each cluster that has none; return them.
+        """Create a key for each cluster that has none; return the new keys.
 
         Raises
         ------
@@ -237,7 +237,7 @@ class KeyFile:
         return made
 
     def rotate(self, clusters: Sequence[str]) -> dict[str, bytes]:
-        """Make a new key for each cluster beside its present one; return the new ones.
+        """Create a new key for each cluster beside its present key; return the new keys.
 
         Raises
         ------
@@ -250,12 +250,12 @@ class KeyFile:
         return made
 
     def take(self, key: bytes) -> None:
-        """Take a new key of the plant into a cluster's file, beside the one that is there.
+        """Add a new plant key to a cluster's file, beside the present key.
 
         Raises
         ------
         InputError
-            If the file has that key, or two others, or is a plant's.
+            If the file has that key, or two others, or is a plant's file.
         """
         if any(name != "plant" for name in self.links):
             raise InputError(f"{self.path}: it is a plant's key file; take belongs to a cluster's")
@@ -264,7 +264,7 @@ class KeyFile:
         self._write({"plant": self._beside("plant", key) if self.links else (key,)})
 
     def end(self, names: Sequence[str]) -> list[str]:
-        """Remove the old keys of some names (() for all that have one); return those names.
+        """Remove the old keys of some names (() for all that have one); return these names.
 
         Raises
         ------
@@ -331,8 +331,8 @@ def carried_files(folder: Path, clusters: Sequence[str]) -> list[Path]:
     Raises
     ------
     InputError
-        If there is no such folder, a cluster is named twice, its name is that of no file, or a file
-        exists: keys are never overwritten.
+        If there is no such folder, a cluster is named twice, its name cannot be a file name, or a
+        file exists, because keys are never overwritten.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder")
@@ -365,15 +365,15 @@ def content_of(path: Path) -> bytes:
 
 
 def replace_private(path: Path, before: bytes, text: str) -> bytes:
-    """Replace the content of a key file that is still as it was read; return the new content.
+    """Replace a key file's content unless it changed since it was read; return the new content.
 
-    Two commands at once would otherwise drop a key that one of them has made, and that a cluster
-    may have taken already.
+    Otherwise two simultaneous commands could drop a key that one of them has created, and that a
+    cluster may already have adopted.
 
     Raises
     ------
     InputError
-        If another command has changed it since, or it cannot be written.
+        If another command has changed the file since, or it cannot be written.
     """
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -387,14 +387,14 @@ def replace_private(path: Path, before: bytes, text: str) -> bytes:
 
 
 def write_private(path: Path, text: str, *, new: bool = False) -> None:
-    """Write a file that only its owner may read, whole or not at all.
+    """Write a file that only its owner may read, completely or not at all.
 
-    An existing file is replaced and keeps its owner, unless ``new`` forbids that it exists.
+    An existing file is replaced and keeps its owner; with ``new``, it must not exist.
 
     Raises
     ------
     InputError
-        If it cannot be written.
+        If the file cannot be written.
     """
     beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -409,7 +409,7 @@ def write_private(path: Path, text: str, *, new: bool = False) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         if new:
-            os.link(beside, path)  # fails where the file exists by now
+            os.link(beside, path)  # fails if the file exists by now
         else:
             beside.replace(path)
     except OSError as error:

@@ -37,7 +37,7 @@ from heliotrope.links.clock import Clock
 
 
 class LinkError(HeliotropeError):
-    """A link that cannot be created, or no longer exists."""
+    """A link cannot be created, or no longer exists."""
 
 
 class LinkLostError(LinkError):
@@ -327,7 +327,8 @@ class Heartbeat:
             self._now.clear()
             due = self._clock.monotonic() + self._period
             await beat()
-            # Not a timeout, which cancels the task twice a second: a field has hundreds of links.
+            # No timeout is used here, because it would cancel the task twice a second, and a field
+            # has hundreds of links.
             remaining = max(1e-6, due - self._clock.monotonic())
             alarm = asyncio.get_running_loop().call_later(remaining, self._now.set)
             try:
@@ -356,7 +357,7 @@ class Inbox:
         self._news.set()
 
     def close(self) -> None:
-        """Wake the task that waits."""
+        """Wake the waiting task."""
         self._closed = True
         self._news.set()
 
@@ -400,7 +401,7 @@ async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]
 
 
 async def first_of(*parts: Coroutine[Any, Any, object]) -> None:
-    """Run parts side by side until one is done, then cancel the others; raise what it raises."""
+    """Run parts concurrently until one ends, then cancel the others; raise what it raises."""
     tasks = [asyncio.ensure_future(part) for part in parts]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

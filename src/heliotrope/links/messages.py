@@ -27,13 +27,13 @@ from heliotrope.safety import Alarm, Severity
 
 VERSION = 1
 
-#: Before each entry in a record of a bus: seconds since its beginning; sent (0) or received (1) by
+#: Header of each entry in a bus recording: seconds since its beginning; sent (0) or received (1) by
 #: the cluster; number of bytes.
 BUS_ENTRY = "<fBH"
 BUS_SENT, BUS_RECEIVED = 0, 1
 
-#: One row for each heliostat of a cluster, in the order of its configuration. ``heard_ms`` is the
-#: age of its STATUS when the row was written (2^32 - 1: none has come, and the row means nothing);
+#: One row per heliostat of a cluster, in the order of its configuration. ``heard_ms`` is the age of
+#: its STATUS when the row was written (2^32 - 1: none has arrived, and the row is meaningless);
 #: states and flags as in `lcu.names`. ``steps_ms`` is the age of its step counts and goals, which
 #: may be requested less often.
 NODE = np.dtype(
@@ -69,7 +69,7 @@ class Stage(Enum):
     ACCEPTED = "accepted"  # by the cluster
     SENT = "sent"  # on the bus
     ACKNOWLEDGED = "acknowledged"  # by the local controller
-    DONE = "done"  # the state that it asks for is reached
+    DONE = "done"  # the requested state is reached
     REFUSED = "refused"
     FAILED = "failed"  # never acknowledged, or expired
 
@@ -149,7 +149,7 @@ class Parameters:
         Raises
         ------
         ProtocolError
-            If names, sizes and block do not fit together.
+            If names, sizes and block are inconsistent.
         """
         if len(self.names) != len(self.sizes) or sum(self.sizes) != len(self.block):
             raise ProtocolError(
@@ -165,7 +165,7 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Ask:
-    """A question.
+    """A query.
 
     Kind of query: ``checksums``, ``stored`` and ``diagnosis`` (for a heliostat), ``statistics``,
     ``discover``, ``frames``. The reply to ``diagnosis`` is the ``result`` of the last motion
@@ -344,7 +344,8 @@ def _no_number(text: str) -> float:
     raise ValueError(text)
 
 
-# The tables below are made once: each cluster sends and takes several messages a second.
+# The tables below are created once, because each cluster sends and receives several messages a
+# second.
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 _DECODER = json.JSONDecoder(parse_constant=_no_number)
 
@@ -369,7 +370,7 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str)
 
 
-#: For each type of a field: a function that converts its JSON value, None if the type is wrong.
+#: For each field type: a function that converts its JSON value, None if the type is wrong.
 _READERS: dict[Any, Callable[[Any], Any]] = {
     Stage: lambda value: next((stage for stage in Stage if stage.value == value), None),
     Severity: lambda value: Severity.read(value) if isinstance(value, str) else None,
@@ -382,7 +383,7 @@ _READERS: dict[Any, Callable[[Any], Any]] = {
     tuple[float, ...]: _list_of(_is_number),
     Mapping[str, Any]: lambda value: value if isinstance(value, dict) else None,
 }
-#: For each kind: names, types and converters of the fields of its line.
+#: For each kind: names, types and converters of the fields in its line.
 _FIELDS: dict[str, tuple[tuple[str, Any, Callable[[Any], Any]], ...]] = {
     kind: tuple(
         (field.name, field.type, _READERS[field.type])

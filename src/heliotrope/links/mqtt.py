@@ -45,20 +45,20 @@ from heliotrope.links.keys import BrokerPassword, KeyRing, ring_of
 from heliotrope.links.link import LinkError, LinkLostError, LinkSettings, Statistics
 from heliotrope.links.tls import TlsSource, context_of
 
-#: Consecutive messages that the broker may leave unconfirmed before the connection is given up.
-#: Below 20, the number from which paho would keep messages back and send them later.
+#: Consecutive messages that the broker may leave unconfirmed before the connection is abandoned. It
+#: is below 20, the number from which paho would hold messages back and send them later.
 _UNCONFIRMED = 10
-#: Time limit for saying goodbye at the end of a connection, in s.
+#: Time limit for disconnecting cleanly at the end of a connection, in s.
 _GOODBYE = 0.5
 #: aiomqtt waits without a limit of its own; the link sets the limits (`asyncio.timeout`). Before
-#: Python 3.12 `asyncio.wait_for`, which aiomqtt uses for limits, loses a cancellation that comes
-#: at the instant of the answer: the heartbeat went on, and a link could not be closed.
+#: Python 3.12, `asyncio.wait_for`, which aiomqtt uses for limits, loses a cancellation that arrives
+#: at the same instant as the reply. The heartbeat then continued, and a link could not be closed.
 _NO_LIMIT = math.inf
-#: Messages between the socket and the link, which takes them at once.
+#: Maximum number of messages between the socket and the link, which reads them at once.
 _WAITING = 1000
-#: Bytes of a packet beside topic and payload: header, and properties as ours.
+#: Bytes of a packet besides topic and payload: header and properties, such as ours.
 _ROOM = 256
-#: aiomqtt writes a line for each message that finds no room: a stranger would fill the log.
+#: aiomqtt logs a line for each message that does not fit, so a stranger could fill the log.
 _LOG = logging.getLogger(f"{__name__}.library")
 _LOG.setLevel(logging.ERROR)
 
@@ -72,11 +72,11 @@ class Broker:
     host, port
         Usually port 1883, with TLS 8883.
     username, password
-        None: the broker asks for none.
+        None: the broker requires none.
     tls
         None: unencrypted; `heliotrope.links.tls.client_tls` makes one from files.
     keepalive_s
-        MQTT's own, in whole seconds. Nothing rests on it; it lets the broker clean up.
+        MQTT's own keepalive, in whole seconds. Nothing depends on it; it lets the broker clean up.
     """
 
     host: str
@@ -120,7 +120,7 @@ def _word_of(password: str | BrokerPassword | None) -> str | None:
 class _MqttCarrier:
     """Successive connections to the broker, each with a new client.
 
-    A client used again would send again, and late, whatever was left unconfirmed.
+    A reused client would send again, too late, whatever had been left unconfirmed.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class _MqttCarrier:
             socket_options=[(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)],
         )
         inner = client._client  # noqa: SLF001 (aiomqtt offers no other way)
-        inner.connect_timeout = self._limit  # it is in a thread, which nothing can end early
+        inner.connect_timeout = self._limit  # it runs in a thread, which nothing can end early
         _write_while_open(inner)
         return client
 
@@ -203,7 +203,7 @@ class _MqttCarrier:
             raise LinkLostError(f"the broker left {_UNCONFIRMED} messages unconfirmed")
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        """Publish; with ``confirmed`` return when the broker has the message."""
+        """Publish; with ``confirmed``, return once the broker has confirmed the message."""
         properties = None
         if lifetime is not None:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
@@ -234,7 +234,7 @@ class _MqttCarrier:
                 return message.payload
 
     async def close(self) -> None:
-        """Disconnect, with a goodbye if the broker takes it at once."""
+        """Disconnect, and notify the broker if it accepts that at once."""
         client, self._client = self._client, None
         if client is None:
             return
@@ -244,21 +244,21 @@ class _MqttCarrier:
                     if self._reports:
                         await client.publish(self._ends.status, b"offline", qos=1, retain=True)
                     await client.__aexit__(None, None, None)
-        finally:  # also when the link is closed while it takes its leave
+        finally:  # even if the link is closed during the disconnection
             await _discard(client)
 
 
 def _asked_of_broker(longest: int) -> Properties:
-    """Return the requests to the broker at connection: no packet larger than a payload."""
+    """Return the requests to the broker on connection: no packet larger than an envelope allows."""
     properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
     properties.MaximumPacketSize = longest + _ROOM
     return properties
 
 
 def _write_while_open(client: paho.Client) -> None:
-    """Have the loop write for a client, but never to the number of a closed socket.
+    """Have the loop write for a client, but never to the file descriptor of a closed socket.
 
-    aiomqtt asks the loop for it by that number, some time later; by then the number may be
+    aiomqtt makes that request by file descriptor, some time later; by then the descriptor may be
     unused, or belong to another connection.
     """
     loop = asyncio.get_running_loop()
@@ -283,19 +283,19 @@ def _refuse_socket(client: paho.Client, userdata: object, sock: "paho.SocketLike
 async def _discard(client: aiomqtt.Client) -> None:
     """Close what remains of a client.
 
-    aiomqtt leaves the socket, its callbacks and a task behind when it gives up waiting for the
-    broker's answer or is cancelled meanwhile, and has no public way to end them.
+    If aiomqtt stops waiting for the broker's reply or is cancelled, it leaves the socket, its
+    callbacks and a task behind, and it has no public way to end them.
     """
     inner = client._client  # noqa: SLF001
-    # The connecting thread may still be running; it closes the socket that it gets.
+    # The connecting thread may still be running; it closes the socket that it obtains.
     inner.on_socket_open = _refuse_socket
-    await asyncio.sleep(0)  # what it has asked of the loop so far is done now
+    await asyncio.sleep(0)  # let what it has scheduled so far be done now
     inner._sock_close()  # noqa: SLF001
     task = client._misc_task  # noqa: SLF001
     if task is not None:
         task.cancel()
         await asyncio.wait([task])
-    # The cause was reported where it was noticed; nothing awaits these futures any more.
+    # The cause was reported where it occurred; nothing awaits these futures any longer.
     for future in (client._connected, client._disconnected):  # noqa: SLF001
         if future.done() and not future.cancelled():
             future.exception()
@@ -318,12 +318,12 @@ def mqtt_link(
     broker
         See `Broker`.
     prefix
-        Of all topics of a plant: "heliotrope/upington".
+        Prefix of all topics of a plant: "heliotrope/upington".
     cluster
         Name of the cluster, one level of a topic.
     key
-        Shared by both ends, at least 16 bytes: messages under another key are refused, whatever the
-        broker admits. The keys of a ring may change while the link runs.
+        Key shared by both ends, at least 16 bytes; messages under another key are rejected,
+        whatever the broker admits. The keys of a ring may change while the link runs.
     clock, settings
         As in `CarriedLink`.
     plant
@@ -332,7 +332,7 @@ def mqtt_link(
     Raises
     ------
     InputError
-        Names that cannot form a topic, or a key that is too short.
+        If names cannot form a topic, or a key is too short.
     """
     ring = ring_of(cluster, key)
     settings = settings or LinkSettings()

@@ -17,22 +17,22 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.tls import RenewedTls, client_tls
 from heliotrope.safety import Alarm, alarms
 
-#: Time between two looks at the files, s.
+#: Interval between two checks of the files, s.
 LOOKED = 2.0
-#: An alarm stands in the last days of a certificate, and comes again each day.
+#: An alarm is active during the last days of a certificate, and is raised again each day.
 DAYS = 30
 _DAY = 86_400.0
-#: What changes when a file does: time, inode, size and mode; None: it is not there.
+#: What changes when a file does: time, inode, size and mode; None: the file is missing.
 _State = tuple[int, ...] | None
 
 
 class _Renewal:
-    """Files that are read again when they change.
+    """Files that are reloaded when they change.
 
     Attributes
     ----------
     count
-        How often they have been taken.
+        Number of times they have been loaded.
     """
 
     def __init__(self, files: Sequence[Path], take: Callable[[], None]) -> None:
@@ -41,7 +41,7 @@ class _Renewal:
         self.count = 0
 
     def look(self) -> str:
-        """Take changed files; return why they cannot be used, or an empty text.
+        """Load changed files; return why they cannot be used, or an empty text.
 
         Files that cannot be used are tried again at each check.
         """
@@ -59,7 +59,7 @@ class _Renewal:
 
 
 class _Certificate:
-    """A certificate whose expiry is watched."""
+    """A certificate whose expiry is monitored."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -68,7 +68,7 @@ class _Certificate:
         self.problem = ""
 
     def look(self) -> None:
-        """Read its end again if the file has changed."""
+        """Read its expiry again if the file has changed."""
         current = _state(self.path)
         if self.end is not None and current == self._last_state:
             return
@@ -78,13 +78,13 @@ class _Certificate:
             self.end, self.problem = None, str(error)
 
     def days(self, now: datetime) -> int | None:
-        """Return the whole days that are left, below 0 once it has ended; None: unknown."""
+        """Return the number of whole days left, below 0 once it has expired; None: unknown."""
         if self.end is None:
             return None
         return math.floor((self.end - now).total_seconds() / _DAY)
 
     def line(self, now: datetime) -> str:
-        """Return its end in words."""
+        """Return its expiry in words."""
         days = self.days(now)
         if days is None or self.end is None:
             return f"the end of certificate {self.path} is unknown ({self.problem})"
@@ -100,7 +100,7 @@ class Papers:
     Parameters
     ----------
     clock
-        Its UTC decides about the ends of certificates.
+        Clock whose UTC decides whether certificates have expired.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -112,15 +112,15 @@ class Papers:
         self._reported: dict[Path, tuple[int | None, str]] = {}
 
     def renew(self, name: str, files: Sequence[Path], take: Callable[[], None]) -> None:
-        """Call ``take`` in a thread whenever one of some files changes, and once at the start."""
+        """Call ``take`` in a thread whenever one of some files changes, and once at start-up."""
         self._renewals[name] = _Renewal(files, take)
 
     def watch_end(self, path: Path) -> None:
-        """Watch the end of a certificate, or of the first to end in a file of several."""
+        """Monitor the expiry of a certificate, or of the first to expire in a file with several."""
         self._certificates.append(_Certificate(path))
 
     def lines(self) -> list[str]:
-        """Return the end of each certificate in words."""
+        """Return the expiry of each certificate in words."""
         for certificate in self._certificates:
             certificate.look()
         now = self._clock.utc()
@@ -130,7 +130,7 @@ class Papers:
     async def watched(
         self, on_alarm: Callable[[Alarm], None], on_renewed: Callable[[str], None] | None = None
     ) -> AsyncIterator[None]:
-        """Look at the files during a block, raise and end alarms, and name what was renewed."""
+        """Check the files during a block, raise and end alarms, and report what was renewed."""
         failure: Exception | None = None
         async with asyncio.TaskGroup() as group:
             task = group.create_task(self._run(on_alarm, on_renewed))
@@ -154,7 +154,7 @@ class Papers:
             await asyncio.sleep(LOOKED)
 
     def look(self) -> list[Alarm]:
-        """Take files that have changed; return alarms that begin, end, or come again."""
+        """Load files that have changed; return alarms that begin, end, or are repeated."""
         changes = []
         for name, renewal in self._renewals.items():
             problem = renewal.look()
@@ -169,7 +169,7 @@ class Papers:
         return changes
 
     def renewed(self) -> list[str]:
-        """Return the files taken again since the last call; the first taking does not count."""
+        """Return the files reloaded since the last call; the first load does not count."""
         before, self._counts = self._counts, {n: r.count for n, r in self._renewals.items()}
         return [n for n, count in self._counts.items() if count > max(1, before.get(n, 0))]
 
@@ -180,7 +180,7 @@ class Papers:
             return []
         stood = path in self._reported
         name = path.name
-        # A new day is a new occurrence, even for somebody who acknowledged the last one.
+        # A new day is a new occurrence, even if someone acknowledged the previous one.
         over = [kind.ended(name)] if stood else []
         if days is not None and days >= DAYS:
             self._reported.pop(path, None)
@@ -199,14 +199,14 @@ def _state(path: Path) -> _State:
 
 
 def end_of(path: Path) -> datetime:
-    """Return the end of a PEM certificate; of several, the first to end.
+    """Return the expiry of a PEM certificate; of several, the first to expire.
 
     Raises
     ------
     InputError
         If the package that reads certificates is not installed.
     FormatError
-        If the file cannot be read, or holds no certificate.
+        If the file cannot be read, or contains no certificate.
     """
     try:
         from cryptography import x509
@@ -225,7 +225,7 @@ def end_of(path: Path) -> datetime:
 
 
 def authority_of(papers: Papers, path: Path) -> RenewedTls:
-    """Return the TLS of a client that trusts an authority alone, renewed with its file."""
+    """Return the TLS of a client that trusts only one authority, renewed with its file."""
     tls = RenewedTls(lambda: client_tls(path))
     papers.renew("certificate of the authority", [path], tls.renew)
     papers.watch_end(path)

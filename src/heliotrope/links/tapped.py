@@ -10,7 +10,7 @@ class LinkListener(Protocol):
     """A listener at one end of a link."""
 
     async def posted(self, data: bytes, now: float) -> None:
-        """Note a message that the owner passes to the link; it is sent when this method returns."""
+        """Note a message that the owner passes to the link; it is sent once this method returns."""
         ...
 
     def sent(self, data: bytes, now: float) -> None:
@@ -18,7 +18,7 @@ class LinkListener(Protocol):
         ...
 
     async def waits(self) -> None:
-        """Note that the owner waits for a message; the link is read when this method returns."""
+        """Note that the owner waits for a message; the link is read once this method returns."""
         ...
 
     def received(self, data: bytes, now: float) -> None:

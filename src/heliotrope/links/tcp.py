@@ -34,15 +34,15 @@ from heliotrope.links.tls import TlsSource, context_of
 
 _NONCE, _PROOF = 32, 32
 _LONGEST_NAME = 64
-#: Longest frame accepted from a client that has not yet proved its identity.
+#: Longest frame accepted from a client that has not yet been authenticated.
 _GREETING = _NONCE + _PROOF + _LONGEST_NAME
 _LENGTH = 4
 #: Frames that may wait in a connection before it stops reading its socket.
 _WAITING = 64
-#: Kernel's send buffer, bytes: small, since data in it can no longer be taken back.
+#: Kernel's send buffer, bytes; it is small because data in it can no longer be withdrawn.
 _SEND_BUFFER = 65536
-#: Connections that may be in their handshake at the same time, beyond one for each cluster: in all,
-#: and from one address.
+#: Maximum number of connections in their handshake at the same time, in addition to one per
+#: cluster: in total, and from one address.
 _NEWCOMERS, _NEWCOMERS_EACH = 64, 16
 
 
@@ -51,7 +51,7 @@ class _Pipe(asyncio.Protocol):
 
     def __init__(self, largest: int, arrived: "Callable[[_Pipe], None] | None" = None) -> None:
         self.largest = largest
-        #: Whether it is a client that has not proved its identity; see `trust`.
+        #: Whether it is a client that has not yet been authenticated; see `trust`.
         self._stranger = arrived is not None
         self.address = ""
         self._arrived = arrived
@@ -76,12 +76,12 @@ class _Pipe(asyncio.Protocol):
             self.address = str((transport.get_extra_info("peername") or ("",))[0])
         self._writable.set()
         if self._arrived is not None:
-            # Read only once its task is there, which may begin with TLS.
+            # Read only once its task exists, which may begin with TLS.
             transport.pause_reading()
             self._arrived(self)
 
     async def begin(self, tls: ssl.SSLContext | None, limit: float) -> None:
-        """Begin to read as a server, after the handshake of TLS if there is one."""
+        """Begin to read as a server, after the TLS handshake if there is one."""
         transport = self._transport
         if transport is None:
             raise LinkLostError(self._lost)
@@ -97,7 +97,7 @@ class _Pipe(asyncio.Protocol):
         self._transport = made
 
     def data_received(self, data: bytes) -> None:
-        """Cut received bytes into frames."""
+        """Split received bytes into frames."""
         self._buffer += data
         while not self._lost and len(self._buffer) >= _LENGTH:
             size = int.from_bytes(self._buffer[:_LENGTH], "big")
@@ -110,7 +110,7 @@ class _Pipe(asyncio.Protocol):
             self._frames.append(bytes(self._buffer[_LENGTH : _LENGTH + size]))
             del self._buffer[: _LENGTH + size]
             if self._stranger and self._buffer:
-                # Cutting 200 kB into empty frames held the plant's loop for 0.1 s.
+                # Splitting 200 kB into empty frames blocked the plant's event loop for 0.1 s.
                 self.lose("received more than one frame before its proof was answered")
                 return
         if self._frames:
@@ -120,7 +120,7 @@ class _Pipe(asyncio.Protocol):
             self._transport.pause_reading()
 
     def trust(self, largest: int) -> None:
-        """Take any number of frames up to a size from now on."""
+        """Accept any number of frames up to a given size from now on."""
         self._stranger, self.largest = False, largest
 
     def pause_writing(self) -> None:
@@ -185,7 +185,7 @@ def _proof(key: bytes, label: bytes, server: bytes, client: bytes, name: bytes) 
 
 
 def _derived(ring: KeyRing, server: bytes, client: bytes, name: bytes) -> SealKeys:
-    """Return the connection's keys: one for each of the ring, whenever it changes."""
+    """Return the connection's keys: one for each key of the ring, updated whenever it changes."""
     made: dict[bytes, bytes] = {}
 
     def keys() -> tuple[bytes, ...]:
@@ -198,7 +198,7 @@ def _derived(ring: KeyRing, server: bytes, client: bytes, name: bytes) -> SealKe
 
 
 async def _introduce(pipe: _Pipe, name: str, key: bytes, ring: KeyRing) -> SealKeys:
-    """Authenticate both ends, and return the connection's keys: the client's side."""
+    """Authenticate both ends from the client's side, and return the connection's keys."""
     server, client, title = await pipe.read(), secrets.token_bytes(_NONCE), name.encode()
     if len(server) != _NONCE:
         raise LinkError("the program that answers there does not speak this protocol")
@@ -215,7 +215,7 @@ async def _introduce(pipe: _Pipe, name: str, key: bytes, ring: KeyRing) -> SealK
 
 
 async def _greet(pipe: _Pipe, rings: Mapping[str, KeyRing], largest: int) -> tuple[str, SealKeys]:
-    """Authenticate the client; return its name and the connection's keys: the server's side."""
+    """Authenticate the client from the server's side; return its name and the connection's keys."""
     server = secrets.token_bytes(_NONCE)
     pipe.write(server)
     frame = await pipe.read()
@@ -296,7 +296,7 @@ class _Client:
             )
             seal = await _introduce(pipe, self.name, key, self.ring)
         except BaseException as error:
-            # The server may not have the new key yet: the next attempt is with the old one.
+            # The server may not have the new key yet, so the next attempt uses the old key.
             self._turn = self._turn + 1 if isinstance(error, LinkError) else 0
             await pipe.close()
             raise
@@ -305,7 +305,7 @@ class _Client:
 
 
 class _Newcomers:
-    """Connections in their handshake: bounded in all and per address, the oldest gives way.
+    """Connections in their handshake, limited in total and per address; the oldest is closed first.
 
     Parameters
     ----------
@@ -455,7 +455,7 @@ class TcpServer:
         self.port = 0
         self.refused = 0
         self.last_refusal = ""
-        # As long as the newcomers are many: what is evicted is taken out at once.
+        # No longer than the number of newcomers, because an evicted connection is removed at once.
         self._arrived: asyncio.Queue[_Pipe] = asyncio.Queue()
         self._newcomers = _Newcomers(len(keys))
         self._listening = asyncio.Event()
@@ -484,7 +484,7 @@ class TcpServer:
                 lambda: _Pipe(_GREETING, self._arrive),
                 self._host,
                 self._requested,
-                # All clusters may call in the same instant, as after a restart.
+                # All clusters may connect at the same instant, as after a restart.
                 backlog=len(self.links) + 2 * _NEWCOMERS,
             )
         except OSError as error:

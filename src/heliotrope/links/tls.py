@@ -6,12 +6,12 @@ from pathlib import Path
 
 from heliotrope.errors import InputError
 
-#: A context, or a function that returns the one to use now; None: no TLS.
+#: A context, or a function that returns the present context; None: no TLS.
 TlsSource = ssl.SSLContext | Callable[[], ssl.SSLContext] | None
 
 
 def context_of(source: TlsSource) -> ssl.SSLContext | None:
-    """Return the context to use now, None without TLS."""
+    """Return the present context, None without TLS."""
     return source if source is None or isinstance(source, ssl.SSLContext) else source()
 
 

@@ -36,12 +36,12 @@ class CallError(HeliotropeError):
 
 
 def value_of(answer: Frame) -> Any:
-    """Return the value of an answer.
+    """Return the value of a reply.
 
     Raises
     ------
     CallError
-        If it is an error.
+        If the reply is an error.
     """
     if "error" in answer.head:
         raise CallError(str(answer.head["error"]), str(answer.head.get("text", "")))
@@ -77,7 +77,7 @@ class LocalConnection:
             await asyncio.sleep(pause)
 
     async def _live(self) -> None:
-        """Connect, and take answers until the connection ends."""
+        """Connect, and receive replies until the connection ends."""
         raw = await asyncio.to_thread(connect, self._path, 2.0)
         raw.setblocking(False)
         reader, writer = await asyncio.open_unix_connection(sock=raw)
@@ -134,7 +134,8 @@ class LocalConnection:
         number = self._number
         head = {"id": number, "call": call, "arguments": arguments, "for": on_behalf}
         data = pack(head, blob)
-        # The plant cuts off a caller that sends more, with all that others have asked through it.
+        # The plant disconnects a caller that sends more, and would drop all other requests on the
+        # connection.
         lengths(data[:PREFIX], REQUEST_HEAD, REQUEST_BLOB)
         future = asyncio.get_running_loop().create_future()
         self._waiting[number] = future
@@ -152,7 +153,7 @@ class LocalConnection:
         finally:
             self._waiting.pop(number, None)
             if future.done() and not future.cancelled():
-                future.exception()  # it may have failed after the limit
+                future.exception()  # it may have failed after the deadline
         return value_of(answer), answer.blob
 
 

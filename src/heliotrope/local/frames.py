@@ -20,16 +20,16 @@ from heliotrope.errors import HeliotropeError
 MARK = b"HLP1"
 _PREFIX = struct.Struct("<4sII")
 PREFIX = _PREFIX.size
-#: Largest head and blob of a request, bytes. Python reads JSON without letting other threads run:
+#: Largest head and blob of a request, bytes. Python parses JSON without letting other threads run;
 #: a head of this size takes less than 0.1 s.
 REQUEST_HEAD, REQUEST_BLOB = 1 << 20, 8 << 20
 #: Largest head before the caller is known, bytes.
 HELLO_HEAD = 4096
-#: Bytes of a blob that are read at once where it is passed over.
+#: Number of bytes read at a time when a blob is skipped.
 _PART = 1 << 16
 #: Error kind for a defect in the program.
 INTERNAL = "internal"
-#: Largest head and blob of an answer, bytes.
+#: Largest head and blob of a reply, bytes.
 ANSWER_HEAD, ANSWER_BLOB = 64 << 20, 64 << 20
 
 
@@ -57,7 +57,7 @@ def lengths(prefix: bytes, most_head: int, most_blob: int) -> tuple[int, int]:
     Raises
     ------
     FrameError
-        Another mark, or a length above its limit.
+        If the mark is wrong, or a length is above its limit.
     """
     mark, head, blob = _PREFIX.unpack(prefix)
     if mark != MARK:
@@ -75,11 +75,11 @@ def head_of(data: bytes) -> dict[str, Any]:
     Raises
     ------
     FrameError
-        If it is not a JSON object, or holds a number or a text that no answer could repeat: an
-        infinite one, or half of a surrogate pair.
+        If it is not a JSON object, or contains a number or text that no reply could return: an
+        infinite number, or half of a surrogate pair.
     """
     try:
-        # As text: of bytes json would accept surrogates, and UTF-16.
+        # As text, because json would accept surrogates and UTF-16 in bytes.
         head = json.loads(data.decode(), parse_constant=_no_number, parse_float=_number)
         if b"\\u" in data:
             json.dumps(head, ensure_ascii=False).encode()
@@ -107,7 +107,7 @@ async def read_frame(
     most_blob: int = ANSWER_BLOB,
     accepts: Callable[[dict[str, Any]], bool] = lambda _: True,
 ) -> Frame:
-    """Read one frame; a blob is kept if ``accepts`` holds for its head, else it is passed over.
+    """Read one frame; its blob is kept if ``accepts`` holds for its head, else skipped.
 
     Raises
     ------

@@ -8,14 +8,14 @@ reverse the text direction, are escaped; the lines of a traceback begin with a m
 import logging
 import re
 
-#: Longest line, and most lines of a traceback that are kept, the last ones.
+#: Length of the longest line, and number of last traceback lines that are kept.
 LONGEST, MOST_LINES = 500, 40
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\\\\]")
 _MARK = "  | "
 
 
 class LogLines(logging.Formatter):
-    """Writes records as such lines."""
+    """Formats records as such lines."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the lines of a record."""

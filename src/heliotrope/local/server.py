@@ -34,16 +34,16 @@ from heliotrope.local.frames import (
 from heliotrope.local.sockets import listen, user_of
 
 _LOG = logging.getLogger(__name__)
-#: Bytes of answers that wait in a connection before its requests do.
+#: Number of reply bytes that wait in a connection before its requests wait.
 _BUFFER = 1 << 16
 
 
 class Caller(Protocol):
-    """The caller at the other end."""
+    """The caller at the other end of a connection."""
 
     @property
     def reserved(self) -> bool:
-        """Whether there is a place for this caller whatever others do."""
+        """Whether a place is reserved for this caller, whatever other callers do."""
         ...
 
 
@@ -93,11 +93,11 @@ class _Peer:
         self._writer.transport.abort()
 
     async def write(self, data: bytes, limit: float) -> None:
-        """Write a frame; a peer that does not take it within ``limit`` s is cut off."""
+        """Write a frame; a peer that does not accept it within ``limit`` s is disconnected."""
         try:
             async with asyncio.timeout(limit), self._turn:
                 if self._writer.transport.is_closing():
-                    return  # asyncio would write a line to the log for each answer
+                    return  # asyncio would write a log line for each reply
                 self._writer.write(data)
                 await self._writer.drain()
         except (TimeoutError, OSError):
@@ -105,7 +105,7 @@ class _Peer:
 
 
 class _Identity(Generic[C]):
-    """The caller of a connection, asked for again once the last answer is old."""
+    """The caller of a connection, determined again when the last result is old."""
 
     def __init__(self, ask: Callable[[], Awaitable[C | None]], trusted: float) -> None:
         self._ask, self._trusted, self._turn = ask, trusted, asyncio.Lock()
@@ -113,7 +113,7 @@ class _Identity(Generic[C]):
         self._until = 0.0
 
     async def caller(self) -> C | None:
-        """Return the caller, None if they are not valid any more."""
+        """Return the caller, None if they are no longer valid."""
         async with self._turn:
             if time.monotonic() >= self._until:
                 asked = time.monotonic()
@@ -156,7 +156,7 @@ class LocalServer(Generic[C]):
         self._blob = blob
         self._limits = limits or LocalLimits()
         self._listener: socket.socket | None = None
-        #: Taken, and not served yet.
+        #: Accepted, but not served yet.
         self._taken = set[socket.socket]()
         self._strangers: list[_Peer] = []
         self._callers: list[_Peer] = []
@@ -180,7 +180,7 @@ class LocalServer(Generic[C]):
             async with asyncio.TaskGroup() as group:
                 while True:
                     await asyncio.sleep(self._limits.pace_s)
-                    with contextlib.suppress(OSError):  # too many open files: it waits
+                    with contextlib.suppress(OSError):  # too many open files, so it waits
                         peer, _ = await loop.sock_accept(self._listener)
                         user = user_of(peer)
                         if user is None:
@@ -210,7 +210,7 @@ class LocalServer(Generic[C]):
             if identity is not None:
                 await self._talk(reader, peer, *identity)
         except (HeliotropeError, EOFError, OSError, TimeoutError):
-            return  # the connection has ended, or has to
+            return  # the connection has ended, or must end
         except Exception:  # noqa: BLE001 - it is logged
             # One connection must not end the others.
             _LOG.exception("local interface")
@@ -223,7 +223,7 @@ class LocalServer(Generic[C]):
     async def _identified(
         self, reader: asyncio.StreamReader, peer: _Peer, user: int
     ) -> tuple[_Identity[C], C] | None:
-        """Return how to ask for the caller again, and the caller; None if they are refused."""
+        """Return how to determine the caller again, and the caller; None if rejected."""
         async with asyncio.timeout(self._limits.hello_s):
             hello = await read_frame(reader, HELLO_HEAD, 0)
             ask = functools.partial(self._caller, hello.head, user)
@@ -268,7 +268,7 @@ class LocalServer(Generic[C]):
                     work.cancel()
 
     async def _end_with(self, identity: _Identity[C], peer: _Peer) -> None:
-        """Cut a connection off once its caller is not valid any more, also an idle one."""
+        """Disconnect a caller who is no longer valid, even if the connection is idle."""
         while await identity.caller() is not None:
             await asyncio.sleep(self._limits.trusted_s)
         peer.cut()
@@ -276,7 +276,7 @@ class LocalServer(Generic[C]):
     async def _answer_one(
         self, frame: Frame, peer: _Peer, identity: _Identity[C], room: asyncio.Semaphore
     ) -> None:
-        """Answer one request, of a caller who is valid now."""
+        """Answer one request of a caller who is currently valid."""
         number, blob = frame.head["id"], b""
         if (caller := await identity.caller()) is None:
             await self._refuse(peer, number)
@@ -289,7 +289,7 @@ class LocalServer(Generic[C]):
             kind, text = self._kinds(error)
             data = pack({"id": number, "error": kind, "text": text})
         except Exception:  # noqa: BLE001 - it is logged
-            # The plant goes on whatever a call does.
+            # The plant continues whatever a call does.
             _LOG.exception("local interface: %s", str(frame.head.get("call"))[:64])
             data = pack({"id": number, "error": INTERNAL, "text": "the call has failed"})
         await peer.write(data, self._limits.answer_s)
@@ -297,7 +297,7 @@ class LocalServer(Generic[C]):
 
 
 def _place(pool: list[_Peer], peer: _Peer, most: int) -> None:
-    """Add a connection; the oldest gives way."""
+    """Add a connection; if the pool is full, the oldest is closed."""
     while len(pool) >= most:
         pool.pop(0).cut()
     pool.append(peer)

@@ -16,11 +16,11 @@ from heliotrope.errors import InputError
 #: The sockets of a plant: one for all calls, and one for EMERGENCY, DEFOCUS and STOW alone.
 ORDINARY, EMERGENCY = "plant.sock", "emergency.sock"
 _FOLDER = "interface"
-#: Connections that wait to be taken.
+#: Number of connections that may wait to be accepted.
 _BACKLOG = 16
 #: Pause before another attempt to connect, s.
 _AGAIN = 0.01
-#: A socket's address has room for this many bytes.
+#: Longest path that fits in a socket address, bytes.
 _LONGEST = 100
 _CREDENTIALS = struct.Struct("3i")
 
@@ -31,7 +31,7 @@ def socket_folder(data: Path) -> Path:
 
 
 def name_here(user: int) -> str:
-    """Return the name under which a user of this computer is recorded; the number if unnamed."""
+    """Return the name under which a user of this computer is recorded; a number if unnamed."""
     try:
         return f"{pwd.getpwuid(user).pw_name} on this machine"
     except KeyError:
@@ -39,12 +39,12 @@ def name_here(user: int) -> str:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for sockets that only this user can enter.
+    """Create a folder for sockets that only this user can enter.
 
     Raises
     ------
     InputError
-        If it cannot be made, or belongs to another user.
+        If it cannot be created, or belongs to another user.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def make_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _short(path: Path) -> Iterator[str]:
-    """Return an address for a socket whose path may be too long for one."""
+    """Yield an address for a socket whose path may be too long for one."""
     if len(os.fsencode(path)) <= _LONGEST:
         yield str(path)
         return
@@ -75,7 +75,7 @@ def listen(path: Path) -> socket.socket:
     Raises
     ------
     InputError
-        If there can be none.
+        If it cannot listen there.
     """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -97,7 +97,7 @@ def connect(path: Path, timeout: float) -> socket.socket:
     Raises
     ------
     OSError
-        If nobody listens there, or another user, who would be given our key or token.
+        If nothing listens there, or another user does, who would then receive our key or token.
     """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     made.settimeout(timeout)
@@ -108,7 +108,7 @@ def connect(path: Path, timeout: float) -> socket.socket:
                 try:
                     made.connect(address)
                     break
-                except BlockingIOError:  # others wait to be taken: try again
+                except BlockingIOError:  # others wait to be accepted: try again
                     if time.monotonic() > until:
                         raise
                     time.sleep(_AGAIN)
@@ -121,7 +121,7 @@ def connect(path: Path, timeout: float) -> socket.socket:
 
 
 def user_of(peer: socket.socket) -> int | None:
-    """Return the user of the process at the other end: this one or root; None for any other.
+    """Return the user of the process at the other end if it is this user or root, else None.
 
     The kernel vouches for it (SO_PEERCRED).
     """

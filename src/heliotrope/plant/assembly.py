@@ -57,42 +57,42 @@ from heliotrope.safety import (
 )
 from heliotrope.store.records import PlannedVisit, StoreError
 
-#: A calibration that removes the errors of a quick installation.
+#: A calibration that removes the errors of quick installation.
 CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto")
-#: Age from which a silent heliostat is not waited for at the end, s.
+#: Age above which a silent heliostat is not waited for at the end, s.
 SILENT = 10.0
-#: Time after which one that is held and has not moved is not waited for either, s: large plants ask
-#: for step counts every five seconds.
+#: Time after which a held heliostat that has not moved is no longer waited for, s. Large plants
+#: poll step counts every five seconds.
 _STANDS = 15.0
-#: Period of reading the sensors, s.
+#: Interval at which the sensors are read, s.
 _SENSED = 0.5
-#: Period of asking the witnesses of the sun, s.
+#: Interval at which the witnesses of the sun are queried, s.
 _WITNESSED = 5.0
-#: The audit has changed limits in this name.
+#: The name under which the audit records changed limits.
 _PLANT_FILE = Person("plant file", Role.ENGINEER)
 
 
 class MachineTables(Enum):
     """Whether the local controllers hold the machine tables of the plant file."""
 
-    #: Unknown: they keep the tables that they hold, and the plant assumes nothing.
+    #: Unknown: the controllers keep the tables that they hold, and the plant assumes nothing.
     UNKNOWN = "unknown"
-    #: They hold them already, as simulated boards do.
+    #: The controllers already hold them, as simulated boards do.
     HELD = "held"
-    #: The plant compares them, and writes those that differ.
+    #: The plant compares the tables, and writes those that differ.
     WRITTEN = "written"
 
 
 @dataclass(frozen=True)
 class AssemblySettings:
-    """Settings of a plant at work.
+    """Settings of a running plant.
 
     Attributes
     ----------
     work
         Automatic control.
     plant
-        Times and limits; the readings of the sensor port are added.
+        Times and limits, to which the readings of the sensor port are added.
     cycle
         Calibration.
     machines
@@ -106,7 +106,7 @@ class AssemblySettings:
 
 
 class _Begun:
-    """Operations that begin once the field is ready; until then the plant already leads it."""
+    """Operations that begin once the field is ready; the plant already controls it before."""
 
     def __init__(
         self, operations: Operations, ready: Callable[[], Coroutine[Any, Any, None]] | None
@@ -122,13 +122,13 @@ class _Begun:
             await self._operations.run()
 
     async def close(self) -> None:
-        """End them."""
+        """End the operations."""
         self._closing.set()
         await self._operations.close()
 
 
 class PlantAssembly:
-    """A plant with everything that it is connected to.
+    """A plant with everything to which it is connected.
 
     Parameters
     ----------
@@ -144,13 +144,13 @@ class PlantAssembly:
     plant, operations, logbook
         See their classes.
     schedule
-        Schedule of calibration; None: nothing is calibrated.
+        Calibration schedule; None: nothing is calibrated.
 
     Raises
     ------
     InputError
-        Links that do not fit the design, or a group without the machine table that ``settings``
-        asks for.
+        If links do not fit the design, or a group lacks the machine table that ``settings``
+        requires.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class PlantAssembly:
             extra=ports.facts,
             worker=ports.worker,
         )
-        #: When each heliostat last moved, or was ordered to, on its way to stow at the end.
+        #: When each heliostat last moved, or was ordered to move, on its way to stow at the end.
         self._moved_at = np.full(len(self.names), math.inf)
         self._record_limits()
         if chosen.machines is not MachineTables.UNKNOWN:
@@ -207,7 +207,7 @@ class PlantAssembly:
         return self.plant.field.names
 
     def _record_limits(self) -> None:
-        """Record which numbers of safety table and approvals differ from those of the run before.
+        """Record which limits of the safety table and of approvals differ from the previous run.
 
         At the first run they are compared with the defaults.
         """
@@ -233,7 +233,7 @@ class PlantAssembly:
         return made
 
     def _visits(self, cameras: Cameras) -> Visits:
-        """Return the visits that the design and its cameras allow, and make their schedule."""
+        """Return the visits that the design and its cameras allow, and create their schedule."""
         plant, design, ports, settings = self.plant, self.design, self.ports, self.settings.cycle
         eye = cameras if ports.pictures is None else KeptCamera(cameras, ports.pictures)
         unhidden = Unhidden(plant, ports.worker)
@@ -252,18 +252,18 @@ class PlantAssembly:
         )
 
     def _rest_on_machines(self) -> None:
-        """Take the standby points of the plant file for all heliostats that were assigned none."""
+        """Set the standby points of the plant file for heliostats to which none was assigned."""
         for row, name in enumerate(self.names):
             rest_on(self.plant.standbys[row : row + 1], self.design.machine(name).standby)
 
     def aim_as_designed(self) -> None:
-        """Take the design's aims for all heliostats that were assigned none: they track them."""
+        """Set the design's aims for heliostats to which none was assigned; they track them."""
         aims = self.plant.default_aims(self.names)
         for row, name in enumerate(self.names):
             rest_on(self.plant.aims[row : row + 1], tuple(aims[name]))
 
     def _want(self) -> None:
-        """Want every local controller to store the machine table and the last calibration."""
+        """Set the machine table and the last calibration as wanted in each local controller."""
         for name, point in zip(self.names, self.plant.standbys, strict=True):
             mechanism = self.plant.beliefs.present(name)[0]
             self.plant.wanted.set(name, items_of(mechanism, self.design.machine(name)))
@@ -274,7 +274,7 @@ class PlantAssembly:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator["PlantAssembly"]:
-        """Run plant, operations and everything beside them for the time of a block."""
+        """Run the plant, its operations and everything beside them for the duration of a block."""
         cameras, sensors = self.ports.cameras, self.ports.sensors
         if cameras is not None:
             cameras.start(self.logbook.take_alarm)
@@ -286,7 +286,7 @@ class PlantAssembly:
             ):
                 group = await later.enter_async_context(asyncio.TaskGroup())
                 tasks = []
-                # The safety table waits for readings from the start.
+                # The safety table expects readings from the start.
                 if sensors is not None:
                     tasks.append(group.create_task(self._sense(sensors)))
                 await later.enter_async_context(running(_Begun(self.operations, self.ports.ready)))
@@ -307,7 +307,7 @@ class PlantAssembly:
                 cameras.close()
 
     async def _sense(self, sensors: Sensors) -> None:
-        """Hand readings of sensors to the safety table as they come."""
+        """Pass sensor readings to the safety table as they arrive."""
         while True:
             news = await sensors.news()
             for name, value in news.values.items():
@@ -321,7 +321,7 @@ class PlantAssembly:
             await asyncio.sleep(_SENSED)
 
     async def _witness(self) -> None:
-        """Compare the plant's sun with those of its witnesses as they come."""
+        """Compare the plant's sun vector with those of its witnesses as they arrive."""
         while True:
             for witness in self.ports.witnesses:
                 seen = await witness.sun(self.design.site)
@@ -330,7 +330,7 @@ class PlantAssembly:
             await sleep_until(self.clock, self.clock.monotonic() + _WITNESSED)
 
     async def _look(self, cameras: Cameras) -> None:
-        """Photograph each target once, so that a camera that fails is known before a beam comes."""
+        """Photograph each target once, so that a camera failure is known before a beam arrives."""
         await self.operations.begun.wait()
         for target in self.design.targets:
             if not cameras.sees(target.name):
@@ -342,7 +342,7 @@ class PlantAssembly:
                 self.logbook.event("calibration", target.name, str(error))
 
     async def end(self) -> None:
-        """End operations and plant, and with them `running`."""
+        """End the operations and the plant, and with them `running`."""
         await self.operations.close()
         await self.plant.close()
 
@@ -352,7 +352,7 @@ class PlantAssembly:
         """Stow the field; return whether every heliostat is stowed.
 
         It waits ``limit`` s at most, and only for heliostats on their way (`to_stow`); `left` names
-        the others.
+        all others.
         """
         await self.operations.automatic.halt()
         ticket, rows = self.plant.stow("plant's end"), self.plant.field
@@ -366,10 +366,10 @@ class PlantAssembly:
         return not self.left()
 
     def _on_the_way(self, now: float) -> npt.NDArray[np.bool_]:
-        """Return the heliostats that an order leads to stow and that are not there, (N,)."""
+        """Return the heliostats that an order sends to stow and that are not there yet, (N,)."""
         rows = self.plant.field
         away = (rows.age(now) <= SILENT) & ~(rows.live(now) & at_stow(rows.rows))
-        # In these states only the motion shows whether a heliostat obeys STOW.
+        # In these states, only the motion shows whether a heliostat obeys STOW.
         stands = rows.among(states.KEPT, now) & (now - self._moved_at > _STANDS)
         return np.asarray(away & ~stands)
 
@@ -378,8 +378,9 @@ class PlantAssembly:
 
         Returns
         -------
-            Their number in each state, and s: both axes of the furthest one turn, in turn, after
-            those that are sent before it. NaN if their positions are unknown.
+            Their number in each state; and the time, s, in which both axes of the furthest
+            heliostat turn, one after the other, once the heliostats before it have been sent. NaN
+            if their positions are unknown.
         """
         rows, now = self.plant.field, self.clock.monotonic()
         away = np.flatnonzero(self._on_the_way(now))
@@ -395,7 +396,7 @@ class PlantAssembly:
         return dict(found.most_common()), seconds
 
     def left(self) -> str:
-        """Return the heliostats that are not stowed, in words; empty if all are."""
+        """Return the heliostats that are not stowed, in words; empty if all are stowed."""
         rows, now = self.plant.field, self.clock.monotonic()
         away = np.flatnonzero(~(rows.live(now) & at_stow(rows.rows)))
         if not len(away):

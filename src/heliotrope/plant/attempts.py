@@ -18,24 +18,24 @@ from heliotrope.safety import Alarm, alarms
 
 @dataclass(frozen=True)
 class RetryLaw:
-    """How one kind of work is tried again.
+    """How one kind of work is retried.
 
     Attributes
     ----------
     work
-        What is tried, for people.
+        What is tried, for display.
     most
-        Failures in a row after which it is given up.
+        Number of consecutive failures after which it is given up.
     wait, growth, longest
         Wait after the first failure, s, the factor from one to the next, and the longest wait, s.
     rest
-        Time until work that was given up gets one more turn, s; infinite: it gets none by itself.
+        Time until work that was given up is tried once more, s; infinite: never by itself.
     memory
         Time after which an earlier failure no longer counts, s.
     following
-        What follows once it is given up: a clause for people.
+        What follows once it is given up: a clause for display.
     alarm
-        Raised when it is given up; None: what follows needs nobody.
+        Alarm raised when it is given up; None: what follows needs no operator.
     """
 
     work: str
@@ -58,11 +58,12 @@ class Retry:
     work, subject
         What is tried, and the heliostat, target, receiver or part of the work.
     count, most
-        Failures in a row, and those after which it is given up.
+        Number of consecutive failures, and the number after which it is given up.
     reason
         Why it failed last.
     left
-        Time until the next try, s; 0: at the next opportunity; infinite: there is none by itself.
+        Time until the next attempt, s; 0: at the next opportunity; infinite: there is none by
+        itself.
     given_up
         Whether it was given up.
     following
@@ -81,7 +82,7 @@ class Retry:
 
 @dataclass(frozen=True)
 class _Failed:
-    """Failures of one subject: their number, the last reason and time, and the next try."""
+    """Failures of one subject: their number, the last reason and time, and the next attempt."""
 
     count: int
     reason: str
@@ -106,7 +107,7 @@ class Attempts:
         self._named: set[str] = set()
 
     def report_to(self, tell: Callable[[Alarm], None]) -> None:
-        """Call a function with each alarm from now on."""
+        """Call the given function with each alarm from now on."""
         self._tell = tell
 
     # -- results ---------------------------------------------------------------------------
@@ -131,14 +132,14 @@ class Attempts:
             self._tell(law.alarm.raised(subject, reason=reason, count=count))
 
     def done(self, subject: str) -> None:
-        """Note that the work has succeeded, or is no longer wanted: its alarm ends."""
+        """Note that the work has succeeded, or is no longer wanted; its alarm ends."""
         self._failed.pop(subject, None)
         if subject in self._named and self.law.alarm is not None and self._tell is not None:
             self._named.discard(subject)
             self._tell(self.law.alarm.ended(subject))
 
     def renew(self, subjects: Iterable[str]) -> None:
-        """Begin anew: somebody wants another try, or more is known. An alarm stays until `done`."""
+        """Start afresh: another attempt is wanted or more is known. An alarm stays until `done`."""
         for subject in subjects:
             self._failed.pop(subject, None)
 
@@ -146,7 +147,7 @@ class Attempts:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Failures in a row, by subject; those without one are left out."""
+        """Number of consecutive failures, by subject; subjects without failures are left out."""
         return MappingProxyType({name: one.count for name, one in self._failed.items()})
 
     @property
@@ -155,7 +156,7 @@ class Attempts:
         return [name for name, one in self._failed.items() if one.count >= self.law.most]
 
     def waiting(self, now: float) -> Collection[str]:
-        """Return the subjects whose next try is not due yet."""
+        """Return the subjects whose next attempt is not due yet."""
         return [name for name, one in self._failed.items() if now < one.next_at]
 
     def due(self, subject: str, now: float) -> bool:
@@ -164,7 +165,7 @@ class Attempts:
         return one is None or now >= one.next_at
 
     def shown(self, now: float) -> tuple[Retry, ...]:
-        """Return the tasks that wait for another try or were given up, for display."""
+        """Return the work that awaits another attempt or was given up, for display."""
         law = self.law
         return tuple(
             Retry(

@@ -91,9 +91,9 @@ from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
 from heliotrope.sun import fast_vector
 
-#: An equal safe order of the same person within this time joins the one before, s.
+#: A repeated safe order of the same person within this time joins the earlier one, s.
 _SAME = 0.25
-#: Pause between two passes over parameters and owed records, s.
+#: Pause between two passes over the parameters and the owed records, s.
 _SLOW_BEAT = 1.0
 
 
@@ -268,7 +268,7 @@ class PlantController:
         )
 
     def _syncing(self) -> ParameterSync:
-        """Return the part that compares and writes the parameters of local controllers."""
+        """Return the part that compares and writes the local controllers' parameters."""
         return ParameterSync(
             self.field,
             self.wanted,
@@ -313,7 +313,7 @@ class PlantController:
         )
 
     def _guarding(self) -> Guards:
-        """Return the guards that stop heliostats."""
+        """Return the guards that block heliostats."""
         return Guards(
             self.field,
             self.authority,
@@ -330,14 +330,15 @@ class PlantController:
         )
 
     def _listed(self) -> tuple[Part, ...]:
-        """Return the parts, in the order in which each hook is called."""
+        """Return the parts in the order in which each hook is called."""
         return (
-            # First at a beat, so that nothing begins that the safety table forbids by now; and
-            # first at a cluster that has connected, which repeats an emergency before all else.
+            # First at a beat, so that nothing begins that the safety table has just forbidden; and
+            # first for a newly connected cluster, to which it repeats an emergency before anything
+            # else.
             self.sentinel,
             self._dispatching(),
             self._orders,
-            # After new orders, which may take what a visit has left.
+            # After new orders, which may take over what a visit has left.
             self._returning(),
             self.ledger,
             self._agreement,
@@ -345,7 +346,7 @@ class PlantController:
             ClusterSettings(self._tell, _expected(self.settings)),
             self._second_plant,
             ClusterAlarms(self._tell),
-            # These judge a status before the sentinel proves anything by it (`on_rows`).
+            # These evaluate a status before the sentinel uses it as proof (`on_rows`).
             self._identities,
             self.doubtful,
             self.drive_checks,
@@ -353,7 +354,7 @@ class PlantController:
             self.witnesses,
             Firmware(self.settings.firmware, self._clusters, self._tell),
             self._taken,
-            # Last: what it compares and writes depends on points that the others have taken.
+            # Last, because what it compares and writes depends on points accepted by the others.
             self._sync,
         )
 
@@ -370,7 +371,7 @@ class PlantController:
         )
 
     def _directed(self) -> Commands:
-        """Return the part that gives people's commands."""
+        """Return the part that issues operators' commands."""
         return Commands(
             self._orders,
             self._joining,
@@ -395,7 +396,7 @@ class PlantController:
         )
 
     def _returning(self) -> GivingBack:
-        """Return the part that gives back what visits have left behind."""
+        """Return the part that restores what visits have left behind."""
         return GivingBack(
             self.field,
             self.authority,
@@ -497,7 +498,7 @@ class PlantController:
                 part.on_second(now)
 
     def _writing(self) -> int:
-        """Return the token under which parameters may be written now, 0 if none may be."""
+        """Return the token under which parameters may be written now, 0 if none may be written."""
         return 0 if self.sentinel.refusal(self.field.clusters) else self.authority.token
 
     def _tell(self, alarm: Alarm) -> None:
@@ -531,7 +532,7 @@ class PlantController:
         return self._orders.open
 
     def put(self, name: str, value: float, subject: str = "", *, made: float | None = None) -> None:
-        """Take a sensor reading for the safety table or for the proof of an emergency.
+        """Accept a sensor reading for the safety table or for the proof of an emergency.
 
         It was measured at ``made`` (monotonic s); None: now.
 
@@ -542,7 +543,7 @@ class PlantController:
         """
         self.sentinel.put(name, value, self.now() if made is None else made, subject)
 
-    # -- open to anybody -------------------------------------------------------------------
+    # -- open to anyone ---------------------------------------------------------------------
 
     def defocus(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
         """Move the beams of some or all heliostats off the receiver now; anyone may order this."""
@@ -551,8 +552,8 @@ class PlantController:
     def stow(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
         """Send some or all heliostats to stow; anyone may order this.
 
-        A large number of heliostats go one after the other, see `PlantSettings.stow_rate`; an
-        emergency sends all at once.
+        If there are many, they go one after the other, see `PlantSettings.stow_rate`; an emergency
+        sends all at once.
         """
         return self._safe(who, Act.STOW, heliostats)
 
@@ -574,8 +575,9 @@ class PlantController:
     def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
         for name in heliostats:
             self.field.place(name)
-        # Whoever repeats an order as fast as it is answered gets the ticket of the one under way:
-        # nothing else has been ordered since, and clusters repeat it by themselves.
+        # A client that repeats an order as soon as it is answered gets the ticket of the order
+        # under way, because nothing else has been ordered since, and clusters repeat it by
+        # themselves.
         same, last = (who, act, tuple(heliostats)), self._orders.latest
         under_way = last is not None and self._last_safe == (same, last) and not last.finished
         if last is not None and under_way and self.now() - last.accepted_at < _SAME:
@@ -595,7 +597,7 @@ class PlantController:
         Raises
         ------
         InputError
-            Another act.
+            If the act is neither DEFOCUS nor STOW.
         RefusedError
             If this person's order was withdrawn repeatedly; see `Callers`.
         """
@@ -685,9 +687,9 @@ class PlantController:
             The person acknowledging; their role must be high enough for the row.
         condition, subject
             As named in the alarm. For a row that a cluster evaluates, the subject is the cluster;
-            the cluster decides, and clears the alarm if it agrees. For `counts_doubtful` the
-            acknowledgement confirms that the person has seen the heliostat where it should be; for
-            `drive_stalled`, that its mirror follows its drives.
+            the cluster decides, and clears the alarm if it agrees. For `counts_doubtful`, the
+            acknowledgement confirms that the person has seen the heliostat in its correct position;
+            for `drive_stalled`, that its mirror follows its drives.
 
         Raises
         ------
@@ -711,7 +713,7 @@ class PlantController:
         self.note(person, "ACKNOWLEDGE", f"{condition} {subject}".strip())
 
     def note(self, person: Person, what: str, note: str) -> None:
-        """Record an action that moves nothing in the audit."""
+        """Record in the audit an action that moves nothing."""
         self._orders.note(person.name, person.role.title, what, note)
 
     # -- commands --------------------------------------------------------------------------
@@ -800,7 +802,7 @@ class PlantController:
         heliostat, items
             Name of the heliostat, and bytes by item.
         confirmed
-            Why a change above the limit of the settings is right; recorded in the audit.
+            Why a change above the limit of the settings is correct; recorded in the audit.
         record
             The calibration that the items come from, which the plant believes as soon as they are
             sent; None: it is adopted later.
@@ -810,7 +812,7 @@ class PlantController:
         RefusedError
             If it is not accepted.
         InputError
-            If the items are not ones that a plant sends.
+            If a plant does not send such items.
         """
         row = self.field.place(heliostat)
         self.wanted.check(heliostat, items)
@@ -839,7 +841,7 @@ class PlantController:
         return ticket
 
     def _use(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
-        """Use an armature (18,) and drives (2, 19) in proofs, and to compare the pointing."""
+        """Use an armature (18,) and drives (2, 19) in proofs, and in the pointing comparison."""
         self.beams.replace(row, armature, drives)
         self._agreement.believe(row, armature, drives)
         self._identities.learn(row, armature)
@@ -859,7 +861,7 @@ class PlantController:
         return self._proofs.misled(heliostat, point)
 
     def _unwritable(self, heliostat: str) -> str | None:
-        """Return the reason why nothing may be written to a heliostat, None if it may."""
+        """Return why nothing may be written to a heliostat, None if it may."""
         asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
         return self.guards.reasons(asked, *kinds).get(heliostat)
 
@@ -911,7 +913,7 @@ class PlantController:
 
 
 def _expected(settings: PlantSettings) -> str:
-    """Return the checksum that clusters should report, empty if it is not configured."""
+    """Return the checksum that clusters should report, empty if none is configured."""
     return "" if settings.common is None else settings_checksum(settings.common)
 
 

@@ -37,7 +37,7 @@ class Cameras(Protocol):
     """The cameras of a plant's targets."""
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
-        """Begin to take frames; ``on_alarm`` is called when a camera falls silent or comes back."""
+        """Begin to take frames; ``on_alarm`` is called when a camera falls silent or recovers."""
         ...
 
     def close(self) -> None:
@@ -45,7 +45,7 @@ class Cameras(Protocol):
         ...
 
     def sees(self, target: str) -> bool:
-        """Return whether a camera looks at the target."""
+        """Return whether a camera observes the target."""
         ...
 
     def awake(self, target: str) -> bool:
@@ -53,12 +53,12 @@ class Cameras(Protocol):
         ...
 
     async def look(self, target: str) -> object:
-        """Photograph the target before a beam comes.
+        """Photograph the target before a beam arrives.
 
         Raises
         ------
         HeliotropeError
-            No usable photograph; the text is for the operator.
+            If there is no usable photograph; the text is for the operator.
         """
         ...
 
@@ -72,21 +72,21 @@ class Cameras(Protocol):
         Raises
         ------
         FetchError, InputError
-            No photograph; or, as its light is awaited, no usable one.
+            If there is no photograph or, because its light is awaited, no usable one.
         """
         ...
 
     def view(self, target: str) -> CameraView:
-        """Return the last photograph of the target, for people."""
+        """Return the last photograph of the target, for display."""
         ...
 
     def eye(self, target: str) -> Camera:
-        """Return the camera of the target, as it is known.
+        """Return the camera of the target, as it is currently known.
 
         Raises
         ------
         UnknownNameError
-            If no camera looks at it.
+            If no camera observes it.
         """
         ...
 
@@ -101,7 +101,7 @@ class Cameras(Protocol):
         ...
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
-        """Read later photographs by a camera, a target with its marks, and taught pictures."""
+        """Evaluate later photographs with a camera, a target and its marks, and taught pictures."""
         ...
 
 

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 
 from heliotrope.errors import HeliotropeError, once
 
-#: Heliostats with one reason that are named; of more, their number is.
+#: Number of heliostats with the same reason that are named; beyond it, their number is stated.
 _NAMED = 3
 
 
 class RefusedError(HeliotropeError):
-    """A command that is not accepted; nothing was sent and nothing moves."""
+    """A command is not accepted; nothing was sent and nothing moves."""
 
 
 class NoFreePath(str):
-    """The reason why the path of a beam is not free: that changes with the sun, aim or volumes.
+    """The reason why the path of a beam is not clear; it changes with the sun, aim or volumes.
 
     Other reasons end by themselves, or have alarms of their own.
     """
@@ -32,14 +32,14 @@ class NoFreePath(str):
 
 
 def by_reason(reasons: Mapping[str, str], most: int = 3) -> str:
-    """Return the reasons of heliostats in one line, each once, with the number that it stops.
+    """Return the reasons of heliostats in one line, each once, with the number of heliostats.
 
     Parameters
     ----------
     reasons
-        By heliostat.
+        Reasons by heliostat.
     most
-        Reasons that are written out, those of most heliostats first.
+        Number of reasons written out, starting with the reasons of most heliostats.
     """
     groups: dict[str, list[str]] = {}
     for name, text in reasons.items():

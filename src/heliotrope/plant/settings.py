@@ -100,7 +100,7 @@ class PlantSettings:
 
 @dataclass
 class Counters:
-    """Counts since the start: refused messages, statuses, leases sent; and the last problems."""
+    """Counts since start-up: refused messages, statuses, leases sent; and the last problems."""
 
     refused: int = 0
     statuses: int = 0

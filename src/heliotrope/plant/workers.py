@@ -18,14 +18,14 @@ from heliotrope.processes import end, pool
 
 T = TypeVar("T")
 Given = TypeVarTuple("Given")
-#: Processes: while one takes beams apart for seconds, the other reads photographs.
+#: Number of processes: while one analyses beams for seconds, the other evaluates photographs.
 PROCESSES = 2
-#: Niceness of the processes: they take what the plant leaves of the machine.
+#: Niceness of the processes, which use the computing time that the plant leaves.
 _NICE = 5
 
 
 class Worker(Protocol):
-    """A place for computations."""
+    """A place where computations run."""
 
     async def __call__(self, work: Callable[[*Given], T], *given: *Given) -> T:
         """Return the result of a function.
@@ -33,24 +33,24 @@ class Worker(Protocol):
         Parameters
         ----------
         work, given
-            A function of a module, and its arguments: all that it needs, to be pickled. It changes
-            nothing that others use.
+            A function of a module, and its arguments, which are pickled and must contain all that
+            it needs. It changes nothing that others use.
 
         Raises
         ------
         HeliotropeError
-            As the function raises it, or the process has ended.
+            If the function raises it, or the process has ended.
         """
         ...
 
 
 async def at_once(work: Callable[[*Given], T], *given: *Given) -> T:
-    """Return the result of a function, computed in the loop itself; see `Worker`."""
+    """Return the result of a function, computed in the event loop itself; see `Worker`."""
     return work(*given)
 
 
 class WorkerProcesses:
-    """Processes that compute for a plant; new ones begin where one has died.
+    """Processes that compute for a plant; if one dies, new ones begin.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class WorkerProcesses:
         self._pool = pool(count, _NICE)
 
     def start(self, *loads: Callable[[], None]) -> None:
-        """Begin the processes, which share what computations need: what one compiles, all load."""
+        """Start the processes, which share compiled code: what one compiles, all load."""
         for load in loads:
             self._pool.submit(load)
 
@@ -89,13 +89,13 @@ class WorkerProcesses:
 
 
 def _computed(work: Callable[[*Given], T], *given: *Given) -> T:
-    """Return the result of a function, with errors that can be sent to another process."""
+    """Return the result of a function, with errors in a form that another process can receive."""
     try:
         return work(*given)
     except HeliotropeError as error:
         try:
             pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
         except TypeError:
-            # The arguments of some errors are not their text.
+            # The arguments of some errors differ from their text.
             raise InputError(str(error)) from None
         raise

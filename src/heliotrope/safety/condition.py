@@ -6,7 +6,7 @@ from enum import Enum, IntEnum, StrEnum
 
 from heliotrope.errors import InputError
 
-#: A time from here on stands for one that nobody knows, s.
+#: A time of at least this represents an unknown time, s.
 UNKNOWN_TIME = 1e8
 
 
@@ -91,7 +91,7 @@ class Watcher(Enum):
 
 @dataclass(frozen=True)
 class Reading:
-    """A value in the unit of its row, and the time of measurement, monotonic s."""
+    """A value in the unit of its row, and the time of its measurement, monotonic s."""
 
     value: float
     at: float
@@ -203,7 +203,7 @@ class Condition:
 
     @property
     def latched(self) -> bool:
-        """Whether the row stays tripped until an operator acknowledges it."""
+        """Whether the row stays tripped until it is acknowledged."""
         return self.role is not None
 
     @property
@@ -217,11 +217,11 @@ class Condition:
         return math.inf if self.above else -math.inf
 
     def beyond(self, value: float) -> bool:
-        """Whether a value trips."""
+        """Whether a value trips the row."""
         return value >= self.trips if self.above else value <= self.trips
 
     def safe(self, value: float) -> bool:
-        """Whether a value may release."""
+        """Whether a value may release the row."""
         return value <= self.releases if self.above else value >= self.releases
 
     def shown(self, value: float) -> str:
@@ -246,7 +246,7 @@ class Condition:
         return "" if self.unit in ("yes/no", "count") else f" (limit {self.shown(self.trips)})"
 
     def ordered(self, act: Act) -> str:
-        """Return an action by name, if the plant may order it."""
+        """Return an action by the name under which the plant may order it."""
         return "DEFOCUS or STOW" if self.or_stow and act is Act.DEFOCUS else act.name
 
     @property

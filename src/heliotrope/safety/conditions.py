@@ -16,12 +16,12 @@ _HELIOSTAT, _BUS, _FIELD = Scope
 _INFO, _WARNING, _SERIOUS, _EMERGENCY = Severity
 _OPERATOR, _SUPERVISOR = AcknowledgeRole
 
-#: Lease of the plant to a cluster, and of a cluster's sun vector to its local controllers, s.
+#: Lease from the plant to a cluster, and from a cluster's sun vector to its local controllers, s.
 PLANT_LEASE, SUN_LEASE = 3.0, 6.0
 #: Time from a defocus to STOW, unless the defocus is lifted, s.
 _PATIENCE = 30.0
-#: The same where only a cluster is left. It knows no keep-out volumes, and its DEFOCUS may have
-#: turned a beam into one, which must not stay there for 30 s.
+#: The same if only a cluster is left. It knows no keep-out volumes, and its DEFOCUS may have turned
+#: a beam into one, where the beam must not stay for 30 s.
 _ALONE = 20.0
 
 

@@ -14,7 +14,7 @@ Rules for every row:
 - A latched row stays tripped until its cause has gone *and* an operator with the row's role or a
   higher role acknowledges it. An acknowledgement before the cause has gone is refused.
 - The strongest action takes precedence. A released row moves no heliostat; motion needs a new
-  The memory of the evaluation: rows, their tracking state, last evaluation time, s.
+  command.
 """
 
 import math
@@ -34,7 +34,7 @@ from heliotrope.safety.condition import (
 )
 from heliotrope.safety.proof import DEFOCUS_BUDGET
 
-#: Key of a track: name of the condition, and of the cluster or heliostat ("" for all).
+#: Key of a track: name of the condition, and name of the cluster or heliostat ("" for all).
 Key = tuple[str, str]
 
 
@@ -45,12 +45,13 @@ class Track:
     Attributes
     ----------
     value, seen
-        Last good reading (``None`` before the first) and its time, s; before the first, the
-        time of the start.
+        Last valid reading (``None`` before the first) and its time, s; before the first, the start
+        time.
     beyond_since
-        Time at which the value went beyond the trip, s; None while it is not.
+        Time at which the value went beyond the trip limit, s; None while it is not beyond it.
     safe_since
-        Time of the first of an unbroken run of safe readings, s; None if the last is not safe.
+        Time of the first in an unbroken series of safe readings, s; None if the last reading is not
+        safe.
     tripped_at
         Time at which the row tripped, s; None while it is not tripped.
     cleared
@@ -139,7 +140,7 @@ def start(
     InputError
         If ``now`` is not finite, or a name occurs twice in the table.
     UnknownNameError
-        Return the state with a row evaluated only for some subjects and those that trip it.
+        If a name in ``subjects`` is not in the table.
     """
     rows = tuple(table)
     if not math.isfinite(now):
@@ -157,7 +158,7 @@ def start(
 
 
 def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetyState:
-    """Return the state with a row evaluated for some subjects and those that it trips for.
+    """Return the state with a row evaluated for some subjects and those for which it has tripped.
 
     For rows about heliostats, of which only a few ever need evaluation.
 
@@ -249,10 +250,10 @@ def evaluate(
 
 
 def _advance(row: Condition, track: Track, reading: Reading | None, now: float) -> Track:
-    """Return the track after a reading, or after none, at ``now``."""
+    """Return the track after a reading, or without a new reading, at ``now``."""
     value, read_at, fresh = track.value, track.seen, False
     if reading is not None and math.isfinite(reading.value) and read_at <= reading.at <= now:
-        # Of two readings with the same time the worse counts.
+        # Of two readings with the same time, the worse one counts.
         worse = value is None or (reading.value > value if row.above else reading.value < value)
         if reading.at > read_at or worse:
             value, read_at, fresh = reading.value, reading.at, True
@@ -266,7 +267,7 @@ def _advance(row: Condition, track: Track, reading: Reading | None, now: float) 
         safe_since = read_at
     tripped_at, cleared, by = track.tripped_at, track.cleared, track.acknowledged_by
     if beyond_since is not None and now - beyond_since >= row.delay:
-        # A second trip needs a second acknowledgement.
+        # A second trip needs its own acknowledgement.
         tripped_at = now if tripped_at is None else tripped_at
         cleared, by = False, "" if track.tripped_at is None else by
     elif tripped_at is not None:
@@ -278,7 +279,7 @@ def _advance(row: Condition, track: Track, reading: Reading | None, now: float) 
 
 
 def _counting(row: Condition, value: float | None, read_at: float, now: float) -> float:
-    """Return the value that the row is judged by now."""
+    """Return the value by which the row is judged now."""
     age = now - read_at
     if row.ages:
         return (0.0 if value is None else value) + age
@@ -331,7 +332,7 @@ def _act(row: Condition, tripped_for: float) -> Act:
 
 
 def _said(row: Condition, track: Track, now: float) -> str:
-    """Return, in words, the value that the row is judged by."""
+    """Return, in words, the value by which the row is judged."""
     counts = _counting(row, track.value, track.seen, now)
     if track.value is None and not row.ages and now - track.seen <= row.stale_after:
         return (
@@ -351,7 +352,7 @@ def _said(row: Condition, track: Track, now: float) -> str:
 
 
 def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) -> Iterable[Action]:
-    """Yield an alarm for each reading that no row uses: a wrong name watches nothing."""
+    """Yield an alarm for each reading that no row uses: a misnamed reading monitors nothing."""
     known = {row.reading for row in state.table}
     kind = alarms.UNKNOWN_READING
     for name in sorted({name for name, _ in readings} - known):
@@ -407,7 +408,7 @@ def acknowledge(
 
 
 def _remains(row: Condition, track: Track, now: float) -> str:
-    """Return the refusal to acknowledge a row before its safe time is over."""
+    """Return the refusal to acknowledge a row before its safe time has passed."""
     if not row.safe(_counting(row, track.value, track.seen, now)):
         return f"the cause is not gone: {_said(row, track, now)}. {row.remedy}"
     safe = 0.0 if track.safe_since is None else track.seen - track.safe_since

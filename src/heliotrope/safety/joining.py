@@ -49,6 +49,6 @@ class JoinLimiter:
             if at is not None and now > at:
                 tokens = min(float(self.burst), tokens + self.rate * (now - at))
             at = now if at is None else max(at, now)
-        # Rounding must not withhold an earned token.
+        # Rounding must not withhold a token that is due.
         granted = max(0, min(wanted, math.floor(tokens + 1e-9)))
         return replace(self, tokens=max(0.0, tokens - granted), at=at), granted

@@ -18,7 +18,7 @@ from heliotrope.safety.condition import Act, Condition
 
 #: Limits by condition and key, as in a file.
 Limits = Mapping[str, Mapping[str, float]]
-#: Ends of the keys of `trips` and `releases` by the unit of the reading, and their size in it.
+#: Suffixes of the keys of `trips` and `releases`, by the unit of the reading, and their size in it.
 _UNITS: dict[str, dict[str, float]] = {
     "s": {"_s": 1.0},
     "m/s": {"_m_s": 1.0},
@@ -28,36 +28,37 @@ _UNITS: dict[str, dict[str, float]] = {
     "°C": {"_c": 1.0},
     "yes/no": {},
 }
-#: Safest value of a reading that is bad when it is small.
+#: Safest value of a reading whose low values are unsafe.
 _SAFEST = {"share": 1.0, "rad": math.pi / 4.0, "°C": 40.0}
 #: Angles below this are shown in mrad, rad.
 _SMALL = 0.05
-#: Shortest and longest time of a key, s. A longer ``then_stow`` than the row's own is refused too.
+#: Shortest and longest value of a time key, s. A ``then_stow`` longer than the row's own is refused
+#: too.
 _TIMES = {
     "delay": (0.0, 60.0),
     "clear_for": (2.0, 86400.0),
     "stale_after": (1.0, 60.0),
     "then_stow": (0.0, 120.0),
 }
-#: Latest time from a fault until a row with this act trips, s. Of the 30 s of a DEFOCUS 20 remain
-#: for the motion, of the 300 s of a STOW 270.
+#: Latest time from a fault until a row with this act trips, s. This leaves 20 s of the 30 s of a
+#: DEFOCUS for the motion, and 270 s of the 300 s of a STOW.
 NOTICED = {Act.DEFOCUS: 10.0, Act.STOW: 30.0}
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A number of a row that a plant may set.
+    """A limit of a row that a plant may set.
 
     Attributes
     ----------
     key, number
         Key in a file, with its unit; field of `Condition`.
     size
-        Size of the file's unit in that of the field.
+        Size of the file's unit in the unit of the field.
     low, high
         Permitted range, in the file's unit.
     main
-        False for a second unit of the same number.
+        False for a second unit of the same limit.
     """
 
     key: str
@@ -68,7 +69,7 @@ class Setting:
     main: bool = True
 
     def shown(self, row: Condition) -> float:
-        """Return the row's number in the file's unit."""
+        """Return the row's limit in the file's unit."""
         return float(f"{getattr(row, self.number) / self.size:.9g}")
 
 
@@ -78,7 +79,7 @@ def settings_of(row: Condition) -> dict[str, Setting]:
         return {}
     settings: list[Setting] = []
     for end, size in _UNITS[row.unit].items():
-        # Small angles read best in mrad, elevations in degrees.
+        # Small angles are easiest to read in mrad, elevations in degrees.
         main = row.unit != "rad" or (row.site[1] < _SMALL) == (end == "_mrad")
         low, high = (float(f"{value / size:.4g}") for value in row.site)
         # The release lies on the safe side of the trip.
@@ -171,7 +172,7 @@ def _near(name: str, known: Iterable[str]) -> str:
 
 
 def _changed(row: Condition, row_limits: Mapping[str, float]) -> Condition:
-    """Return a row with its numbers in a file."""
+    """Return a row with its limits replaced by those of a file."""
     settings, changes = settings_of(row), dict[str, float]()
     for key, value in row_limits.items():
         setting = settings.get(key)
@@ -207,7 +208,7 @@ def _changed(row: Condition, row_limits: Mapping[str, float]) -> Condition:
 
 
 def _ordered(row: Condition, rows: Iterable[Condition]) -> None:
-    """Refuse a weaker act that comes after a stronger one of the same reading."""
+    """Refuse a weaker act that follows a stronger act for the same reading."""
     for other in rows:
         if other.reading != row.reading or other.act == row.act:
             continue

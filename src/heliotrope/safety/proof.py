@@ -17,7 +17,7 @@ from heliotrope.safety.condition import Reading
 #: Maximum time from the order to the last acknowledgement, to beams off the receiver, and to stow,
 #: s.
 ORDER_BUDGET, DEFOCUS_BUDGET, STOW_BUDGET = 1.0, 30.0, 300.0
-#: Limit of the flux on the receiver after a defocus, as a share of the nominal.
+#: Limit of the flux on the receiver after a defocus, as a fraction of the nominal flux.
 FLUX_LIMIT = 0.10
 #: A flux reading older than this (s) proves nothing.
 FLUX_AGE = 5.0
@@ -28,16 +28,16 @@ FLUX_READING = "receiver_flux_nominal"
 class FluxProof(Enum):
     """What is known about the flux on the receiver; the value is the display text."""
 
-    #: No sensor feeds it: the proof rests on what each heliostat reports.
+    #: No sensor supplies it, so the confirmation rests on what each heliostat reports.
     NOT_MEASURED = "the flux on the receiver is not measured"
     #: There is still time for a reading.
     AWAITED = "flux not proven yet"
-    #: A fresh reading, taken after the order, shows it below its limit.
+    #: A fresh reading, taken after the order, is below the limit.
     BELOW = (
         "measured: the flux is below its limit "
         f"({FLUX_LIMIT:.0%} of nominal, where single beams do not show)"
     )
-    #: No such reading came in time.
+    #: No such reading arrived in time.
     NOT_BELOW = f"flux not proven to be below {FLUX_LIMIT:.0%}"
 
 

@@ -38,14 +38,14 @@ def insert(connection: Connection, table: Table, rows: Sequence[Row]) -> int:
 
 @cache
 def _insert(dialect: str, table: Table) -> Executable:
-    """Return the statement; cached, because events come in thousands."""
+    """Return the insert statement, cached because events arrive in thousands."""
     kind = postgresql if dialect == "postgresql" else sqlite
     statement: Executable = kind.insert(table).on_conflict_do_nothing()
     return statement
 
 
 def replace(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
-    """Insert rows; each replaces the row with its key."""
+    """Insert rows; each replaces an existing row with its key."""
     if not rows:
         return
     kind = postgresql if connection.dialect.name == "postgresql" else sqlite
@@ -62,13 +62,13 @@ def row_of(table: Table, record: object, **others: Any) -> Row:
 
 
 def record_of(kind: type[Record], row: RowMapping, **others: Any) -> Record:
-    """Return the record of a row: each field from the column of its name or ``others``."""
+    """Return the record of a row: each field from the column of its name or from ``others``."""
     names = {field.name for field in fields(cast("Any", kind))} - others.keys()
     return kind(**{name: row[name] for name in names if name in row}, **others)
 
 
 def records(connection: Connection, kind: type[Record], query: Select[Any]) -> list[Record]:
-    """Return the records that a query finds."""
+    """Return the records found by a query."""
     return [record_of(kind, row) for row in connection.execute(query).mappings()]
 
 
@@ -98,8 +98,8 @@ def sighting_rows(
 
 
 def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
-    """Return sightings from M rows of the whole table, all with the same number of drives."""
-    # By columns: looking up each cell of 100,000 rows takes longer than reading them.
+    """Return sightings from M complete rows of the table, all with the same number of drives."""
+    # Column by column, because looking up each cell of 100,000 rows takes longer than reading them.
     cells = zip(*rows, strict=True) if rows else ((),) * len(tables.sighting.columns)
     columns = dict(zip(tables.sighting.columns.keys(), cells, strict=True))
     names = tuple(dict.fromkeys(columns["heliostat"]))
@@ -148,11 +148,11 @@ def behind_rows(
     record
         The new version.
     standing
-        Whether each sighting behind the version before was used, by number.
+        Whether each sighting behind the previous version was used, by number.
 
     Returns
     -------
-        The new rows, and the numbers whose rows end.
+        The new rows, and the sighting numbers whose rows end.
     """
     nothing = np.full((len(record.left_out), 4), np.nan)
     misses = np.concatenate([record.residual_before, record.residual_after], axis=1)
@@ -194,7 +194,7 @@ class Behind:
         self._misses = np.array([[row[name] for name in _MISSES] for row in rows]).reshape(-1, 4)
 
     def of(self, version: int) -> dict[str, Any]:
-        """Return the fields of a version; what a sighting missed by where it is new, else NaN."""
+        """Return the fields of a version; residuals of sightings new in it, else NaN."""
         stands = (self._from <= version) & (version < self._until)
         used = np.flatnonzero(stands & self._used)
         new = (self._from[used] == version)[:, None]

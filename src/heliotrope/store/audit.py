@@ -10,12 +10,12 @@ from heliotrope.store import chain, tables
 from heliotrope.store.records import AuditEntry
 
 _AUDIT = tables.audit
-#: Points by name of the heliostat, ENU, m.
+#: Points by heliostat name, ENU, m.
 Places = Mapping[str, tuple[float, ...]]
 
 
 def begin(connection: Connection, entry: AuditEntry) -> None:
-    """Keep a record without a result; keeping it twice is the same as once.
+    """Store a record without a result; storing it twice has the same effect as once.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def begin(connection: Connection, entry: AuditEntry) -> None:
 
 
 def finish(connection: Connection, identity: str, result: str, at: str) -> None:
-    """Add the result to a record; adding it twice is the same as once.
+    """Add the result to a record; adding it twice has the same effect as once.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def finish(connection: Connection, identity: str, result: str, at: str) -> None:
 
 
 def finish_open(connection: Connection, result: str, at: str) -> int:
-    """Give one result to all records without one; return their number."""
+    """Add one result to all records without one; return their number."""
     query = select(_AUDIT.c.identity).where(_AUDIT.c.result == "").order_by(_AUDIT.c.number)
     identities = connection.scalars(query).all()
     for identity in identities:
@@ -63,7 +63,7 @@ def finish_open(connection: Connection, result: str, at: str) -> int:
 
 
 def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[AuditEntry]:
-    """Return records, the latest first; only those before a number if given."""
+    """Return records, latest first; only those before a given number, if any."""
     query = select(_AUDIT).order_by(_AUDIT.c.number.desc()).limit(limit)
     if before:
         query = query.where(_AUDIT.c.number < before)
@@ -77,7 +77,7 @@ def _find(connection: Connection, identity: str) -> AuditEntry | None:
 
 
 def probe(connection: Connection) -> None:
-    """Write a row without meaning: only a write shows that the disk accepts one."""
+    """Write a meaningless row, because only a write shows that the disk accepts one."""
     about = tables.about
     known = connection.scalar(select(about.c.value).where(about.c.name == "probe"))
     row = {"name": "probe", "value": str(int(known or 0) + 1)}
@@ -97,9 +97,9 @@ def points(connection: Connection) -> dict[str, dict[str, tuple[float, ...]]]:
 
 
 def doubt_points(connection: Connection) -> None:
-    """Mark all assigned points as not taken by their local controllers.
+    """Mark all assigned points as not acknowledged by their local controllers.
 
-    A point before that is like the assigned one says so; see `plant.field.assigned`.
+    An earlier point equal to the assigned one expresses this; see `plant.field.assigned`.
     """
     known = points(connection)
     doubted = {

@@ -71,15 +71,15 @@ def backup(
     Parameters
     ----------
     database
-        It may be written meanwhile.
+        Source; it may be written to in the meantime.
     folder
-        Folder to make; it must not exist.
+        Folder to create; it must not exist.
     now
         Time for the manifest.
     telemetry
         Folder of the archive to include.
     key
-        Signs it; None: it is not signed.
+        Key that signs it; None: it is not signed.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
         size += file.stat().st_size
     for link in place.rglob("*"):
         if link.is_symlink():
-            # Its content is another place's: no checksum speaks for it.
+            # Its content is stored elsewhere, so no checksum vouches for it.
             raise FormatError(link, "it is a link, which no backup has; remove it")
     for file in _files(place):
         if str(file.relative_to(place)) not in {*checksums, MANIFEST, SIGNATURE}:
@@ -201,9 +201,9 @@ def restore(
     signed_by: PublicKey | None = None,
     who: str = "",
 ) -> Backup:
-    """Restore a backup into an empty place; one of an earlier program is migrated.
+    """Restore a backup into an empty place; a backup of an earlier program is migrated.
 
-    Nobody is signed in there, no token is valid, and an event says who restored what.
+    Afterwards nobody is signed in, no token is valid, and an event records who restored what.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def restore(
     signed_by
         As in `check`.
     who
-        Who restores it, for the event.
+        Person who restores it, for the event.
 
     Raises
     ------
@@ -268,7 +268,7 @@ def restore(
 
 
 def _begin_anew(copy: Path, now: datetime, restored: Backup, who: str) -> None:
-    """Let nobody into a store that was restored, and record who did that."""
+    """Revoke all access to a restored store, and record who restored it."""
     at = now.timestamp()
     with Database(copy) as database:
         if restored.revision < HEAD:
@@ -289,7 +289,7 @@ def _begin_anew(copy: Path, now: datetime, restored: Backup, who: str) -> None:
 
 
 def summary(database: Database) -> dict[str, Any]:
-    """Return a store's revision, rows of each table, and times of the first and last.
+    """Return a store's revision, the number of rows in each table, and its first and last times.
 
     Raises
     ------
@@ -310,7 +310,7 @@ def summary(database: Database) -> dict[str, Any]:
         first, last = connection.execute(select(func.min(time), func.max(time))).one()
         open_ = select(func.count()).where(tables.audit.c.result == "")
         figures["audit_without_result"] = int(connection.scalar(open_) or 0)
-    # No time is NULL, which the column's type reads as NaN.
+    # A missing time is NULL, which the column's type reads as NaN.
     times = {"first_sighting": first, "last_sighting": last}
     figures.update({name: None if math.isnan(at) else at for name, at in times.items()})
     if database.file is not None:
@@ -319,7 +319,7 @@ def summary(database: Database) -> dict[str, Any]:
 
 
 def migrate(place: str | Path) -> tuple[str, Path | None]:
-    """Bring a store up to date; return its old revision, and the copy that was made of it.
+    """Bring a store up to date; return its old revision, and the copy made of it.
 
     A file is first copied to ``store.before-REVISION.sqlite`` beside it; PostgreSQL changes its
     tables in one transaction.
@@ -327,7 +327,8 @@ def migrate(place: str | Path) -> tuple[str, Path | None]:
     Raises
     ------
     StoreError
-        If there is no store, another process holds it, it is newer than the program, or it fails.
+        If there is no store, another process holds it, it is newer than the program, or the
+        migration fails.
     """
     with Database(place) as database:
         revision = database.revision()
@@ -368,7 +369,7 @@ def _sync(path: Path) -> None:
 
 
 def _copy_file(source: Path, target: Path) -> None:
-    """Copy an SQLite database in one step: a consistent state, even while it is written."""
+    """Copy an SQLite database in one step, which gives a consistent state even during writes."""
     with (
         closing(sqlite3.connect(f"file:{source}?mode=ro", uri=True, timeout=10.0)) as old,
         closing(sqlite3.connect(target)) as new,
@@ -393,7 +394,7 @@ def _changing(copy: Database) -> Iterator[Connection]:
 
 
 def _end_access(connection: Connection, now: datetime) -> None:
-    """End all sessions and tokens, and use up the codes of second factors shown until a time."""
+    """End all sessions and tokens, and use up the second-factor codes shown until a given time."""
     factor, last = tables.second_factor, int(now.timestamp() // STEP) + NEAR
     with chain.changing_accounts(connection, None):
         for table in (tables.session, tables.api_token):
@@ -402,7 +403,7 @@ def _end_access(connection: Connection, now: datetime) -> None:
 
 
 def _lock(connection: Connection, now: datetime) -> None:
-    """Lock the tower in a backup made at a time, and doubt its assigned points."""
+    """Lock the tower in a backup made at a given time, and mark its points as unconfirmed."""
     hold = Lockout(
         Kind.TOWER,
         "tower",
@@ -450,7 +451,7 @@ def _parts(connection: Connection, table: Any) -> Iterator[list[dict[str, Any]]]
 
 
 def _copy_telemetry(source: Path, target: Path) -> None:
-    """Copy an archive, of which parts may become Parquet files meanwhile."""
+    """Copy an archive whose parts may become Parquet files in the meantime."""
     target.mkdir(mode=0o700)
     for _ in range(2):
         for path in sorted(source.glob("????-??-??/*.*")):
@@ -462,5 +463,5 @@ def _copy_telemetry(source: Path, target: Path) -> None:
                 try:
                     shutil.copyfile(path, copy)
                 except FileNotFoundError:
-                    # It has become a Parquet file: the second round takes it.
+                    # It has become a Parquet file, which the second round copies.
                     copy.unlink(missing_ok=True)

@@ -36,7 +36,7 @@ from heliotrope.store.digests import ACCOUNT, AUDIT, CHAINS, EVENT, GENESIS, Hea
 from heliotrope.store.records import AuditEntry, StoreError
 
 ACCEPTED, RESULT = "accepted", "result"
-#: Rows of the table ``about`` with digest and number of the last event that has left.
+#: Rows of the table ``about`` with the digest and number of the last event removed.
 ANCHOR, ANCHOR_NUMBER = "event_anchor", "event_anchor_number"
 _EVENT, _AUDIT = tables.event, tables.audit
 _LINKS = {EVENT: tables.event_link, AUDIT: tables.audit_link, ACCOUNT: tables.account_link}
@@ -60,23 +60,23 @@ def _accepted(entry: AuditEntry, number: int) -> list[Any]:
 
 
 def add_event(connection: Connection, row: dict[str, Any]) -> None:
-    """Insert an event and its link; inserting it twice is the same as once."""
+    """Insert an event and its link; inserting it twice has the same effect as once."""
     if not rows.insert(connection, _EVENT, [row]):
         return
     digest = digest_of(_last(connection, EVENT)[1], _event(row))
     link = {"number": row["number"], "digest": digest}
     connection.execute(_LINKS[EVENT].insert().values(link))
-    # A connection does not outlive a failure, and what it remembers goes with it.
+    # A connection is closed after a failure, and what it remembers is lost with it.
     connection.info[EVENT] = row["number"], digest
 
 
 def add_accepted(connection: Connection, entry: AuditEntry, number: int) -> None:
-    """Add the link of a record of the audit that was accepted."""
+    """Add the link for an accepted audit record."""
     _add_link(connection, entry.identity, ACCEPTED, _accepted(entry, number))
 
 
 def add_result(connection: Connection, identity: str, result: str, finished: str) -> None:
-    """Add the link of a record's result."""
+    """Add the link for a record's result."""
     _add_link(connection, identity, RESULT, [identity, result, finished])
 
 
@@ -86,7 +86,7 @@ def _add_link(connection: Connection, identity: str, part: str, content: list[An
 
 @contextmanager
 def changing_accounts(connection: Connection, names: Iterable[str] | None) -> Iterator[None]:
-    """Link what a block changes of the accounts of some persons (None: all), and their tokens."""
+    """Link what a block changes in the accounts and tokens of some persons (None: all)."""
     chosen = None if names is None else sorted(set(names))
     before = _states(connection, chosen)
     yield
@@ -99,7 +99,7 @@ def changing_accounts(connection: Connection, names: Iterable[str] | None) -> It
 
 
 def _states(connection: Connection, names: list[str] | None) -> dict[Key, str]:
-    """Return the states of accounts and tokens as JSON: all but passing figures and secrets."""
+    """Return the states of accounts and tokens as JSON, without transient values and secrets."""
 
     def rows_of(table: Any) -> list[RowMapping]:
         of = table.c.name
@@ -132,7 +132,7 @@ def _states(connection: Connection, names: list[str] | None) -> dict[Key, str]:
 def _append(
     connection: Connection, chain: str, link: Mapping[str, str], content: list[Any]
 ) -> None:
-    """Add a link to a chain whose links have numbers of their own."""
+    """Add a link to a chain whose links are numbered separately."""
     number, before = _last(connection, chain)
     digest = digest_of(before, content)
     row = {"number": number + 1, **link, "digest": digest}
@@ -164,18 +164,18 @@ def _about(connection: Connection, name: str) -> str | None:
 
 
 def _anchor_number(connection: Connection) -> int:
-    """Return the number of the last event that has left, 0 if none has."""
+    """Return the number of the last event removed, 0 if there is none."""
     noted = _about(connection, ANCHOR_NUMBER)
     if noted is not None:
         return int(noted)
     if _about(connection, ANCHOR) is None:
         return 0
-    # Programs before this one did not note it. Numbers follow each other.
+    # Earlier programs did not record it. The numbers are consecutive.
     return (connection.scalar(select(func.min(_LINKS[EVENT].c.number))) or 1) - 1
 
 
 def forget_events(connection: Connection, before: float) -> None:
-    """Remove the oldest events, up to the first that is not before a time."""
+    """Remove the oldest events, up to the first that is not before a given time."""
     e = _EVENT.c
     kept = connection.scalar(select(func.min(e.number)).where(e.at >= before))
     last = connection.scalar(select(func.max(e.number)))
@@ -193,14 +193,14 @@ def forget_events(connection: Connection, before: float) -> None:
     connection.execute(_EVENT.delete().where(e.number < end))
 
 
-# -- heads on other machines ---------------------------------------------------------------
+# -- heads on other computers --------------------------------------------------------------
 
-#: File of exported heads: a line for each export, the time and both heads.
+#: File of exported heads, with one line per export: the time and both heads.
 HEADS = "heads"
 
 
 def write_heads(folder: Path, new: Iterable[Head], at: datetime) -> None:
-    """Add heads to the file `HEADS` of a folder; they are on the disk when this returns.
+    """Append heads to the file `HEADS` in a folder; they are on disk when this returns.
 
     Raises
     ------
@@ -221,12 +221,12 @@ def write_heads(folder: Path, new: Iterable[Head], at: datetime) -> None:
 
 
 def read_heads(path: Path) -> list[Head]:
-    """Return the heads in a file: lines of `write_heads`, or text that holds heads anywhere.
+    """Return the heads in a file: lines of `write_heads`, or text that contains heads anywhere.
 
     Raises
     ------
     InputError
-        If there is none in it, or it cannot be read.
+        If it contains none, or cannot be read.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -258,11 +258,11 @@ class Verified:
     heads
         The heads of the `CHAINS`.
     fitting
-        Heads that were noted before and are in the chains, or fit the anchor.
+        Earlier heads that are in the chains, or match the anchor.
     old
-        Heads of events before the anchor, and of chains that were empty: they show nothing.
+        Heads of events before the anchor, and of chains that were empty; they prove nothing.
     since
-        Time of the oldest event that is kept, POSIX s; None without any.
+        Time of the oldest stored event, POSIX s; None if there is none.
     """
 
     heads: tuple[Head, ...]
@@ -272,13 +272,13 @@ class Verified:
 
 
 def verify(connection: Connection, known: Iterable[Head] = ()) -> Verified:
-    """Check the chains, and that heads that were noted before are in them.
+    """Check the chains, and that earlier heads are in them.
 
     Raises
     ------
     StoreError
-        If a record does not fit; the text names the first. If heads are given, and none of them
-        could be compared with anything.
+        If a record does not fit (the text names the first), or if heads are given but none of them
+        can be compared.
     """
     _verify_events(connection)
     _verify_audit(connection)
@@ -295,7 +295,7 @@ def verify(connection: Connection, known: Iterable[Head] = ()) -> Verified:
 
 
 def kept_since(since: float | None) -> str:
-    """Return the words for the time from which events are kept."""
+    """Return in words the time since which events are kept."""
     return "no event is kept" if since is None else f"events are kept since {format_time(since)}"
 
 
@@ -368,7 +368,7 @@ def _verify_accounts(connection: Connection) -> None:
 
 
 def _compare(key: Key, linked: str, found: str, when: str) -> None:
-    """Check that an account or token was as its last link says; "": there was none."""
+    """Check that an account or token matches its last link; "": it did not exist."""
     if linked != found:
         what = "altered" if linked and found else "removed" if linked else "added"
         raise StoreError(
@@ -389,7 +389,7 @@ def _named(key: Key, state: str) -> str:
 
 
 def _verify_head(connection: Connection, head: Head) -> bool:
-    """Check a head; return whether there is still something to compare it with."""
+    """Check a head; return whether anything remains to compare it with."""
     if head.number == 0:
         return False
     table = _LINKS[head.chain]

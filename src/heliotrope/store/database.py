@@ -19,14 +19,14 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 
 from heliotrope.store.records import StoreError
 
-#: Revision of the tables that this program knows.
+#: Table revision that this program knows.
 HEAD = "0013"
 FILE = "store.sqlite"
-#: Modes of the folders and files of a plant: for its user alone.
+#: Modes of a plant's folders and files: only for its user.
 _PRIVATE_FOLDER, PRIVATE = 0o700, 0o600
-#: Key of PostgreSQL's advisory lock; the second number stands for the schema.
+#: Key of PostgreSQL's advisory lock; the second number identifies the schema.
 _LOCK = 0x48454C49
-#: Time limit for taking it, s.
+#: Time limit for acquiring the lock, s.
 _PATIENCE = 2
 _LOCK_TIMEOUT = "55P03"
 
@@ -50,14 +50,14 @@ class Database:
     Raises
     ------
     StoreError
-        A URL that cannot be used.
+        If the URL cannot be used.
     """
 
     def __init__(self, place: str | Path) -> None:
         self.url, self.file = _place(place)
         options: dict[str, Any] = {}
         if self.file is None:
-            # A silent server is reported within seconds; the loop never waits for it.
+            # A silent server is reported within seconds; the event loop never waits for it.
             options["connect_args"] = {"connect_timeout": 3, "tcp_user_timeout": 5000}
         self._reader = create_engine(
             self.url, pool_pre_ping=self.file is None, isolation_level=self._isolation(), **options
@@ -71,7 +71,7 @@ class Database:
         self.locked = False
 
     def _isolation(self) -> Any:
-        # Reads of one transaction must be consistent; SQLite's always are.
+        # Reads within one transaction must be consistent, as SQLite's always are.
         return "REPEATABLE READ" if self.file is None else "SERIALIZABLE"
 
     @property
@@ -102,7 +102,7 @@ class Database:
         Raises
         ------
         StoreError
-            If another process has taken the lock.
+            If another process holds the lock.
         """
         spare, self._spare = self._spare, None
         if spare is not None:
@@ -113,17 +113,17 @@ class Database:
         return connection
 
     def lock(self) -> None:
-        """Become the one process that writes.
+        """Become the only process that writes.
 
         Raises
         ------
         StoreError
-            If another process is, or the folder cannot be written.
+            If another process is, or the folder cannot be written to.
         """
         if self.file is None:
             self.locked = True
             try:
-                # The server's lock lasts as long as the connection that took it.
+                # The server's lock lasts as long as the connection that acquired it.
                 self._spare = self.connect()
             except SQLAlchemyError as error:
                 self.locked = False
@@ -149,7 +149,7 @@ class Database:
         self.locked = True
 
     def _lock_server(self, connection: Connection) -> None:
-        """Take the server's lock, which an earlier connection may still hold for a moment."""
+        """Acquire the server's lock, which an earlier connection may still hold for a moment."""
         key = {"key": _LOCK}
         try:
             with connection.begin():
@@ -165,7 +165,7 @@ class Database:
             ) from None
 
     def revision(self) -> str:
-        """Return the revision of the tables; empty without tables.
+        """Return the revision of the tables; empty if there are no tables.
 
         Raises
         ------
@@ -198,12 +198,12 @@ class Database:
             )
 
     def prepare(self) -> None:
-        """Make the tables of a new store; refuse one of another revision.
+        """Create the tables of a new store; refuse a store of another revision.
 
         Raises
         ------
         StoreError
-            If it has another revision, or cannot be made.
+            If it has another revision, or cannot be created.
         """
         if not self.revision():
             self.migrate()
@@ -215,7 +215,7 @@ class Database:
         Raises
         ------
         StoreError
-            If that fails; the store is unchanged.
+            If migration fails; the store is then unchanged.
         """
         from alembic import command
         from alembic.config import Config
@@ -267,11 +267,11 @@ _WRITER = (
 
 
 def _prepare(engine: Engine, begin: str, pragmas: tuple[str, ...]) -> None:
-    """Make SQLAlchemy's transactions SQLite's own, and set up each connection."""
+    """Let SQLAlchemy's transactions control SQLite's, and set up each connection."""
 
     @event.listens_for(engine, "connect")
     def connected(connection: Any, _: object) -> None:
-        connection.isolation_level = None  # the driver does not begin transactions by itself
+        connection.isolation_level = None  # stop the driver from beginning transactions by itself
         for pragma in pragmas:
             connection.execute(pragma)
 
@@ -301,28 +301,28 @@ def _place(place: str | Path) -> tuple[URL, Path | None]:
 
 
 def cause(error: Exception) -> str:
-    """Return in one line why a database refused."""
+    """Return in one line why a database refused an operation."""
     inner = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
     lines = str(inner).strip().splitlines()
     return lines[0] if lines else type(inner).__name__
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder and its missing parents, so that only this user may enter them."""
+    """Create a folder and its missing parents, so that only this user may enter them."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     for place in reversed(missing):
         place.mkdir(mode=_PRIVATE_FOLDER, exist_ok=True)
     folder.mkdir(exist_ok=True)
 
 
-#: What a plant makes in its data folder, beside the store.
+#: What a plant creates in its data folder, beside the store.
 MADE = ("telemetry", "targets", "marks", "photographs", "interface", "first-password")
 
 
 def tighten(folder: Path) -> None:
-    """Take a data folder of an earlier program, and what plants made in it, from other users.
+    """Revoke other users' access to a data folder of an earlier program, and to its content.
 
-    Files that a plant did not make are left alone, and so is a folder that is shared by its nature.
+    Files that a plant did not create are left alone, and so is a folder that is shared by design.
     """
     status = folder.stat()
     if status.st_mode & stat.S_ISVTX or status.st_uid != os.geteuid():

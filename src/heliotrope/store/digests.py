@@ -31,7 +31,7 @@ class Head:
         Raises
         ------
         InputError
-            If it is none.
+            If the text is not a head.
         """
         chain, _, rest = text.partition(":")
         number, _, digest = rest.partition(":")
@@ -41,6 +41,6 @@ class Head:
 
 
 def digest_of(before: str, content: Sequence[Any]) -> str:
-    """Return the digest of a record, from the digest before it and its content."""
+    """Return the digest of a record, from the previous digest and the record's content."""
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
     return hashlib.sha256(f"{before}\n{text}".encode(errors="surrogatepass")).hexdigest()

@@ -39,13 +39,13 @@ def export(
     Parameters
     ----------
     database
-        It may be written meanwhile: the export shows one consistent state.
+        Source; it may be written to in the meantime, because the export shows one consistent state.
     folder
-        Made if missing; existing files are replaced.
+        Destination, created if missing; existing files are replaced.
     heliostats
         Names; None: every heliostat in the store.
     progress
-        Called with (done, all) after each heliostat.
+        Called with (done, total) after each heliostat.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def _residuals(
     row_of = {int(number): row for row, number in enumerate(kept.identities)}
     for version in history:
         before, after = version.residual_before, version.residual_after
-        # What a sighting missed by is kept for the version that begins to use it.
+        # The residual of a sighting is stored for the version that first uses it.
         known = np.isfinite(before).any(axis=1) | np.isfinite(after).any(axis=1)
         for i in np.flatnonzero(known):
             sighting = version.sightings[i]

@@ -26,9 +26,10 @@ from heliotrope.store.writer import Work, Writer
 T = TypeVar("T")
 #: Name of the key file in the plant's data folder.
 KEY_FILE = "second-factor.key"
-#: Recovery codes of an account.
+#: Number of recovery codes of an account.
 CODES = 8
-#: Length of a code's step, s, and steps before and after the present one that are accepted.
+#: Length of a code's time step, s, and number of steps before and after the present one that are
+#: accepted.
 STEP, NEAR = 30, 1
 _FACTOR, _RECOVERY = tables.second_factor, tables.recovery_code
 _BYTES = 32
@@ -48,11 +49,11 @@ class Factors:
     Parameters
     ----------
     database, writer
-        The keeper's.
+        Parts of the keeper.
     file
-        Key file; it is made when the first secret is.
+        Key file, created together with the first secret.
     entropy
-        Returns random bytes.
+        Function that returns random bytes.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class Factors:
         self._database, self._writer, self._file, self._entropy = database, writer, file, entropy
 
     def begin(self, name: str, now: float) -> str:
-        """Return a new secret of an account, base32; it counts once `confirm` has seen its code.
+        """Return a new secret of an account, base32; in force once `confirm` accepts its code.
 
         Raises
         ------
@@ -89,14 +90,14 @@ class Factors:
         return made
 
     def confirm(self, name: str, code: str, now: float) -> tuple[str, ...]:
-        """Put the secret of `begin` in force; return the recovery codes, shown only now.
+        """Activate the secret from `begin`; return the recovery codes, which are shown only now.
 
         Raises
         ------
         InputError
-            If there is none, or the code is wrong.
+            If there is no such secret, or the code is wrong.
         StoreError
-            If it could not be written.
+            If the change could not be written.
         """
         codes = tuple(self._recovery_code() for _ in range(CODES))
 
@@ -119,7 +120,7 @@ class Factors:
         return codes
 
     def check(self, name: str, code: str, now: float) -> Used | None:
-        """Use a code; None if it is wrong. Each code is good once.
+        """Use a code; None if it is wrong. Each code is valid once.
 
         Raises
         ------
@@ -155,7 +156,7 @@ class Factors:
         return self._change(name, work)
 
     def _change(self, name: str, work: Work[T]) -> T:
-        """Change the factor of an account; the change is linked, see `chain`."""
+        """Change the second factor of an account; the change is linked, see `chain`."""
 
         def linked(connection: Connection) -> T:
             with chain.changing_accounts(connection, (name,)):
@@ -166,14 +167,14 @@ class Factors:
     # -- codes ---------------------------------------------------------------------------
 
     def _step(self, name: str, word: str, used: int, code: str, now: float) -> int | None:
-        """Return the step of a code that is right and was not used; None if there is none."""
+        """Return the time step of a correct, unused code; None if the code is not valid."""
         import pyotp
 
         clean = code.replace(" ", "")
         try:
             totp = pyotp.TOTP(self._secret(name, word))
         except InputError:
-            return None  # without the key file only recovery codes are left
+            return None  # without the key file, only recovery codes remain
         present = int(now // STEP)
         for step in range(max(used + 1, present - NEAR), present + NEAR + 1):
             if hmac.compare_digest(totp.at(step * STEP).encode(), clean.encode()):
@@ -191,12 +192,12 @@ class Factors:
         return base64.b32encode(hmac.digest(self._key(), message, "sha256")[:20]).decode()
 
     def _key(self) -> bytes:
-        """Return the key of the file, which is made if there is none.
+        """Return the key in the file, which is created if missing.
 
         Raises
         ------
         InputError
-            If it cannot be read or made, or others may read it.
+            If the file cannot be read or created, or others may read it.
         """
         try:
             if self._file.stat().st_mode & 0o077:

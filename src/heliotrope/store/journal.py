@@ -18,12 +18,12 @@ from heliotrope.store.records import (
 )
 
 _EVENT, _ALARM, _AUDIT = tables.event.c, tables.alarm.c, tables.audit.c
-#: Heliostats of a command that are named; of more, their number is.
+#: Number of heliostats that are named for a command; beyond it, their number is stated.
 _NAMED = 5
 
 
 def search(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
-    """Return the entries that a query asks for, the latest first."""
+    """Return the entries that match a query, latest first."""
     parts = {"event": _events, "alarm": _alarms, "command": _commands, NOTE: _events}
     kinds = [query.kind] if query.kind else ["event", "alarm", "command"]
     found = [entry for kind in kinds for entry in parts[kind](connection, query)]
@@ -31,7 +31,7 @@ def search(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
 
 
 def _within(column: ColumnElement[Any], query: JournalQuery, *, text: bool = False) -> Any:
-    """Return the condition on a time, POSIX s or (``text``) as ISO 8601."""
+    """Return the condition for a time range, in POSIX s or (``text``) in ISO 8601."""
     since, until = (
         datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds") if text else at
         for at in (query.since, query.until)
@@ -40,12 +40,12 @@ def _within(column: ColumnElement[Any], query: JournalQuery, *, text: bool = Fal
 
 
 def _has(text: str, *columns: ColumnElement[Any]) -> list[Any]:
-    """Return the condition that one of some columns contains a text, in any case."""
+    """Return the condition that one of some columns contains a text, ignoring case."""
     return [or_(*(column.icontains(text, autoescape=True) for column in columns))] if text else []
 
 
 def _events(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
-    # An event of a person, or about a heliostat, begins with the name.
+    # The text of an event by a person or about a heliostat begins with the name.
     by = [_EVENT.text.istartswith(f"{query.person}: ", autoescape=True)] if query.person else []
     about = _has(query.heliostat, _EVENT.heliostat, _EVENT.text)
     notes = [_EVENT.source == NOTE] if query.kind == NOTE else []
@@ -100,7 +100,7 @@ def _clock(at: float) -> str:
 def _commands(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
     names = cast(_AUDIT.heliostats, String)
     by = [_AUDIT.who == query.person] if query.person else [_AUDIT.who != query.but]
-    # No names: it was a command to the whole field.
+    # Without names, it was a command to the whole field.
     about = [*_has(f'"{query.heliostat}"', names), names == "[]"] if query.heliostat else []
     wanted = select(tables.audit).where(
         *_within(_AUDIT.at, query, text=True),

@@ -45,7 +45,7 @@ from heliotrope.store.writer import Work, Writer
 
 T = TypeVar("T")
 _NUMBERED = (tables.sighting, tables.visit, tables.hold, tables.event, tables.alarm)
-#: Table of each kind of fact, and how its row gets there.
+#: Table for each kind of fact, and the function that writes its row.
 _FACTS: dict[type[Fact], tuple[Table, Callable[[Connection, Table, list[rows.Row]], object]]] = {
     VisitEntry: (tables.visit, rows.insert),
     CampaignEntry: (tables.campaign, rows.replace),
@@ -55,13 +55,13 @@ _FACTS: dict[type[Fact], tuple[Table, Callable[[Connection, Table, list[rows.Row
     Outlook: (tables.outlook, rows.replace),
     PlantFigures: (tables.figures, rows.replace),
 }
-#: With more names than this a query reads all rows, which are then filtered.
+#: With more names than this, a query reads all rows and filters them afterwards.
 _MANY = 500
-#: Row of the table ``about`` with the numbers of the safety table in force.
+#: Row of the table ``about`` with the limits of the safety table in force.
 _LIMITS = "safety limits"
-#: Name of the document about the emergency that stands.
+#: Name of the document about the active emergency.
 _EMERGENCY = "emergency"
-#: Name of the document about changes that wait for an approval.
+#: Name of the document about changes that await approval.
 _CHANGES = "waiting changes"
 
 
@@ -71,16 +71,17 @@ class Keeper:
     Parameters
     ----------
     place
-        A folder (made if missing), a file ``.sqlite``, or a URL ``postgresql://...``.
+        A folder (created if missing), a file ``.sqlite``, or a URL ``postgresql://...``.
     inline
-        Write at once in the caller's thread: for virtual time, in which no thread can be awaited.
+        Whether to write at once in the caller's thread, for virtual time, in which no thread can be
+        awaited.
     limit
         Number of records that may wait.
 
     Attributes
     ----------
     database, writer, people
-        Its parts.
+        Parts of the keeper.
 
     Raises
     ------
@@ -113,16 +114,16 @@ class Keeper:
 
     @property
     def refused(self) -> str:
-        """The last record that the database refused for its content; empty without one."""
+        """The last record that the database rejected because of its content; empty if none."""
         return self.writer.refused
 
     @property
     def refused_count(self) -> int:
-        """Number of records that the database refused for their content."""
+        """Number of records that the database rejected because of their content."""
         return self.writer.refused_count
 
     def close(self) -> None:
-        """Write the records that wait, and close.
+        """Write the waiting records, and close.
 
         Raises
         ------
@@ -135,12 +136,12 @@ class Keeper:
             self.database.close()
 
     async def confirm(self) -> None:
-        """Wait until all earlier records are safe.
+        """Wait until all earlier records are safely stored.
 
         Raises
         ------
         StoreError
-            If an attempt to write failed; the records wait and are tried again.
+            If an attempt to write failed; the records stay queued and are retried.
         """
         done = self.writer.confirmed()
         if self.writer.inline:
@@ -149,7 +150,7 @@ class Keeper:
             await asyncio.wrap_future(done)
 
     def _take_numbers(self, table: Table, count: int = 1) -> int:
-        """Return the first of some new numbers."""
+        """Return the first of a range of new numbers."""
         with self._mine:
             first = self._numbers[table.name] + 1
             self._numbers[table.name] += count
@@ -170,14 +171,14 @@ class Keeper:
         target: str = "",
         campaign: str = "",
     ) -> Identities:
-        """Record sightings, whose rows point to ``names``; return their numbers, (M,).
+        """Record sightings, whose indices refer to ``names``; return their numbers, (M,).
 
         Raises
         ------
         InputError
-            If a row points beyond the names.
+            If an index is beyond the names.
         StoreError
-            If too many records wait already.
+            If too many records are already waiting.
         """
         if len(sightings) and int(sightings.heliostat.max()) >= len(names):
             raise InputError(
@@ -195,9 +196,9 @@ class Keeper:
         Raises
         ------
         InputError
-            If a version is not above them, or a heliostat comes twice; then none is recorded.
+            If a version is not above them, or a heliostat occurs twice; then none is recorded.
         StoreError
-            If too many records wait already.
+            If too many records are already waiting.
         """
         with self._mine:
             versions = dict[str, int]()
@@ -231,7 +232,7 @@ class Keeper:
         until: float = float("inf"),
         campaign: str = "",
     ) -> KeptSightings:
-        """Return sightings by time: of some heliostats (None: all), of one campaign if given."""
+        """Return sightings by time, for some heliostats (None: all) and one campaign if given."""
         s = tables.sighting.c
         query = select(tables.sighting).order_by(s.time, s.number)
         if heliostats is not None and len(heliostats) <= _MANY:
@@ -271,7 +272,7 @@ class Keeper:
         }
 
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
-        """Return all versions of one heliostat, the oldest first; see `Records`."""
+        """Return all versions of one heliostat, oldest first; see `Records`."""
         with self.database.reading() as connection:
             return calibration_history(connection, heliostat)
 
@@ -285,30 +286,30 @@ class Keeper:
         self.writer.put(lambda c: write(c, table, [row]))
 
     def flights(self) -> list[FlightEntry]:
-        """Return the flights, the first taken first."""
+        """Return the flights, in order of import."""
         return self._records(FlightEntry, select(tables.flight).order_by(tables.flight.c.at))
 
     def learnings(self) -> list[LearningEntry]:
-        """Return the latest learned hyperparameters of each group."""
+        """Return the latest learnt hyperparameters of each group."""
         entries = self._records(
             LearningEntry, select(tables.learning).order_by(tables.learning.c.version)
         )
         return list({entry.group: entry for entry in entries}.values())
 
     def timetables(self) -> list[TimetableRecord]:
-        """Return the timetables that persons have put in force, the last first."""
+        """Return the timetables that operators have activated, latest first."""
         order = tables.timetable.c.at.desc()
         return self._records(TimetableRecord, select(tables.timetable).order_by(order))
 
     def outlooks(self, since: float) -> list[Outlook]:
-        """Return the predictions made since a time, oldest first."""
+        """Return the predictions made since a given time, oldest first."""
         o = tables.outlook.c
         query = select(o.made, o.document).where(o.made >= since).order_by(o.made)
         with self.database.reading() as connection:
             return [Outlook.of(*row) for row in connection.execute(query)]
 
     def figures(self, since: float, until: float) -> list[PlantFigures]:
-        """Return the figures of the plant from a time to before another, oldest first."""
+        """Return the plant's time series from a start time to before an end time, oldest first."""
         f = tables.figures.c
         query = select(tables.figures).where(f.at >= since, f.at < until).order_by(f.at)
         return self._records(PlantFigures, query)
@@ -316,7 +317,7 @@ class Keeper:
     def visits(
         self, limit: int = 100, heliostat: str = "", *, since: float = 0.0, until: float = 1e11
     ) -> list[VisitEntry]:
-        """Return the measurements that finished within a time, the latest first."""
+        """Return the calibration visits that finished within a time span, latest first."""
         v = tables.visit.c
         query = select(tables.visit).where(v.finished >= since, v.finished < until)
         query = query.order_by(v.number.desc()).limit(limit)
@@ -325,7 +326,7 @@ class Keeper:
         return self._records(VisitEntry, query)
 
     def campaigns(self) -> list[CampaignEntry]:
-        """Return the campaigns, the latest first."""
+        """Return the campaigns, latest first."""
         query = select(tables.campaign).order_by(tables.campaign.c.begun.desc())
         return self._records(CampaignEntry, query)
 
@@ -341,14 +342,14 @@ class Keeper:
         """
         _check_severity(event.severity)
         with self._mine:
-            # In the order of the numbers, in which they are linked.
+            # In the order of their numbers, in which they are linked.
             number = self._numbers[tables.event.name] + 1
             row = rows.row_of(tables.event, event, number=number)
             self.writer.put(lambda c: chain.add_event(c, row))
             self._numbers[tables.event.name] = number
 
     def record_alarm(self, alarm: Alarm, at: float) -> None:
-        """Record that an alarm stands, or (not active) that it is over; see `Records`."""
+        """Record that an alarm was raised, or (not active) that it cleared; see `Records`."""
         severity = Severity.read(alarm.severity)
         number = self._take_numbers(tables.alarm)
         entry = AlarmEntry(alarm.condition, alarm.subject, severity, alarm.text, at, number=number)
@@ -382,7 +383,7 @@ class Keeper:
         severity: Severity = Severity.INFO,
         before: int = 0,
     ) -> list[Event]:
-        """Return events of at least a severity, the latest first; before a number if given."""
+        """Return events of at least a given severity, latest first; before a number if given."""
         _check_severity(severity)
         e = tables.event.c
         query = select(tables.event).where(e.severity >= severity)
@@ -400,7 +401,7 @@ class Keeper:
         since: float = 0.0,
         until: float = 1e11,
     ) -> list[AlarmEntry]:
-        """Return alarms that were active within a time, the latest first; see `Records`."""
+        """Return alarms that were active within a time span, latest first; see `Records`."""
         a = tables.alarm.c
         query = select(tables.alarm).where(
             a.raised < until, a.cleared.is_(None) | (a.cleared >= since)
@@ -411,12 +412,12 @@ class Keeper:
         return self._records(AlarmEntry, query)
 
     def journal(self, query: JournalQuery) -> list[JournalEntry]:
-        """Return events, alarms and commands that a query asks for, the latest first."""
+        """Return the events, alarms and commands that match a query, latest first."""
         with self.database.reading() as connection:
             return journal.search(connection, query)
 
     def forget_events(self, before: float) -> None:
-        """Remove events, predictions and figures up to a time, and alarms over by then."""
+        """Remove events, predictions and time series up to a time, and alarms cleared by then."""
         a = tables.alarm.c
         over = and_(a.cleared < before, a.acknowledged < before)
 
@@ -431,7 +432,7 @@ class Keeper:
     # -- holds ---------------------------------------------------------------------------
 
     def hold(self, holds: Sequence[Lockout]) -> None:
-        """Keep locks; a person's new lock replaces their own one before."""
+        """Store locks; a new lock replaces the same person's earlier lock."""
         new = {_locked(hold): hold for hold in holds}
         first = self._take_numbers(tables.hold, len(new))
         made = [
@@ -446,7 +447,7 @@ class Keeper:
 
         with self._mine:
             self.writer.put(work)
-            # A new dictionary: a reader of the old one sees one consistent state.
+            # A new dictionary, so that a reader of the old one sees one consistent state.
             self._holds = {**self._holds, **new}
 
     def unhold(self, holds: Sequence[Lockout], person: str, at: float) -> None:
@@ -462,11 +463,11 @@ class Keeper:
             self._holds = {k: hold for k, hold in self._holds.items() if k not in ended}
 
     def holds(self) -> tuple[Lockout, ...]:
-        """Return the locks that stand."""
+        """Return the active locks."""
         return tuple(self._holds.values())
 
     def exchange_limits(self, numbers: Mapping[str, float]) -> dict[str, float]:
-        """Keep the numbers of the safety table in force; return those of the run before, or {}."""
+        """Store the safety-table limits in force; return those of the previous run, or {}."""
         about = tables.about
 
         def work(connection: Connection) -> str | None:
@@ -479,19 +480,19 @@ class Keeper:
         return {} if before is None else dict(json.loads(before))
 
     def emergency(self) -> str:
-        """Return the document about the emergency in force; empty without one."""
+        """Return the document about the emergency in force; empty if there is none."""
         return self._document(_EMERGENCY)
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document about the emergency in force; empty: it has ended."""
+        """Replace the document about the emergency in force; empty: the emergency has ended."""
         self._keep_document(_EMERGENCY, document)
 
     def waiting_changes(self) -> str:
-        """Return the document about changes that wait for an approval; empty without one."""
+        """Return the document about changes that await approval; empty if there are none."""
         return self._document(_CHANGES)
 
     def keep_waiting_changes(self, document: str) -> None:
-        """Replace the document about changes that wait for an approval; empty: none waits."""
+        """Replace the document about changes that await approval; empty: there are none."""
         self._keep_document(_CHANGES, document)
 
     def _document(self, name: str) -> str:
@@ -504,12 +505,12 @@ class Keeper:
         self.writer.put(lambda connection: rows.replace(connection, tables.about, [row]))
 
     def do(self, work: Work[Any], timeout: float = 5.0) -> Any:
-        """Do work in the writer and return its result; see `Writer.do`."""
+        """Do work in the writer thread and return its result; see `Writer.do`."""
         return self.writer.do(work, timeout)
 
 
 def calibration_history(connection: Connection, heliostat: str) -> list[HeliostatCalibration]:
-    """Return all versions of one heliostat, the oldest first; see `Records`."""
+    """Return all versions of one heliostat, oldest first; see `Records`."""
     versions, used = tables.parameter_version, tables.parameter_sighting
     query = select(used).where(used.c.heliostat == heliostat).order_by(used.c.sighting)
     behind = rows.Behind(connection.execute(query).mappings().all())
@@ -518,7 +519,7 @@ def calibration_history(connection: Connection, heliostat: str) -> list[Heliosta
 
 
 def _change_behind(connection: Connection, records: Sequence[HeliostatCalibration]) -> None:
-    """Record the sightings behind versions: those that the ones before do not rest on alike."""
+    """Record the sightings behind versions, as far as they differ from the previous versions."""
     used = tables.parameter_sighting.c
     standing: dict[str, dict[int, bool]] = {record.heliostat: {} for record in records}
     names = list(standing)
@@ -564,7 +565,7 @@ def _last_versions(connection: Connection) -> dict[str, int]:
 
 
 def _locked(hold: Lockout) -> tuple[str, str, str]:
-    """Return the key of a lock: the place, and the person. One lock of a key can be in force."""
+    """Return the key of a lock: the place and the person. A key has at most one lock in force."""
     return hold.kind, hold.name, hold.who
 
 

@@ -37,9 +37,9 @@ from heliotrope.store.writer import Work, Writer
 T = TypeVar("T")
 _ACCOUNT, _SESSION, _TOKEN = tables.account, tables.session, tables.api_token
 _DUE, _FACTOR = tables.password_due, tables.second_factor
-#: In the place of a password's hash: a trusted proxy signs that person in.
+#: Stored in place of a password hash if a trusted proxy signs that person in.
 BY_PROXY = "by the proxy"
-#: In the same place: nobody has set a password yet.
+#: Stored in the same place if nobody has set a password yet.
 UNSET = "none yet"
 _STATE = (
     _DUE.c.name.is_not(None).label("password_due"),
@@ -63,19 +63,19 @@ class Account:
     role
         One of `ROLES`.
     password_hash
-        As given; never shown.
+        Password hash; never displayed.
     disabled
         Whether the account is disabled.
     created, changed
         POSIX s.
     password_due
-        Whether the password must be changed at its next use: somebody else has given it.
+        Whether the password must be changed at its next use, because someone else set it.
     factor
         Whether it has a second factor.
     by_proxy
         Whether it has no password, and a trusted proxy signs that person in.
     no_password
-        Whether nobody has set its password yet: its person enters by a one-time link.
+        Whether nobody has set its password yet, so that the person signs in by a one-time link.
     """
 
     name: str
@@ -91,13 +91,13 @@ class Account:
 
     @property
     def has_password(self) -> bool:
-        """Whether a password can be checked."""
+        """Whether there is a password to check."""
         return not self.by_proxy and not self.no_password
 
 
 @dataclass(frozen=True)
 class Session:
-    """A signed-in person: name and current role, beginning and end.
+    """A signed-in person: name and current role, start and end.
 
     ``key`` identifies the session in lists without revealing its secret.
     """
@@ -123,7 +123,7 @@ class ApiToken:
     key
         Identifies the token without revealing its secret.
     name
-        Account that it belongs to.
+        Account to which it belongs.
     label
         Purpose.
     role
@@ -151,7 +151,7 @@ class Valid:
 
 @dataclass(frozen=True)
 class Expired:
-    """A session, or a token with its label, of a person that has expired."""
+    """An expired session of a person, or an expired token with its label."""
 
     token: bool
     name: str
@@ -159,22 +159,22 @@ class Expired:
 
 
 _DAY = 86_400.0
-#: Longest validity of a token by its role, s. What a viewer's token can do harms nobody, so the
-#: programs that only read need a new one once a year; those that command, every quarter.
+#: Longest validity of a token by its role, s. A viewer's token can do no harm, so programs that
+#: only read need a new one once a year; programs that command need one every quarter.
 LONGEST = {"viewer": 365.0 * _DAY, "operator": 90.0 * _DAY, "engineer": 90.0 * _DAY}
-#: Sessions, and tokens, of one account: those of a person, their programs and their pages.
+#: Maximum number of sessions and of tokens of one account, for a person's browsers and programs.
 MOST_SESSIONS, MOST_TOKENS = 20, 50
-#: A secret of which only the SHA-256 is kept: random bytes.
+#: Length of a secret in random bytes; only its SHA-256 is stored.
 _SECRET = 32
 #: The last use of a token is recorded at most this often, s.
 _NOTED = 60.0
 
 
-#: Tokens with what `_valid_token` needs of their accounts.
+#: Tokens, with the account data that `_valid_token` needs.
 _TOKENS = select(_TOKEN, _ACCOUNT.c.role.label("owner_role"), _ACCOUNT.c.disabled).join(_ACCOUNT)
 
 
-#: Letters, in small ones, that look like others, small or capital: Cyrillic, Greek and digits.
+#: Lower-case letters that look like others in lower or upper case: Cyrillic, Greek and digits.
 _ALIKE = str.maketrans(
     "авекмнорстухісѕјԁһӏԛԝѵαβεζηικμνορτυχϲ10|i",
     "abekmhopctyxlcsjdhlqwvabezhlkmvoptyxcloll",
@@ -184,15 +184,15 @@ _ALIKE = str.maketrans(
 class People:
     """Accounts, sessions and tokens in a database.
 
-    All of them are small: a read takes less than a millisecond, a write one commit. Any thread may
+    All tables are small: a read takes less than a millisecond, a write one commit. Any thread may
     call any method.
 
     Parameters
     ----------
     database, writer
-        The keeper's.
+        Parts of the keeper.
     entropy
-        Returns random bytes.
+        Function that returns random bytes.
     """
 
     def __init__(
@@ -207,11 +207,11 @@ class People:
     # -- accounts ------------------------------------------------------------------------
 
     def empty(self) -> bool:
-        """Whether there is no account yet, as at the first start."""
+        """Whether there is no account yet, as at the first start-up."""
         return not self.accounts()
 
     def accounts(self) -> tuple[Account, ...]:
-        """Return all accounts by name."""
+        """Return all accounts, sorted by name."""
         with self._database.reading() as connection:
             return tuple(rows.records(connection, Account, _accounts().order_by(_ACCOUNT.c.name)))
 
@@ -223,16 +223,16 @@ class People:
     def add(
         self, name: str, password_hash: str, role: str, now: float, *, due: bool = False
     ) -> Account:
-        """Make an account; a password that is ``due`` must be changed at first use.
+        """Create an account; a password that is ``due`` must be changed at first use.
 
         Raises
         ------
         InputError
-            A name that exists or looks like another, is empty or too long; an empty hash.
+            If the name exists, resembles another, is empty or too long; or the hash is empty.
         UnknownNameError
-            An unknown role.
+            If the role is unknown.
         StoreError
-            If it could not be written.
+            If the change could not be written.
         """
         _check_role(role)
         if not name.strip(" .") or len(name) > LONGEST_NAME or not name.isprintable():
@@ -270,7 +270,7 @@ class People:
         disabled: bool | None = None,
         due: bool = False,
     ) -> Account:
-        """Change an account. A new password, and disabling it, end its sessions and tokens.
+        """Change an account. Setting a new password or disabling it ends its sessions and tokens.
 
         A new password that is ``due`` must be changed at first use.
 
@@ -279,9 +279,9 @@ class People:
         InputError
             If no engineer would be left.
         UnknownNameError
-            An unknown account or role.
+            If the account or role is unknown.
         StoreError
-            If it could not be written.
+            If the change could not be written.
         """
         changes = {"password_hash": password_hash, "role": role, "disabled": disabled}
         new = {key: value for key, value in changes.items() if value is not None}
@@ -312,9 +312,9 @@ class People:
         InputError
             If no engineer would be left.
         UnknownNameError
-            An unknown account.
+            If the account is unknown.
         StoreError
-            If it could not be written.
+            If the change could not be written.
         """
 
         def work(connection: Connection) -> None:
@@ -335,7 +335,7 @@ class People:
         return self._writer.do(linked)
 
     def factors(self, file: Path) -> Factors:
-        """Return the second factors of the accounts; ``file`` has the key of their secrets."""
+        """Return the second factors of the accounts; ``file`` holds the key to their secrets."""
         return Factors(self._database, self._writer, file, self._entropy)
 
     # -- sessions ------------------------------------------------------------------------
@@ -343,16 +343,16 @@ class People:
     def open_session(self, name: str, now: float, lifetime: float, note: str = "") -> str:
         """Return the secret of a new session, which expires ``lifetime`` s from now.
 
-        It ends the oldest ones of an account that has `MOST_SESSIONS`.
+        If the account has `MOST_SESSIONS` sessions, the oldest ones end.
 
         Raises
         ------
         InputError
             If the account is disabled.
         UnknownNameError
-            An unknown account.
+            If the account is unknown.
         StoreError
-            If it could not be written.
+            If the session could not be written.
         """
         secret = self._secret()
         row = {"key": _key(secret), "name": name, "since": now, "expires": now + lifetime}
@@ -370,7 +370,7 @@ class People:
         return secret
 
     def valid(self, now: float, used: Collection[str] = ()) -> Valid:
-        """Return all valid sessions and tokens; record the use of the tokens of some keys."""
+        """Return all valid sessions and tokens; record the use of tokens with the given keys."""
         for key in used:
             self._note_use(key, now)
         columns = (_SESSION, _ACCOUNT.c.role, *_STATE)
@@ -394,19 +394,19 @@ class People:
     def add_token(
         self, name: str, label: str, role: str, now: float, lifetime: float | None = None
     ) -> tuple[ApiToken, str]:
-        """Make a token of an account; return it with its secret, which is shown only now.
+        """Create a token for an account; return it with its secret, which is shown only now.
 
-        It expires ``lifetime`` s from now, and after the `LONGEST` time of its role at the latest.
+        It expires ``lifetime`` s from now, and at the latest after the `LONGEST` time for its role.
 
         Raises
         ------
         InputError
-            If its role is above that of the account, the lifetime above the longest, or the
-            account has `MOST_TOKENS`.
+            If its role is above that of the account, the lifetime is too long, or the account has
+            `MOST_TOKENS` tokens.
         UnknownNameError
-            An unknown account or role.
+            If the account or role is unknown.
         StoreError
-            If it could not be written.
+            If the token could not be written.
         """
         _check_role(role)
         longest = LONGEST[role]
@@ -436,7 +436,7 @@ class People:
         return made, secret
 
     def token(self, secret: str, now: float) -> ApiToken | None:
-        """Return the token of a secret and record its use; None if there is no valid one."""
+        """Return the token with a secret and record its use; None if there is no valid token."""
         with self._database.reading() as connection:
             result = connection.execute(_TOKENS.where(_TOKEN.c.key == _key(secret)))
             row = result.mappings().first()
@@ -450,14 +450,14 @@ class People:
         if last is None or abs(now - last) >= _NOTED:
             self._noted[key] = now
             which = _TOKEN.c.key == key
-            # A full disk must not keep anybody out.
+            # A full disk must not lock anyone out.
             with suppress(StoreError):
                 self._writer.put(
                     lambda c: c.execute(_TOKEN.update().where(which).values(last_used=now))
                 )
 
     def tokens(self, name: str = "") -> tuple[ApiToken, ...]:
-        """Return the tokens of an account, or all, the oldest first."""
+        """Return the tokens of an account, or all tokens, oldest first."""
         query = select(_TOKEN).order_by(_TOKEN.c.created, _TOKEN.c.key)
         if name:
             query = query.where(_TOKEN.c.name == name)
@@ -498,13 +498,13 @@ class People:
 
 
 def _likeness(name: str) -> str:
-    """Return the form shared by two names that people could confuse."""
+    """Return the common form of names that people could confuse."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().translate(_ALIKE).split())
 
 
 def _valid_token(row: RowMapping, now: float) -> ApiToken | None:
     """Return the token of a row of `_TOKENS`; None if it is not valid."""
-    # Earlier programs made tokens that last for years, or for ever.
+    # Earlier programs issued tokens that last for years, or forever.
     ends = row["created"] + LONGEST[row["role"]]
     if row["disabled"] or now >= min(ends, row["expires"] if row["expires"] is not None else ends):
         return None
@@ -526,7 +526,7 @@ def _accounts() -> Select[Any]:
 
 
 def _with_state(accounts: FromClause) -> FromClause:
-    """Join what `_STATE` needs to the accounts."""
+    """Join the columns that `_STATE` needs to the accounts."""
     factor = (_FACTOR.c.name == _ACCOUNT.c.name) & _FACTOR.c.confirmed
     return accounts.outerjoin(_DUE, _DUE.c.name == _ACCOUNT.c.name).outerjoin(_FACTOR, factor)
 

@@ -16,7 +16,7 @@ _BLOCK = 1 << 20
 
 
 def purge(folder: Path) -> tuple[int, list[Path]]:
-    """Overwrite and remove what plants made in a data folder, their keys and passwords included.
+    """Overwrite and remove what plants created in a data folder, including keys and passwords.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def purge(folder: Path) -> tuple[int, list[Path]]:
 
     Returns
     -------
-    The number of removed files, and what is left in the folder, since no plant made it.
+    The number of removed files, and what is left in the folder because no plant created it.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def purge(folder: Path) -> tuple[int, list[Path]]:
 
 
 def _remove(path: Path) -> int:
-    """Overwrite and remove a file or folder, and follow no link; return the number of files."""
+    """Overwrite and remove a file or folder without following links; return the number of files."""
     try:
         status = path.lstat()
     except FileNotFoundError:

@@ -31,7 +31,7 @@ SEVERITIES = tuple(Severity)
 
 
 class StoreError(HeliotropeError):
-    """A record that could not be stored, or a store that cannot be used."""
+    """A record could not be stored, or a store cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -269,16 +269,16 @@ class CampaignEntry:
 
 @dataclass(frozen=True)
 class FlightEntry:
-    """A flight of a drone that the plant has taken.
+    """A drone flight that was imported into the plant.
 
     Attributes
     ----------
     name
         Unique.
     at
-        When it was taken, POSIX s.
+        Time of import, POSIX s.
     person
-        Who gave it.
+        Person who imported it.
     document
         Text of its file; see `calibration.flights`.
     """
@@ -291,18 +291,18 @@ class FlightEntry:
 
 @dataclass(frozen=True)
 class LearningEntry:
-    """The learned hyperparameters of a group of mirrors.
+    """The learnt hyperparameters of a heliostat group.
 
     Attributes
     ----------
     group, version
-        Name of the group in the plant file, and 1, 2, ... for each.
+        Name of the group in the plant file, and 1, 2, ... for each group.
     at, person
         Time of learning, POSIX s, and the person who ordered it.
     heliostats, sightings
-        Numbers of heliostats and sightings that it was learned from.
+        Numbers of heliostats and sightings from which it was learnt.
     gain
-        Rise of a sighting's log probability density, predicted from those before it.
+        Increase of a sighting's log probability density, predicted from earlier sightings.
     document
         The model and the hyperparameters as JSON; see `calibration.learn.group`.
     """
@@ -319,16 +319,16 @@ class LearningEntry:
 
 @dataclass(frozen=True)
 class TimetableRecord:
-    """A timetable of calibrations that a person has put in force.
+    """A calibration timetable that an operator has activated.
 
     Attributes
     ----------
     at
-        When, POSIX s.
+        Time of activation, POSIX s.
     person
-        Who.
+        Person who activated it.
     document
-        Its entries as JSON, with the keys of the plant file; "": that of the plant file.
+        Its entries as JSON, with the keys of the plant file; "": the timetable of the plant file.
     """
 
     at: float
@@ -345,7 +345,7 @@ class FieldPoint:
     at
         POSIX s.
     median, percentile_90
-        Percentiles of their tracking errors, RMS over the suns of the year, rad.
+        Percentiles of their tracking errors, RMS over the sun positions of the year, rad.
     """
 
     at: float
@@ -362,15 +362,16 @@ class Outlook:
     made
         POSIX s.
     heliostats
-        Number of heliostats that may be measured; the others keep their errors.
+        Number of heliostats that may be measured; the errors of all others stay constant.
     goal
-        Tracking error that 90 % of the heliostats shall not exceed, rad.
+        Tracking error that 90 % of the heliostats must not exceed, rad.
     reached
-        When they do not, POSIX s; None if not on this day.
+        When this is achieved, POSIX s; None if not on this day.
     points
-        The predicted curve, oldest first; the first is what was known when it was made.
+        The predicted curve, oldest first; the first point is the state at the time of the
+        prediction.
     text
-        The outcome for people.
+        The outcome for display.
     """
 
     made: float
@@ -382,28 +383,28 @@ class Outlook:
 
     @property
     def document(self) -> str:
-        """The prediction as JSON, without the time when it was made."""
+        """The prediction as JSON, without the time at which it was made."""
         own = asdict(self)
         del own["made"]
         return json.dumps(own | {"points": [astuple(point) for point in self.points]})
 
     @classmethod
     def of(cls, made: float, document: str) -> "Outlook":
-        """Return the prediction made at a time, from its document."""
+        """Return the prediction made at a given time, from its document."""
         own = json.loads(document)
         return cls(made, **own | {"points": tuple(FieldPoint(*point) for point in own["points"])})
 
 
 @dataclass(frozen=True)
 class PlantFigures:
-    """Figures of the whole plant at one moment.
+    """Values for the whole plant at one moment.
 
     Attributes
     ----------
     at
         POSIX s.
     values
-        Figures by name, SI; NaN where one is not known. See `plant.operations.history`.
+        Values by name, SI; NaN if unknown. See `plant.operations.history`.
     """
 
     at: float
@@ -428,20 +429,20 @@ class AuditEntry:
 
 @dataclass(frozen=True)
 class JournalQuery:
-    """What is looked for in the journal.
+    """A query to the journal.
 
     Attributes
     ----------
     since, until
-        Times, POSIX s; the later one is excluded.
+        Time range, POSIX s; ``until`` is excluded.
     kind
         "event", "alarm", "command" or "note"; "" for all. Notes are events, too.
     person, heliostat, text
-        Person, heliostat, and a text in any case; "" for any.
+        Person, heliostat, and a text, ignoring case; "" for any.
     but
         Users whose commands are left out.
     limit
-        Most entries.
+        Maximum number of entries.
     """
 
     since: float = 0.0
@@ -482,11 +483,11 @@ class JournalEntry:
     heliostats: tuple[str, ...] = ()
 
 
-#: Heliostats of a command that the journal names at most.
+#: Maximum number of heliostats of a command that the journal names.
 JOURNAL_NAMES = 200
 
 
-#: Source of an event that is a person's note.
+#: Source of an event that is an operator's note.
 NOTE = "note"
 #: A record that is one row of its own table.
 Fact = (
@@ -541,7 +542,7 @@ class Records(Protocol):
         ...
 
     def record(self, fact: Fact) -> None:
-        """Record a fact; one keyed by time or name replaces the earlier one with that key."""
+        """Record a fact; if keyed by time or name, it replaces the earlier fact with that key."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -584,11 +585,11 @@ class Records(Protocol):
         ...
 
     def waiting_changes(self) -> str:
-        """Return the document about changes that wait for an approval; empty without one."""
+        """Return the document about changes that await approval; empty if there are none."""
         ...
 
     def keep_waiting_changes(self, document: str) -> None:
-        """Replace the document about changes that wait for an approval; empty: none waits."""
+        """Replace the document about changes that await approval; empty: there are none."""
         ...
 
     async def confirm(self) -> None:

@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     )
 
 _OTHERS = 0o077
-#: Ending of the file of the public key.
+#: File suffix of the public key.
 PUBLIC = ".pub"
-#: What is signed begins with this, so that no other signature of the key passes for one.
+#: Signed data begins with this, so that no other signature made with the key can be used instead.
 _PURPOSE = b"heliotrope backup 1\n"
 
 
 def make_key(path: Path) -> Path:
-    """Make a pair of keys; return the file of the public one.
+    """Create a key pair; return the file of the public key.
 
     Raises
     ------
     InputError
-        If a file exists, or they cannot be written.
+        If a file exists, or the files cannot be written.
     """
     ed25519 = _ed25519()
     from cryptography.hazmat.primitives import serialization as form
@@ -65,7 +65,7 @@ class SigningKey:
     Raises
     ------
     FormatError
-        If it cannot be read, others may read it, or it is no such key.
+        If it cannot be read, others may read it, or it is not such a key.
     """
 
     def __init__(self, path: Path) -> None:
@@ -85,7 +85,7 @@ class SigningKey:
         self._key: Ed25519PrivateKey = key
 
     def sign(self, data: bytes) -> bytes:
-        """Return the signature of some data, one line of text."""
+        """Return the signature of some data as one line of text."""
         signature: bytes = self._key.sign(_PURPOSE + data)
         return base64.b64encode(signature) + b"\n"
 
@@ -101,7 +101,7 @@ class PublicKey:
     Raises
     ------
     FormatError
-        If it cannot be read, or is no such key.
+        If it cannot be read, or is not such a key.
     """
 
     def __init__(self, path: Path) -> None:
@@ -120,7 +120,7 @@ class PublicKey:
         self._key: Ed25519PublicKey = key
 
     def signed(self, data: bytes, signature: bytes) -> bool:
-        """Whether a signature of the private key belongs to some data."""
+        """Return whether a signature was made over some data with the private key."""
         from cryptography.exceptions import InvalidSignature
 
         try:

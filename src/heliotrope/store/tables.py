@@ -47,12 +47,12 @@ metadata = MetaData(
         "pk": "pk_%(table_name)s",
     }
 )
-#: SQLite takes only INTEGER for the number of a row itself.
+#: SQLite accepts only INTEGER for the row number itself.
 Number = BigInteger().with_variant(Integer, "sqlite")
 
 
 def _finite(value: float | None) -> float | None:
-    """Return a float as it is kept: None if it is not finite."""
+    """Return a float as it is stored: None if it is not finite."""
     return float(value) if value is not None and math.isfinite(value) else None
 
 
@@ -67,11 +67,11 @@ class _Converted(TypeDecorator[Any], ABC):
     impl: Any = Text
 
     def process_bind_param(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002 - SQLAlchemy gives it
-        """Return a value as the database keeps it."""
+        """Return a value in the form in which the database stores it."""
         return self._written(value)
 
     def process_result_value(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002 - SQLAlchemy gives it
-        """Return a value as a record has it."""
+        """Return a value in the form in which a record holds it."""
         return self._read(value)
 
     @abstractmethod
@@ -82,7 +82,7 @@ class _Converted(TypeDecorator[Any], ABC):
 
 
 class Figure(_Converted):
-    """A float; one that is not finite is NULL, and NULL is NaN."""
+    """A float; a non-finite float is stored as NULL, and NULL is read as NaN."""
 
     impl = Double
     cache_ok = True
@@ -95,7 +95,7 @@ class Figure(_Converted):
 
 
 class FiguresByName(_Converted):
-    """Floats by name, as a JSON object; one that is not finite is null, and null is NaN."""
+    """Floats by name, as a JSON object; a non-finite float becomes null, and null is NaN."""
 
     impl = JSON
     cache_ok = True
@@ -121,7 +121,7 @@ class Figures(_Converted):
         return value.tolist()
 
     def _read(self, value: list[Any]) -> FloatArray:
-        # The list of an empty array has lost all axes but one.
+        # The JSON list of an empty array retains only one of its axes.
         return np.array(value, np.float64) if value else np.zeros((0,) * self.axes)
 
 
@@ -143,7 +143,7 @@ class Items(_Converted):
 
 
 class Name(_Converted):
-    """A member of an enum, as its name in lower case."""
+    """A member of an enum, stored as its name in lower case."""
 
     cache_ok = True
 
@@ -234,8 +234,9 @@ parameter_version = Table(
     Column("provenance", Name(Provenance), nullable=False),
 )
 
-#: The sightings behind versions. A row stands from a version until before another (NULL: to the
-#: last one); it says whether they use the sighting, and what it missed by in the first of them.
+#: The sightings behind versions. A row applies from one version until before another (NULL: to the
+#: last one). It says whether these versions use the sighting, and the residual in the first of
+#: them.
 parameter_sighting = Table(
     "parameter_sighting",
     metadata,
@@ -264,8 +265,8 @@ campaign = Table(
     Column("found", FiguresByName, nullable=False),
 )
 
-#: Flights that were taken: the document as its file has it. Their sightings stand among the others,
-#: with the flight as their campaign.
+#: Imported flights, with the document exactly as in its file. Their sightings are stored among the
+#: others, with the flight as their campaign.
 flight = Table(
     "flight",
     metadata,
@@ -275,7 +276,7 @@ flight = Table(
     _text("document"),
 )
 
-#: What was learnt of each group of mirrors, version by version.
+#: What was learnt about each heliostat group, version by version.
 learning = Table(
     "learning",
     metadata,
@@ -289,7 +290,7 @@ learning = Table(
     _text("document"),
 )
 
-#: Timetables of calibrations that persons have put in force.
+#: Calibration timetables that operators have activated.
 timetable = Table(
     "timetable",
     metadata,
@@ -298,7 +299,7 @@ timetable = Table(
     _text("document"),
 )
 
-#: Predictions of the field's errors, as JSON.
+#: Predictions of the field errors, as JSON.
 outlook = Table(
     "outlook",
     metadata,
@@ -306,7 +307,7 @@ outlook = Table(
     _text("document"),
 )
 
-#: Figures of the whole plant, one row a minute.
+#: Values for the whole plant, one row per minute.
 figures = Table(
     "figures",
     metadata,
@@ -342,7 +343,8 @@ visit = Table(
     Index(None, "heliostat"),
 )
 
-#: Empty, since no version has written it: the next necessary migration may drop it.
+#: Empty, because no version has written to it; the next migration that is needed anyway may drop
+#: it.
 plan = Table(
     "plan",
     metadata,
@@ -422,7 +424,7 @@ audit = Table(
     _text("finished"),
 )
 
-#: A link for each event, two for each record of the audit (accepted, and result), and one for each
+#: One link for each event, two for each audit record (acceptance and result), and one for each
 #: change of an account or token; see `chain`.
 event_link = Table("event_link", metadata, _number(), _text("digest"))
 audit_link = Table(
@@ -455,14 +457,14 @@ account = Table(
     CheckConstraint("role IN ('viewer', 'operator', 'engineer')", name="role"),
 )
 
-#: Accounts whose password somebody else has given: it must be changed at first use.
+#: Accounts whose password was set by someone else and must be changed at first use.
 password_due = Table(
     "password_due",
     metadata,
     Column("name", Text, ForeignKey(account.c.name, ondelete="CASCADE"), primary_key=True),
 )
 
-#: Of `used`: the last step of time whose code was accepted. `word` is not secret, see `factors`.
+#: `used` is the last time step whose code was accepted. `word` is not secret, see `factors`.
 second_factor = Table(
     "second_factor",
     metadata,

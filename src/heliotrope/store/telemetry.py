@@ -34,7 +34,7 @@ from heliotrope.store.records import StoreError
 
 #: State of a heliostat whose values are stale.
 STALE = 255
-#: Number of pieces of work that may wait for the disk.
+#: Number of jobs that may wait for the disk.
 _WAITING = 64
 SCHEMA = pa.schema(
     [
@@ -59,13 +59,13 @@ class TelemetrySettings:
     period
         Interval between two snapshots of the field, s.
     keyframe
-        Interval between two snapshots that are written in full, s.
+        Interval between two snapshots that are written completely, s.
     deadband
-        Motion of a drive that is not yet written, steps.
+        Motion of a drive up to which nothing is written, steps.
     days
         Number of days kept besides the current one.
     rows
-        Length of a segment.
+        Number of rows in a segment.
     """
 
     period: float = 60.0
@@ -94,7 +94,7 @@ class Look:
     Attributes
     ----------
     state
-        Codes; `STALE` where the values are stale, (N,).
+        Codes; `STALE` if the values are stale, (N,).
     fault, flags
         Codes, (N,).
     counts
@@ -116,7 +116,7 @@ class Telemetry:
     Parameters
     ----------
     folder
-        Folder of the archive; made if missing.
+        Folder of the archive, created if missing.
     names
         Names of the N heliostats.
     states
@@ -124,12 +124,13 @@ class Telemetry:
     settings
         See `TelemetrySettings`.
     inline
-        Write in the caller's thread: for virtual time, in which no thread can be awaited.
+        Whether to write in the caller's thread, for virtual time, in which no thread can be
+        awaited.
 
     Raises
     ------
     StoreError
-        If the folder cannot be made.
+        If the folder cannot be created.
     """
 
     def __init__(
@@ -148,7 +149,7 @@ class Telemetry:
         self._states = pa.array(words, pa.string())
         self._last: Look | None = None
         self._looked_at = self._keyed_at = -np.inf
-        #: Why it cannot be written now, "" if it can.
+        #: Why the archive cannot be written now, "" if it can.
         self.problem = ""
         self._lost = False
         self._segment: _Segment | None = None
@@ -190,7 +191,7 @@ class Telemetry:
         return len(rows)
 
     def close(self, timeout: float = 10.0) -> None:
-        """Write what waits, and close; the next start finishes the open part."""
+        """Write the waiting rows, and close; the next start finishes the open part."""
         if self._thread is not None:
             self._queue.put(None)
             self._thread.join(timeout)
@@ -217,7 +218,7 @@ class Telemetry:
         except (OSError, pa.ArrowException) as error:
             why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
             self.problem = f"telemetry {self.folder}: cannot be written ({why}); check the disk"
-            # Nothing behind a torn batch is readable, and rows are missing now.
+            # Nothing after a torn batch can be read, so rows are missing from here on.
             self._lost = True
             self._drop_segment()
 
@@ -246,7 +247,7 @@ class Telemetry:
             pa.DictionaryArray.from_arrays(pa.array(look.state[rows], pa.int16()), self._states),
             pa.array(look.fault[rows], pa.uint8()), pa.array(look.flags[rows], pa.uint16()),
             pa.array(look.counts[rows, 0], pa.int32()), pa.array(look.counts[rows, 1], pa.int32()),
-            # More digits of an age are noise and take space.
+            # More digits of an age are noise and take up space.
             pa.array(np.round(look.age[rows], 1), pa.float32()),
         ]  # fmt: skip
         return pa.RecordBatch.from_arrays(columns, schema=SCHEMA)
@@ -265,7 +266,7 @@ class _Segment:
         self._stream = pa.ipc.new_stream(self._file, SCHEMA, options=options)
 
     def write(self, batch: pa.RecordBatch) -> None:
-        """Write a batch; it is on the disk when this returns."""
+        """Write a batch; it is on disk when this returns."""
         self._stream.write_batch(batch)
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -282,7 +283,7 @@ class _Segment:
 def changed(last: Look, look: Look, deadband: int) -> npt.NDArray[np.bool_]:
     """Return the mask of changed rows, (N,): state, fault, flags, or counts beyond a deadband.
 
-    Nothing is known of a row that was and is stale, so it does not differ.
+    A row that was stale and still is does not count as changed, because nothing is known about it.
     """
     moved = np.abs(look.counts.astype(np.int64) - last.counts).max(axis=-1) > deadband
     other = (look.fault != last.fault) | (look.flags != last.flags) | moved
@@ -301,7 +302,7 @@ def _merged(last: Look, look: Look, rows: npt.NDArray[np.intp]) -> Look:
 
 
 def read_part(path: Path) -> list[pa.RecordBatch]:
-    """Return the whole batches of a part, up to where it is torn."""
+    """Return the complete batches of a part, up to the point where it is torn."""
     batches = []
     with path.open("rb") as file:
         try:
@@ -313,10 +314,10 @@ def read_part(path: Path) -> list[pa.RecordBatch]:
 
 
 def finish_parts(folder: Path) -> None:
-    """Turn all parts of an archive into Parquet; none of them may be open."""
+    """Convert all parts of an archive to Parquet; none of them may be open."""
     for part in sorted(folder.glob("????-??-??/*.part")):
         final = part.with_suffix(".parquet")
-        # A crash between the two steps below leaves both; the Parquet file is then whole.
+        # A crash between the two steps below leaves both files; the Parquet file is then complete.
         if not final.exists():
             table = pa.Table.from_batches(read_part(part), SCHEMA)
             if table.num_rows:
@@ -326,7 +327,7 @@ def finish_parts(folder: Path) -> None:
 
 def _write_parquet(table: pa.Table, final: Path) -> None:
     table = table.unify_dictionaries()
-    # Sorted by heliostat, counts differ little from row to row.
+    # If rows are sorted by heliostat, counts differ little from row to row.
     heliostat = table["heliostat"].combine_chunks().indices.to_numpy()
     order = np.lexsort((table["time"].to_numpy(), heliostat))
     beside = final.with_suffix(".tmp")
@@ -353,12 +354,12 @@ def _write_parquet(table: pa.Table, final: Path) -> None:
 
 
 def _new_file(path: Path, how: int) -> BinaryIO:
-    """Return a file that only this user may read, open for writing."""
+    """Open a file for writing that only this user may read, and return it."""
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | how, PRIVATE), "wb")
 
 
 def retain(folder: Path, days: int, today: date) -> list[str]:
-    """Remove the days of an archive that are older than some days; return them."""
+    """Remove the days of an archive that are older than the given number; return them."""
     removed = []
     for place in sorted(folder.glob("????-??-??")):
         try:

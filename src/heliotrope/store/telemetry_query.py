@@ -15,9 +15,9 @@ from heliotrope.errors import InputError
 from heliotrope.store.records import StoreError
 from heliotrope.store.telemetry import SCHEMA, read_part
 
-#: A part may become a Parquet file while it is being looked for.
+#: A part may become a Parquet file during the search.
 _TRIES = 5
-#: DuckDB would look for extensions on the network.
+#: DuckDB would otherwise look for extensions on the network.
 _CONFIG: dict[str, Any] = {
     "memory_limit": "1GB",
     "autoinstall_known_extensions": False,
@@ -26,22 +26,22 @@ _CONFIG: dict[str, Any] = {
 
 
 def query(folder: str | Path, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
-    """Return the answer to one SELECT.
+    """Return the result of one SELECT.
 
     Parameters
     ----------
     folder
         Folder of the archive.
     sql
-        One reading statement, such as ``SELECT heliostat, max(time) FROM telemetry WHERE
-        state = ? GROUP BY ALL``. It sees no files, settings or variables.
+        One read-only statement, such as ``SELECT heliostat, max(time) FROM telemetry WHERE
+        state = ? GROUP BY ALL``. It has no access to files, settings or variables.
     parameters
-        Values of its question marks.
+        Values for its placeholders.
 
     Raises
     ------
     InputError
-        If it is malformed, or does anything but read.
+        If the statement is malformed, or does anything other than read.
     StoreError
         If there is no archive, or it cannot be read.
     """
@@ -65,7 +65,7 @@ def query(folder: str | Path, sql: str, parameters: Sequence[Any] = ()) -> pa.Ta
 
 
 def _show(connection: duckdb.DuckDBPyConnection, files: Sequence[str], parts: pa.Table) -> None:
-    """Show a connection the archive and nothing else."""
+    """Give a connection access to the archive and to nothing else."""
     connection.register("parts", parts)
     sources = ["SELECT * FROM parts"]
     if files:
@@ -96,7 +96,7 @@ def _line(error: Exception) -> str:
 
 
 def _content(folder: Path) -> tuple[list[str], pa.Table]:
-    """Return the Parquet files, and the rows of parts that are not among them."""
+    """Return the Parquet files, and the rows of parts not included in them."""
     for _ in range(_TRIES):
         paths = sorted(folder.glob("????-??-??/*.*"))
         files = [p for p in paths if p.suffix == ".parquet"]

@@ -30,17 +30,17 @@ from heliotrope.store.records import StoreError
 T = TypeVar("T")
 Work = Callable[[Connection], T]
 
-#: Largest number of pieces of work in one transaction: nobody waits long behind the others.
+#: Largest number of jobs in one transaction, so that no caller waits long behind the others.
 MOST = 256
 #: Wait after a failure, s: the first, and the longest.
 _PAUSE = (0.25, 5.0)
-#: How long work may wait for more work to share its commit, s.
+#: How long a job may wait for more jobs to share its commit, s.
 _LINGER = 0.05
 
 
 @dataclass
 class _Entry:
-    """Work that waits; ``kept`` until it is written, otherwise for one attempt."""
+    """A waiting job, ``kept`` until it is written or else dropped after one attempt."""
 
     work: Work[Any]
     future: "Future[Any] | None"
@@ -53,11 +53,12 @@ class Writer:
     Parameters
     ----------
     database
-        Ready, and locked by this process.
+        Database that is ready and locked by this process.
     limit
-        Number of pieces of work that may wait.
+        Number of jobs that may wait.
     inline
-        Write at once in the caller's thread: for virtual time, in which no thread can be awaited.
+        Whether to write at once in the caller's thread, for virtual time, in which no thread can be
+        awaited.
     """
 
     def __init__(self, database: Database, *, limit: int = 50_000, inline: bool = False) -> None:
@@ -69,7 +70,7 @@ class Writer:
         self._closing = self._hasty = False
         #: Why nothing can be written now, "" if it can.
         self.problem = ""
-        #: The last work that was dropped, and the number dropped so far.
+        #: The last job that was dropped, and the number dropped so far.
         self.refused, self.refused_count = "", 0
         self._thread: threading.Thread | None = None
         if not inline:
@@ -78,12 +79,12 @@ class Writer:
 
     @property
     def backlog(self) -> int:
-        """Number of pieces of work that wait."""
+        """Number of waiting jobs."""
         return len(self._queue)
 
     @property
     def crowded(self) -> str:
-        """Why no more work is accepted; empty while there is room."""
+        """Why no more jobs are accepted; empty while there is room."""
         if len(self._queue) < self._limit:
             return ""
         return (
@@ -92,25 +93,25 @@ class Writer:
         )
 
     def put(self, work: Work[Any]) -> None:
-        """Queue work, to be done whenever that is possible.
+        """Queue a job, to be done as soon as possible.
 
         Raises
         ------
         StoreError
-            If too much waits already, or the writer is closed.
+            If too many jobs are already waiting, or the writer is closed.
         """
         if crowded := self.crowded:
             raise StoreError(crowded)
         self._add(_Entry(work, None, kept=True))
 
     def do(self, work: Work[T], timeout: float = 5.0) -> T:
-        """Do work and return its result once it is safely on the disk.
+        """Do a job and return its result once it is safely on disk.
 
         Raises
         ------
         StoreError
-            If it could not be written now; it is dropped. After a timeout (s) it may still be
-            written: repeating the work must do no harm.
+            If it could not be written now; the job is dropped. After a timeout (s) it may still be
+            written, so repeating the job must do no harm.
         """
         future = self.attempt(work)
         try:
@@ -123,9 +124,9 @@ class Writer:
             raise StoreError(f"store {self._database.name}: it is closed") from None
 
     def attempt(self, work: Work[T]) -> "Future[T]":
-        """Queue work for the next attempt; return a future that is done when it is safe.
+        """Queue a job for the next attempt; return a future that is done when it is safely stored.
 
-        The future fails with `StoreError` if that attempt fails: the work is then dropped.
+        The future fails with `StoreError` if that attempt fails; the job is then dropped.
 
         Raises
         ------
@@ -137,11 +138,11 @@ class Writer:
         return future
 
     def confirmed(self) -> "Future[None]":
-        """Return a future that is done when all earlier work is safe, and fails with an attempt."""
+        """Return a future that is done once all earlier jobs are stored, or fails with them."""
         return self.attempt(_nothing)
 
     def close(self, timeout: float = 10.0) -> None:
-        """Write what waits, and close.
+        """Write the waiting jobs, and close.
 
         Raises
         ------
@@ -168,7 +169,7 @@ class Writer:
             if self._closing:
                 raise StoreError(f"store {self._database.name}: it is closed")
             self._queue.append(entry)
-            # A waiting caller does not wait for a pause to end.
+            # A waiting caller does not wait for the end of a pause.
             self._hasty |= entry.future is not None
             self._news.notify_all()
         if self.inline:
@@ -181,7 +182,7 @@ class Writer:
                 self._news.wait_for(lambda: self._queue or self._closing)
                 if not self._queue:
                     return
-                # No caller waits for it: let more work join the same commit.
+                # No caller waits for it, so more jobs may join the same commit.
                 self._news.wait_for(self._in_haste, _LINGER)
             self._hasty = False
             if self._step():
@@ -224,7 +225,7 @@ class Writer:
         return True
 
     def _write_singly(self, batch: list[_Entry], entries: list[_Entry]) -> bool:
-        """Find the work that was refused; the rest of its batch is written."""
+        """Find the job that was rejected; the rest of its batch is written."""
         retried = {id(entry) for entry in entries}
         self._remove([entry for entry in batch if id(entry) not in retried])
         for count, entry in enumerate(entries):
@@ -249,7 +250,7 @@ class Writer:
             with self._connection.begin():
                 return [entry.work(self._connection) for entry in entries]
         except BaseException:
-            # Whatever it was, the next attempt begins with a fresh connection.
+            # Whatever the cause, the next attempt begins with a fresh connection.
             self._drop_connection()
             raise
 
@@ -262,7 +263,7 @@ class Writer:
                 connection.invalidate()
 
     def _remove(self, entries: list[_Entry]) -> None:
-        """Remove finished work from the head of the queue."""
+        """Remove finished jobs from the head of the queue."""
         with self._news:
             for entry in entries:
                 if self._queue[0] is not entry:
@@ -283,7 +284,7 @@ class Writer:
             self.refused, self.refused_count = text, self.refused_count + 1
 
     def _fail(self, entries: list[_Entry], error: Exception) -> None:
-        """Tell the waiting callers, whose work is dropped; kept work stays in order."""
+        """Notify waiting callers, whose jobs are dropped; kept jobs stay queued in order."""
         why = str(error) if isinstance(error, StoreError) else cause(error)
         self.problem = f"store {self._database.name}: cannot be written ({why}); check the disk"
         with self._news:
@@ -297,7 +298,7 @@ class Writer:
 
 
 def _is_of_database(error: Exception) -> bool:
-    """Whether the state of the database is at fault, not the work."""
+    """Return whether the state of the database is at fault rather than the job."""
     if isinstance(error, StatementError) and not isinstance(error, DBAPIError):
         return False  # a value that cannot be written
     if isinstance(error, IntegrityError | DataError):

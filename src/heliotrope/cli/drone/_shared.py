@@ -1,4 +1,4 @@
-"""Shared by the commands of a drone's flight: arguments, options and progress bars."""
+"""Shared by the drone commands: arguments, options and progress bars."""
 
 import os
 import re
@@ -62,7 +62,7 @@ OutOption = Annotated[Path, typer.Option(help="Folder for the results.")]
 
 
 def cores(processes: int) -> int:
-    """Return the number of processes to use: as given, or one for each core."""
+    """Return the number of processes to use: as specified, or one per core."""
     return processes or len(os.sched_getaffinity(0))
 
 
@@ -103,7 +103,7 @@ def rendered_camera(size: str, focal_px: float = 0.0) -> "LedCamera":
 
 
 def formats(text: str) -> tuple[str, ...]:
-    """Return the formats of waypoint files that --formats names."""
+    """Return the formats of waypoint files specified by --formats."""
     from heliotrope.airborne.plan.flight_files import FORMATS
     from heliotrope.errors import InputError
 

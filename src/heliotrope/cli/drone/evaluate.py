@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from heliotrope.airborne.evaluate.flight import CampaignResult
     from heliotrope.airborne.evaluate.reference import Compared
 
-#: Most warnings, and most orientations, that are printed.
+#: Maximum number of warnings, and of orientations, that are printed.
 _WARNINGS, _ORIENTATIONS = 12, 40
 
 

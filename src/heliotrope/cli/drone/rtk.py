@@ -128,5 +128,5 @@ def _show(check: "RtkCheck") -> None:
 
 
 def _mm(value: float) -> str:
-    """Return metres as mm; a dash for what is not known."""
+    """Return metres as mm; a dash if unknown."""
     return f"{1e3 * value:.1f}" if math.isfinite(value) else "–"

@@ -149,7 +149,7 @@ def simulate(
         return
     chosen = _nearest(mirrors, heliostats)
     middle = chosen.position.mean(axis=0)
-    # By default on the side of the tower, half way up to the zenith.
+    # By default on the side of the tower, halfway up to the zenith.
     level = -middle[:2] / max(float(np.linalg.norm(middle[:2])), 1e-9)
     place = middle + distance * np.sqrt(0.5) * np.array([*level, 1.0])
     place = np.array(parse_point(hover, "--hover")) if hover else place

@@ -1,4 +1,4 @@
-"""Evidence of a plant at work leaves its machine: security events, alarms, heads of the chains."""
+"""Evidence that leaves a running plant's computer: security events, alarms, chain heads."""
 
 import asyncio
 import contextlib
@@ -17,26 +17,13 @@ from heliotrope.store.keeper import Keeper
 
 #: Default time between exports of the heads, hours, and the shortest and longest.
 HOURS, _LEAST, _MOST = 1.0, 0.01, 168.0
-#: Time between looks at the sender, s.
+#: Interval between checks of the sender, s.
 _LOOKED = 2.0
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Options of what leaves the machine.
-
-    Attributes
-    ----------
-    syslog, authority
-        URL of the receiver of security events and alarms, and the PEM file of its authority.
-    heads, hours
-        Folder to which the heads of the chains are written, and the time between, hours.
-
-    Raises
-    ------
-    InputError
-        A URL, a folder or a time that cannot be used.
-    """
+    """Options for what leaves the computer."""
 
     syslog: str | None = None
     authority: Path | None = None
@@ -54,13 +41,13 @@ class Evidence:
 
     @property
     def receiver(self) -> Receiver | None:
-        """The receiver of syslog, if there is one."""
+        """The syslog receiver, if there is one."""
         return None if self.syslog is None else Receiver.read(self.syslog, self.authority)
 
 
 @contextlib.asynccontextmanager
 async def leaving(live: PlantAssembly, keeper: Keeper, chosen: Evidence) -> AsyncIterator[None]:
-    """Send on security events and alarms, and export heads, during a block."""
+    """Forward security events and alarms, and export heads, during a block."""
     receiver, sender = chosen.receiver, None
     async with asyncio.TaskGroup() as group:
         tasks = []

@@ -1,11 +1,11 @@
 """Emergency orders of people: one per person, until it is withdrawn.
 
 An order that a person repeats merges with the active one and is neither recorded nor sent again, so
-that a program that repeats it hundreds of times a second fills neither the store nor the event
-list. If a person's order is withdrawn while they (or a program with their token) keep repeating it,
-or by others five times within ten minutes, there is a pause before that person's next order is
-accepted; nobody else is affected. The first order of a person is never refused, nor is the first
-one after another person has withdrawn theirs.
+that a program that repeats it hundreds of times a second cannot fill the store or the event list.
+If a person's order is withdrawn while they (or a program with their token) keep repeating it, or by
+others five times within ten minutes, there is a pause before that person's next order is accepted;
+nobody else is affected. The first order of a person is never refused, nor is the first one after
+another person has withdrawn theirs.
 """
 
 import math
@@ -17,22 +17,22 @@ from heliotrope.plant import refusals
 from heliotrope.plant.emergency.standing import Call
 from heliotrope.safety import Act
 
-#: An order is being repeated if it was given this often within a time, s.
+#: An order counts as being repeated if it was given this often within a time, s.
 REPEATED, REPEATED_SPAN = 10, 10.0
-#: The first pause, s; each later one is twice as long, up to the longest.
+#: The first pause, s; each later pause is twice as long, up to the longest.
 PAUSE, LONGEST_PAUSE = 30.0, 480.0
-#: Withdrawals by others after which a person pauses: with fewer, the person may know of something.
+#: Withdrawals by others after which a person must pause; after fewer, the person may have a reason.
 MOST_WITHDRAWN = 5
 #: Withdrawals count for this long after the last one, s.
 REMEMBERED = 600.0
-#: Reasons of one order that are kept.
+#: Number of reasons stored for one order.
 MOST_REASONS = 5
 _BETWEEN = "; "
 
 
 @dataclass
 class _History:
-    """What is remembered of a person: when they gave their order, and what became of it."""
+    """What is remembered about a person: when they gave their order, and what became of it."""
 
     given: deque[float] = field(default_factory=lambda: deque(maxlen=REPEATED))
     merged: int = 0
@@ -42,12 +42,12 @@ class _History:
 
 
 class Callers:
-    """The persons whose emergency orders stand.
+    """The persons whose emergency orders are active.
 
     Parameters
     ----------
     calls
-        Orders that stood when the last program ended.
+        Orders that were active when the last program ended.
     """
 
     def __init__(self, calls: Iterable[Call] = ()) -> None:
@@ -56,18 +56,18 @@ class Callers:
 
     @property
     def calls(self) -> tuple[Call, ...]:
-        """The orders that stand, one for each person."""
+        """The active orders, one for each person."""
         return tuple(self._calls.values())
 
     def pause(self, who: str, now: float) -> float:
-        """Return the time until an order of a person is taken, s; 0 if it is taken now."""
+        """Return the time until an order of a person is accepted, s; 0 if it is accepted now."""
         history = self._histories.get(who)
         if history is None or who in self._calls:
             return 0.0
         return max(0.0, history.until - now)
 
     def take(self, who: str, act: Act, reason: str, at: float, now: float) -> bool:
-        """Take an order of a person.
+        """Accept an order of a person.
 
         Parameters
         ----------
@@ -78,12 +78,12 @@ class Callers:
 
         Returns
         -------
-        Whether it is more than what stands.
+        Whether it goes beyond the active order.
 
         Raises
         ------
         RefusedError
-            If the person pauses.
+            If the person must pause.
         """
         if (wait := self.pause(who, now)) > 0.0:
             raise refusals.EMERGENCY_PAUSED.error(who=who, wait=math.ceil(wait))
@@ -107,7 +107,7 @@ class Callers:
 
         Returns
         -------
-        What people should know: how often it was repeated, and when the next one is taken.
+        What the operator should know: how often it was repeated, and when the next one is accepted.
         """
         self._calls.pop(who, None)
         self._histories = {

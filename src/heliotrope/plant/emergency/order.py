@@ -23,9 +23,9 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Act, Proof, ProofReport
 
-#: An axis this close to the goal of its defocus (rad) has taken the beam off the receiver.
+#: An axis this close to its defocus goal (rad) has taken the beam off the receiver.
 NEAR = 5e-3
-#: A heliostat on its way to stow has left the receiver this long (s) after the order.
+#: A heliostat on its way to stow has left the receiver by this time (s) after the order.
 LEAVING = 5.0
 
 Mask = npt.NDArray[np.bool_]
@@ -61,7 +61,7 @@ class EmergencyOrder:
     ) -> None:
         self.act, self.who, self.reason, self.at, self.ticket = act, who, reason, at, ticket
         self._proof = Proof.of(act.name, ticket.heliostats, at, flux_measured=flux_measured)
-        # A proof is a value, so reports of a whole field are added to it together.
+        # A proof is an immutable value, so the reports of a whole field are added to it together.
         self.unknown: dict[str, str] = {}
         self._acknowledged: dict[str, float] = {}
         self._done: dict[str, float] = {}
@@ -75,7 +75,7 @@ class EmergencyOrder:
         return self._proof
 
     def take_flux(self, share: float, at: float) -> None:
-        """Take a flux reading, as a fraction of the nominal flux."""
+        """Accept a flux reading, as a fraction of the nominal flux."""
         self._proof = self.proof.with_flux(share, at)
 
     def is_acknowledged(self, heliostat: str) -> bool:
@@ -93,7 +93,7 @@ class EmergencyOrder:
     def take_back(
         self, names: tuple[str, ...], rows: npt.NDArray[Any], heard: npt.NDArray[np.float64]
     ) -> tuple[str, ...]:
-        """Return those of K heliostats that carried out the order but have moved back since.
+        """Return which of K heliostats carried out the order but have moved back since.
 
         They no longer count as done. A row (`NODE`) from before the order is ignored.
         """
@@ -114,11 +114,11 @@ class EmergencyOrder:
         return report.with_evidence(self.proof.done, shown)
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
-        """Return those of some heliostats that have not acknowledged the order."""
+        """Return which of some heliostats have not acknowledged the order."""
         return tuple(name for name in heliostats if not self.is_acknowledged(name))
 
     def take_stage(self, heliostats: tuple[str, ...], stage: Stage, now: float) -> None:
-        """Take a cluster's report on the order."""
+        """Accept a cluster's report on the order."""
         if stage is Stage.ACKNOWLEDGED:
             for name in heliostats:
                 self._acknowledged.setdefault(name, now)
@@ -137,7 +137,7 @@ class EmergencyOrder:
         mismatched: Mask,
         shining: Mask,
     ) -> None:
-        """Take the state of heliostats (K,): rows of `NODE`, the time they apply to, and drives.
+        """Accept the state of heliostats (K,): rows of `NODE`, their time of validity, and drives.
 
         Step counts (``counted``) from before the order prove nothing, because they do not show
         where the beam is now.
@@ -158,7 +158,7 @@ class EmergencyOrder:
 
 
 def switched_off(flags: npt.NDArray[Any]) -> Mask:
-    """Return whether drives are switched off at the mirror, away from stow: it cannot obey."""
+    """Return a mask of drives switched off at the heliostat away from stow, which cannot obey."""
     return np.asarray((flags & meanings.LOCAL_SWITCH != 0) & (flags & meanings.AT_STOW == 0))
 
 
@@ -182,7 +182,7 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     rows
         As the clusters report them.
     drives
-        Of these heliostats, (K, 2).
+        Drives of these heliostats, (K, 2).
     settled
         Whether a heliostat on its way to stow has had enough time to leave the receiver, (K,).
     """
@@ -194,6 +194,6 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     counts = np.stack([rows["primary"], rows["secondary"]], axis=-1).astype(np.float64)
     goals = np.stack([rows["primary_goal"], rows["secondary_goal"]], axis=-1).astype(np.float64)
     remaining = np.abs((goals - counts) * drives.radians_per_count(counts)).max(axis=-1)
-    # On the way to stow the goal is far away, although the beam has left.
+    # On the way to stow the goal is far away, although the beam has already left.
     leaving = rows["state"] == states.STOWING
     return np.asarray(stowed | (off & known & np.where(leaving, settled, remaining < NEAR)))

@@ -34,19 +34,20 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act, Alarm
 from heliotrope.store.records import StoreError
 
-#: A heliostat that was sent off the receiver shows it within this time, s.
+#: A heliostat that was ordered off the receiver reports it within this time, s.
 OFF_SHOWS = 10.0
-#: Longest pause between two orders to one heliostat that does not show them, s.
+#: Longest pause between two orders to one heliostat whose reports do not show them, s.
 LONGEST_PAUSE = 60.0
-#: Row for heliostats that an emergency left unconfirmed.
+#: Row for heliostats whose completion an emergency left unconfirmed.
 UNPROVEN = "unproven_after_emergency"
-#: A heliostat that was proven after its emergency is shown to the table for this long, s.
+#: A heliostat that was confirmed after its emergency is reported to the table for this long, s.
 _PROVEN_SHOWS = 5.0
-#: Pause between two records of a proof that goes on, s.
+#: Interval between two records of a proof in progress, s.
 _KEEP_PERIOD = 1.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
-#: Name and role in the record of an emergency that a new program continues: nobody orders it then.
+#: Name and role in the record of an emergency that a new program continues, because nobody orders
+#: it then.
 _AGAIN = ("plant", "plant")
 #: Name and role of the night in a record.
 _NIGHT = ("the sun is down", "plant")
@@ -60,7 +61,7 @@ class Sentinel(Part):
     table
         The plant's rows of the safety table.
     orders, joining, watch
-        Those of the plant.
+        Parts of the plant.
     repeat
         Pause between repetitions of an order, s.
     identities
@@ -102,10 +103,11 @@ class Sentinel(Part):
         self._record, self._kept_at = record, -math.inf
         self._kept = self._recalled = Standing() if record is None else _recall(record)
         self._callers = Callers(self._recalled.calls)
-        #: Heliostats that an emergency left unproven, and when each was proven, monotonic s.
+        #: Heliostats that an emergency left unconfirmed, and when each was confirmed, monotonic s.
         unproven = set() if self._recalled.act else set(self._recalled.unproven) & set(field.names)
         self._unproven = dict.fromkeys(sorted(unproven), math.inf)
-        #: The order of the program before that these did not prove; reports from now on prove it.
+        #: The previous program's order, which these heliostats did not prove; reports from now on
+        #: prove it.
         self._before = _left_order(self._recalled, tuple(self._unproven), clock)
         known = {"", *field.names, *field.clusters}
         table.recall(row for row in self._recalled.rows if row[1] in known)
@@ -113,12 +115,13 @@ class Sentinel(Part):
         self._orders, self._joining, self._watch = orders, joining, watch
         self._repeat, self._identities = repeat, identities
         self._drive_checks = drive_checks
-        #: The strongest act that each cluster was sent as a whole, while it holds.
+        #: The strongest act that each cluster was sent as a whole, while the act is in force.
         self._acts: dict[str, Act] = {}
-        #: Orders to single heliostats while their rows hold: number, and time of the next.
+        #: Orders to single heliostats while their rows are tripped: number, and time of the next
+        #: order.
         self._tries: dict[str, tuple[int, float]] = {}
         self._repeated_at = -math.inf
-        #: Alarms of orders since the last beat.
+        #: Alarms about orders since the last beat.
         self._news: list[Alarm] = []
 
     # -- the table -------------------------------------------------------------------------
@@ -142,7 +145,8 @@ class Sentinel(Part):
     def _obey_field(self, now: float) -> None:
         demanded, caused = self.table.demanded(), self.table.caused()
         order = self.order
-        # A consequence of an emergency may make it worse, but begins none: it would never end.
+        # A consequence of an emergency may make it worse but must not begin one, which would never
+        # end.
         if demanded is not None and demanded >= Act.DEFOCUS and (caused or self.on):
             if not self.on or order is None or demanded > order.act:
                 self._begin_again(demanded)
@@ -155,7 +159,7 @@ class Sentinel(Part):
             self._joining.drop(self.table.reasons(Act.HOLD))
 
     def _obey_night(self) -> None:
-        """Send the field to stow when the sun goes down, in turn, as an ordinary STOW."""
+        """Send the field to stow at sunset, heliostats in turn, as an ordinary STOW."""
         before, self.night = self.night, self.table.night()
         if self.night and not before:
             self._joining.drop(self.night)
@@ -178,10 +182,10 @@ class Sentinel(Part):
                 self._watch.proofs.ledger.follows_loss(members)
 
     def _obey_heliostats(self, now: float) -> None:
-        """Send heliostats off, and send them again until their rows release.
+        """Order heliostats off, and repeat the order until their rows release.
 
-        A heliostat that has just been sent off has the time to show it, unless DEFOCUS has turned
-        it already: its beam stays where it may not be until it is stowed.
+        A heliostat that has just been ordered off has time to report it, unless DEFOCUS has already
+        turned it; in that case its beam stays where it may not be until it is stowed.
         """
         ordered_off = {**self.table.off(), **self._identities.off(now)}
         self._tries = {name: tried for name, tried in self._tries.items() if name in ordered_off}
@@ -215,9 +219,9 @@ class Sentinel(Part):
     def _begin(
         self, act: Act, giver: tuple[str, str], reason: str, who: str = ""
     ) -> EmergencyOrder:
-        """Order DEFOCUS or STOW of the whole field; ``giver`` is a name and a role in the record.
+        """Order DEFOCUS or STOW of the whole field; ``giver`` is a name and a role for the record.
 
-        ``who`` gave the order that this one continues, if it continues one.
+        ``who`` gave the order that this order continues, if it continues one.
         """
         now, names = self._clock.monotonic(), self._field.names
         ticket = self._orders.accept((*giver, act.name), (), names, reason, late=True)
@@ -232,7 +236,7 @@ class Sentinel(Part):
 
     @property
     def _proving(self) -> EmergencyOrder | None:
-        """The order that reports prove now: the last one, or the one of the previous program."""
+        """The order that reports prove now: the last one, or that of the previous program."""
         return self.order or self._before
 
     @property
@@ -299,19 +303,19 @@ class Sentinel(Part):
         return told
 
     def _keep(self, now: float) -> None:
-        """Keep what stands, for the next program; a proof that goes on, once in a while."""
+        """Store the emergency for the next program; a proof in progress, only at intervals."""
         if self._record is None or (self._recalled.act and not self.on):
             return
         standing = self._standing()
         changed = replace(standing, unproven=()) != replace(self._kept, unproven=())
         if standing == self._kept or not (changed or now - self._kept_at >= _KEEP_PERIOD):
             return
-        with contextlib.suppress(StoreError):  # it is tried again, and the store's alarm says why
+        with contextlib.suppress(StoreError):  # it is retried, and the store's alarm tells why
             self._record.keep_emergency(standing.document)
             self._kept, self._kept_at = standing, now
 
     def _not_done(self) -> tuple[str, ...]:
-        """Return the heliostats that are not proven to have carried out the last order."""
+        """Return the heliostats not proven to have carried out the last order."""
         order = self.order
         return () if order is None else tuple(sorted(order.proof.nodes - order.proof.done.keys()))
 
@@ -348,7 +352,7 @@ class Sentinel(Part):
         An ordinary STOW of a large number goes ``in_turn``, but at once while an emergency is
         active.
         """
-        # Short of an emergency, the table sends off those that something is wrong with.
+        # Short of an emergency, the table orders off heliostats with a problem.
         ticket = self._orders.accept(
             (*giver, act.name), (), heliostats, note, late=True, fault=giver is _TABLE
         )
@@ -365,9 +369,9 @@ class Sentinel(Part):
         self._repeat_order([cluster])
 
     def _repeat_order(self, clusters: Iterable[str]) -> None:
-        """Send the order again to heliostats that have not acknowledged it, while it holds.
+        """Send the order again to heliostats that have not acknowledged it, while it is in force.
 
-        While its ticket is open, `PlantOrders` repeats it as it repeats every other one.
+        While its ticket is open, `PlantOrders` repeats it like any other order.
         """
         order = self.order
         if order is None or not self.on or not order.ticket.finished:
@@ -379,7 +383,7 @@ class Sentinel(Part):
     # -- proof -----------------------------------------------------------------------------
 
     def put(self, name: str, value: float, at: float, subject: str = "") -> None:
-        """Take a sensor reading for the table, or for the proof; see `TableWatch.put`."""
+        """Accept a sensor reading for the table, or for the proof; see `TableWatch.put`."""
         self.table.put(name, value, at, subject)
         if name == FLUX_READING and self.order is not None:
             self.order.take_flux(value, at)
@@ -387,7 +391,7 @@ class Sentinel(Part):
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Take a cluster's report on a ticket, if the ticket belongs to the order.
+        """Accept a cluster's report on a ticket, if the ticket belongs to the order.
 
         If the plant has receivers, a cluster's report that the order is done counts only as an
         acknowledgement; whether the beam is off follows from the step counts in the next status,
@@ -455,12 +459,12 @@ class Sentinel(Part):
                 self._unproven[name] = min(self._unproven[name], now)
 
     def _doubted(self, heliostat: str) -> str | None:
-        """Return the reason why a heliostat's reports prove nothing of its beam, if any."""
+        """Return why a heliostat's reports prove nothing about its beam, None if they count."""
         untrusted = self._identities.untrusted(heliostat)
         return untrusted or self._drive_checks.stalled.get(heliostat)
 
     def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
-        """Send heliostats off again that have come back while the emergency holds."""
+        """Order heliostats off again that have come back while the emergency is active."""
         index = np.array([self._field.index[name] for name in names], dtype=np.intp)
         back = order.take_back(names, self._field.rows[index], self._field.heard[index])
         if back:
@@ -469,7 +473,7 @@ class Sentinel(Part):
             )
 
     def _last_of(self, row: int, now: float) -> str:
-        """Return, in words, where a heliostat with unknown step counts was last."""
+        """Return, in words, where a heliostat with unknown step counts was last reported."""
         field, points = self._field, self._watch.proofs.points
         text = (
             f"{field.names[row]}: its step counts are unknown, so its beam is not proven to be "
@@ -498,7 +502,7 @@ def _said(causes: Mapping[str, str]) -> str:
 
 
 def _left_order(before: Standing, unproven: tuple[str, ...], clock: Clock) -> EmergencyOrder | None:
-    """Return the order that heliostats have yet to prove after a restart, None if none has."""
+    """Return the order that heliostats have yet to prove after a restart, None if there is none."""
     if not unproven:
         return None
     ticket = Ticket("", before.left_by, unproven, clock, math.inf)
@@ -509,9 +513,9 @@ def _left_order(before: Standing, unproven: tuple[str, ...], clock: Clock) -> Em
 
 
 def _recall(record: EmergencyRecord) -> Standing:
-    """Return the emergency that stood when the last program ended."""
+    """Return the emergency that was active when the last program ended."""
     try:
         document = record.emergency()
     except StoreError as error:
-        document = str(error)  # no document: it reads as an emergency, which is the safe side
+        document = str(error)  # an invalid document is read as an emergency, which is the safe side
     return read_standing(document)

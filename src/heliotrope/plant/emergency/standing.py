@@ -8,7 +8,7 @@ from typing import Protocol
 
 from heliotrope.safety import Act
 
-#: Reason of the emergency in which a plant begins that cannot read its record.
+#: Reason of the emergency with which a plant starts if it cannot read its record.
 _UNREADABLE = "the record of the last emergency cannot be read"
 
 
@@ -87,12 +87,12 @@ class Standing:
 
     @property
     def document(self) -> str:
-        """The document that the store keeps, empty if there is nothing to keep."""
+        """The document that the store keeps, empty if there is nothing to store."""
         return "" if self == Standing() else json.dumps(asdict(self))
 
     @property
     def giver(self) -> str:
-        """The people whose orders are active; without any, whoever gave the field-wide order."""
+        """The persons whose orders are active; if none, whoever gave the field-wide order."""
         return ", ".join(call.who for call in self.calls) or self.who
 
     @property
@@ -115,7 +115,8 @@ def read_standing(document: str) -> Standing:
         rows = tuple((str(row), str(subject)) for row, subject in fields["rows"])
         unproven = _names(fields["unproven"])
         act, who, reason = (str(fields[key]) for key in ("act", "who", "reason"))
-        # A record of an older edition does not say which order: STOW is harder to prove.
+        # A record of an older version does not name the order: assume STOW, which is harder to
+        # prove.
         left_by = str(fields.get("left_by", "STOW" if unproven and not act else ""))
         for name in filter(None, (act, left_by)):
             if Act[name] not in (Act.DEFOCUS, Act.STOW):

@@ -52,21 +52,21 @@ OWN_READINGS = frozenset(
         "pointing_errors",
     }
 )
-#: Row for emergency orders by people.
+#: Row for operators' emergency orders.
 ORDERED = "operator_emergency"
-#: Row of the night: the field rests at stow, and that is no emergency.
+#: Row of the night, when the field rests at stow without an emergency.
 NIGHT = "sun_below_horizon"
-#: Rows that follow from an emergency; by themselves they keep none going.
+#: Rows that follow from an emergency; on their own they do not keep one active.
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
-#: Readings that the plant makes of a sensor's, and the sensor.
+#: Readings that the plant derives from a sensor reading, and the sensor reading.
 DERIVED = {"flux_after_emergency": FLUX_READING}
 #: Direct normal irradiance, W/m², for the schedule and for operators.
 DNI_READING = "dni"
-#: Readings of sensors that are in no row.
+#: Sensor readings that no row uses.
 _IN_NO_ROW = frozenset({DNI_READING, *DERIVED.values()})
-#: Age from which a reading is no longer shown, s.
+#: Age above which a reading is no longer displayed, s.
 _SHOWN = 60.0
-#: Pause between two computations of the sun's elevation, s.
+#: Interval between two computations of the sun's elevation, s.
 SUN_PERIOD = 5.0
 
 
@@ -76,7 +76,7 @@ class PlantReadings:
     Parameters
     ----------
     field, authority, orders, watch, agreement
-        Those of the plant.
+        Parts of the plant.
     sun
         Function that returns the unit vector to the sun now, (3,).
 
@@ -160,7 +160,7 @@ class TableWatch:
     rows
         Names of the rows that are evaluated.
     unwatched
-        Names of the rows without a reading, which are not evaluated; the operator must be told.
+        Names of the rows without a reading, which are not evaluated; the operator must be informed.
     actions
         Actions of the last evaluation, the strongest first.
 
@@ -207,7 +207,7 @@ class TableWatch:
         return FLUX_READING in self._sensors
 
     def put(self, name: str, value: float, at: float, subject: str = "") -> None:
-        """Take a sensor reading, measured at ``at`` (monotonic s).
+        """Accept a sensor reading, measured at ``at`` (monotonic s).
 
         Raises
         ------
@@ -274,7 +274,7 @@ class TableWatch:
     def standing(self) -> tuple[tuple[str, str], ...]:
         """Return the rows that persist across a restart, each with its subject.
 
-        These keep the beams of the whole field off, or wait for acknowledgement.
+        These rows keep the beams of the whole field off, or wait for acknowledgement.
         """
         latched = {row.name for row in self._state.table if row.latched}
         off = {
@@ -299,7 +299,7 @@ class TableWatch:
         return max((a.act for a in self._demands(cluster)), default=None)
 
     def _demands(self, cluster: str = "") -> Iterator[Action]:
-        """Yield the actions about the field, or about one cluster alone, but those of the night."""
+        """Yield the actions for the field, or for one cluster alone, except those of the night."""
         scope = Scope.CLUSTER if cluster else Scope.FIELD
         return (
             a
@@ -320,7 +320,7 @@ class TableWatch:
         }
 
     def blocked(self, condition: str = "") -> dict[str, str]:
-        """Return the heliostats that one row, or any, keeps from their aims, with the reasons."""
+        """Return the heliostats that one row, or any, keeps from their aims, and the reasons."""
         return {
             a.subject: a.text
             for a in self.actions
@@ -347,7 +347,7 @@ class TableWatch:
         return "; ".join([a.text for a in demands if a.act >= least and a.condition != but][:3])
 
     def withdrawn(self) -> str:
-        """Return how an emergency ordered by people ends, empty if there is none.
+        """Return how an emergency ordered by operators ends, empty if there is none.
 
         For an emergency whose orders have all been withdrawn.
         """

@@ -37,19 +37,19 @@ from heliotrope.sun import Site, fast_vector
 
 #: Pause between two checks of the pointing, s.
 CHECK_PERIOD = 2.0
-#: Errors from here on (rad) are handed to the safety table.
+#: Errors above this (rad) are passed to the safety table.
 NOTED = 1e-3
-#: Most heliostats that are named; with more, the field is the subject.
+#: Largest number of heliostats that are named; above it, the alarm is about the field.
 MOST_NAMED = 150
-#: Step counts count from this time after a beam was first seen to be sent to its point, s.
+#: Step counts are used from this time after a beam was first seen to be sent to its point, s.
 _SETTLE = 1.0
-#: An axis that comes nearer to its goal by this between two looks is on its way, rad.
+#: An axis that comes closer to its goal by this much between two checks is on its way, rad.
 _CLOSING = 1e-4
-#: The motion of the sun is taken over this time, s.
+#: The motion of the sun is computed over this time, s.
 _SPAN = 10.0
-#: Longest time that a command of `messages.STANDS` is under way to its heliostat, s.
+#: Longest time from sending a command of `messages.STANDS` to its arrival at the heliostat, s.
 _UNDER_WAY = 15.0
-#: States from which a heliostat that is ready comes to IDLE by following its standby point.
+#: States from which a ready heliostat comes to IDLE by tracking its standby point.
 _COMES = (states.APPROACHING, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
 
 Rows = npt.NDArray[np.intp]
@@ -61,16 +61,16 @@ class _Points:
     Parameters
     ----------
     points
-        ENU, m, (N, 3); NaN where there is none; assigned by others.
+        ENU, m, (N, 3); NaN if there is none; other parts assign them.
     before
-        The points before that were not replaced for certain when the plant's program began.
+        The earlier points that may still have been in force when the plant's program started.
 
     Attributes
     ----------
     before
-        The points before the assigned ones, the latest first, (`assigned.BEFORE`, N, 3); NaN from
-        where the beam was found: an assigned point may be refused by the local controller, and
-        then the beam goes on to one before.
+        The points before the assigned ones, latest first, (`assigned.BEFORE`, N, 3); NaN from the
+        point at which the beam was found. They are kept because a local controller may refuse an
+        assigned point, and then the beam stays at an earlier one.
     """
 
     def __init__(self, points: FloatArray, before: FloatArray) -> None:
@@ -86,7 +86,7 @@ class _Points:
         return changed
 
     def beside(self, rows: Rows, beam: FloatArray, vertex: FloatArray) -> FloatArray:
-        """Return the angle between beams (K, 3) and the nearest of their points, rad, (K,)."""
+        """Return the angle between beams (K, 3) and the nearest point of each, rad, (K,)."""
         error = _angle(beam, self.points[rows] - vertex)
         self.before[:, rows[error < NOTED]] = np.nan
         for points in self.before[:, rows]:
@@ -101,15 +101,15 @@ class Agreement(Part):
     Parameters
     ----------
     field, ledger, points
-        State of the field; what was ordered; assigned aims.
+        State of the field; orders sent; assigned aims.
     check
-        Mirrors as the plant knows them at its start.
+        Heliostats as the plant knows them at start-up.
     site
         Site of the plant.
     utc
-        Returns the plant's time, POSIX s.
+        Function that returns the plant's time, POSIX s.
     differing
-        Returns why a heliostat does not store the wanted parameters, None if it does.
+        Function that returns why a heliostat does not store the wanted parameters, None if it does.
     """
 
     def __init__(
@@ -132,21 +132,22 @@ class Agreement(Part):
         self._time_off = dict.fromkeys(field.clusters, 0.0)
         self._sun_off = dict.fromkeys(field.clusters, 0.0)
         count = len(field)
-        #: States at the last look; those whose beams are sent to aims and to standby points.
+        #: States at the last check, and which beams are sent to aims and to standby points.
         self._states = np.full(count, -1, dtype=np.int64)
         self._on_aim, self._at_rest = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        #: Since when they are, and to the present points, monotonic s.
+        #: Since when they have been sent to the present points, monotonic s.
         self._since = np.full(count, np.inf)
         #: Radius of the last search, rad.
         self._radius = np.full(count, np.nan)
         self._lag = np.full(count, np.inf)
-        #: Whether the axes stand beside their goals, by counts that came at a time, monotonic s.
+        #: Whether the axes stand away from their goals, and the time of the counts used, monotonic
+        #: s.
         self._stands, self._counted = np.zeros(count, dtype=bool), np.full(count, -np.inf)
         self._named_errors: dict[str, float] = {}
         self._at = -np.inf
 
     def believe(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
-        """Take new parameters, which hold once the local controller reports their checksum."""
+        """Accept new parameters, which apply once the local controller reports their checksum."""
         self._pending[row] = crc32(packed("armature", tuple(armature))), armature, drives
 
     def on_sent(
@@ -157,16 +158,16 @@ class Agreement(Part):
         now: float,
         again: bool,
     ) -> None:
-        """Note how far a command that has been sent lets beams go."""
+        """Note how far a command that was sent may move beams from their points."""
         del now, again
         if name == "SEARCH":
             rows = np.array([self._field.index[name] for name in heliostats], dtype=np.intp)
-            # One that searches already goes on with its spiral if it refuses the new one.
+            # A heliostat that is already searching continues its spiral if it refuses the new one.
             searches = self._field.rows["state"][rows] == states.SEARCHING
             self._radius[rows] = np.fmax(values[1], np.where(searches, self._radius[rows], np.nan))
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Take the time and the site that a cluster reports."""
+        """Accept the time and the site that a cluster reports."""
         del now
         utc_s = self._utc()
         if status.time_quality != "none":
@@ -175,9 +176,10 @@ class Agreement(Part):
             self._sun_off[cluster] = _sun_off(status.site, self._site, utc_s)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
-        """Return the differences of clusters and of heliostats; all others agree.
+        """Return the differences of clusters and of heliostats; all those not listed agree.
 
-        A cluster that has fallen silent keeps its last difference: its silence has its own row.
+        A cluster that has fallen silent keeps its last difference, because a separate row covers
+        silence.
         """
         if now - self._at >= CHECK_PERIOD:
             self._check(now)
@@ -208,7 +210,7 @@ class Agreement(Part):
         kinds = ((self._on_aim, self._aims), (self._at_rest, self._standbys))
         error = np.zeros(len(field))
         for mine, sent in kinds:
-            # Counts from before a new point say nothing about it.
+            # Counts from before a new point say nothing about the new point.
             newer = field.counted_at >= self._since + _SETTLE
             known = np.isfinite(sent.points).all(axis=-1) & newer
             rows = np.flatnonzero(mine & known & field.sure(now))
@@ -220,11 +222,11 @@ class Agreement(Part):
         self._named_errors = {field.names[row]: float(error[row]) for row in worst}
 
     def _sort(self, now: float) -> Mask:
-        """Find which beams are sent to which points; return those for which that has changed."""
+        """Find which beams are sent to which points; return the heliostats whose point changed."""
         field = self._field
         live, state = field.live(now), field.rows["state"].astype(np.int64)
         ready = live & (state == states.IDLE) & (field.rows["flags"] & meanings.READY != 0)
-        # IDLE brings back one that is IDLE already and stands elsewhere.
+        # IDLE brings back a heliostat that is already IDLE but stands elsewhere.
         came = self._ledger.obeyed_since(TO_REST, self._at, after=messages.STANDS)
         stilled = self._ledger.sent_since(messages.STANDS, now - _UNDER_WAY)
         came |= np.isin(self._states, _COMES) & ~stilled
@@ -238,7 +240,7 @@ class Agreement(Part):
         return np.asarray(begins | ~(on_aim | at_rest))
 
     def _errors(self, rows: Rows, sent: _Points, now: float) -> FloatArray:
-        """Return the angle between each beam (K,) and its point, rad, by goals and counts."""
+        """Return the angle between each beam (K,) and its point, rad, from goals and counts."""
         field = self._field
         sun = self._sun_at(now - field.counted_at[rows])
         drives = Drive(self._drives[rows])
@@ -246,8 +248,8 @@ class Agreement(Part):
         present = np.asarray(drives.angles(field.counts(rows)))
         error = self._beside(rows, sent, ends, sun)
         lag = np.abs(ends - present).max(axis=-1)
-        # Axes that come no nearer to their goals stand where they are.
-        # In large fields counts are older than a check: the same counts say nothing new.
+        # Axes that come no closer to their goals stand where they are. In large fields, counts may
+        # be older than the last check; unchanged counts give no new information.
         newer = field.counted_at[rows] > self._counted[rows]
         still = (lag > NOTED) & (lag > self._lag[rows] - _CLOSING)
         stands = np.where(newer, still, self._stands[rows])
@@ -259,14 +261,14 @@ class Agreement(Part):
         return error
 
     def _sun_at(self, ages: FloatArray) -> FloatArray:
-        """Return the vectors to the sun some time ago, (K, 3); ages (K,) in s."""
+        """Return the sun vectors some time ago, (K, 3); ages (K,) in s."""
         utc_s = self._utc()
         sun = fast_vector(utc_s, self._site)
         rate = (sun - fast_vector(utc_s - _SPAN, self._site)) / _SPAN
         return normalize(sun - rate * ages[:, None], "sun")
 
     def _beside(self, rows: Rows, sent: _Points, angles: FloatArray, sun: FloatArray) -> FloatArray:
-        """Return the angle between beams (K,), the axes at angles (K, 2), and their points, rad."""
+        """Return the angle between beams (K,), axes at angles (K, 2), and their points, rad."""
         normal, vertex = Armature(self._armature[rows]).pose(angles)
         beam = 2.0 * np.sum(sun * normal, axis=-1, keepdims=True) * normal - sun
         return sent.beside(rows, beam, vertex)
@@ -279,7 +281,7 @@ def _angle(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _sun_off(values: Sequence[float], site: Site, utc_s: float) -> float:
-    """Return the angle between the suns of a reported site and of the plant's, rad."""
+    """Return the angle between the sun vectors of a reported site and of the plant's, rad."""
     if tuple(values) == site.numbers:
         return 0.0
     try:

@@ -20,23 +20,23 @@ from heliotrope.optics.standing import entered_over_the_year, standing_beams
 
 #: Length over which an unobstructed beam is followed, m.
 FAR = 3000.0
-#: Most light of all resting beams together at an eye, in suns: a look there is then no worse than a
-#: look at the sun, whatever the eye's limits are. No formula of glare is asked.
+#: Maximum light of all resting beams together at an eye, in suns. Looking there is then no worse
+#: than looking at the sun, whatever the limits of the eye are, so no glare formula is needed.
 MOST_SUNS = 1.0
 _ON_ITS_WAY = "on its way there"
-#: Room that the middle of a beam leaves about a receiver in an approach, m.
+#: Clearance between the central ray of a beam and a receiver during an approach, m.
 ROOM = 0.5
-#: A mirror whose beam is the middle of every beam: the image of the sun alone. A whole beam may
-#: graze a receiver's edge: with all its width and errors, one heliostat in ten of a small field,
-#: whose beams rest close beside the receiver, would never find a way to standby.
+#: A mirror whose beam is only the image of the sun, that is, the core of every beam. A whole beam
+#: may graze a receiver's edge. With the full width and errors of the beams, one heliostat in ten of
+#: a small field, whose beams rest close beside the receiver, would never find a path to standby.
 _MIDDLE = MirrorOptics.of(1e-3, 1e-3, error=0.0)
 
 
 def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
     """Assign an aim point to each heliostat, (N, 3), with each point used equally often.
 
-    Heliostats that are adjacent in azimuth about the points get different points, so that a cloud
-    or the loss of a cluster affects all points equally.
+    Heliostats that are adjacent in azimuth about the points are assigned different points, so that
+    a cloud or the loss of a cluster affects all points equally.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def default_aims(
 
 
 class BeamCheck:
-    """Checks beams, computed from the mirrors, against keep-out volumes and people's eyes.
+    """Checks beams, computed from the heliostats' mechanisms, against keep-out volumes and eyes.
 
     Parameters
     ----------
@@ -163,15 +163,16 @@ class BeamCheck:
         self.mirrors = MirrorOptics.of(*sizes)
 
     def replace(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
-        """Take a heliostat's new calibration: arrays (18,) and (2, 19)."""
+        """Use a heliostat's new calibration: arrays (18,) and (2, 19)."""
         self.armature.table[row] = armature
         self.drives.table[row] = drives
         self._stop(row)
 
     def _stop(self, row: int) -> None:
-        """Take the limits of the machine as stops: the local controller chooses the pose by them.
+        """Use the limits of the machine as stops, as the local controller does for its pose.
 
-        Without stops the pose nearest to the present one may be another than the mirror takes.
+        Without stops, the pose nearest to the present one may differ from the pose that the
+        heliostat takes.
         """
         machine, table = self.machines.get(self.names[row]), self.drives.table[row]
         for i, axis in enumerate(() if machine is None else machine.axes):
@@ -185,11 +186,11 @@ class BeamCheck:
         sun: FloatArray,
         counts: FloatArray | None = None,
     ) -> Tracking:
-        """Return the poses for aims (K, 3) of heliostats (K,), those nearest to counts (K, 2).
+        """Return the poses for aims (K, 3) of heliostats (K,) that are nearest to counts (K, 2).
 
         The sun vector is (3,) or (K, 3).
         """
-        # At night nothing moves; the pose for an overhead sun shows the beam's way just as well.
+        # At night nothing moves; the pose for an overhead sun shows the beam's path just as well.
         source = np.where(sun[..., 2:] > 0.0, sun, np.array([0.0, 0.0, 1.0]))
         return track(
             Armature(self.armature.table[rows]),
@@ -200,7 +201,7 @@ class BeamCheck:
         )
 
     def stop(self, row: int, aim: FloatArray, sun: FloatArray, counts: FloatArray) -> str:
-        """Return the stop that keeps a heliostat from an aim (3,), and the remedy.
+        """Return the stop that prevents a heliostat from aiming at a point (3,), and the remedy.
 
         The sun vector is (3,), and the pose is the one nearest to counts (2,).
         """
@@ -278,7 +279,7 @@ class BeamCheck:
         """Return the heliostats whose resting beams would dazzle a person, and the reasons.
 
         All resting beams together must stay below `MOST_SUNS` there; if they do not, every
-        heliostat that shines into the eye is named.
+        heliostat whose light reaches the eye is named.
 
         Parameters
         ----------
@@ -286,8 +287,8 @@ class BeamCheck:
             Heliostats (K,) and their new standby points, ENU, m, (K, 3).
         possible
             Standby points that local controllers may have now, and the heliostats concerned; see
-            `Points.possible`. A heliostat counts with the standby point from which an eye receives
-            most.
+            `Points.possible`. For each heliostat, the standby point that sends the most light to an
+            eye counts.
         sun
             Sun vector, (3,).
         """
@@ -413,7 +414,7 @@ class BeamCheck:
     ) -> dict[str, str]:
         """Return the heliostats whose beams would cross a receiver on a path, and why.
 
-        For the arguments see `moving`. The check uses the middle of a beam; see `_MIDDLE`.
+        For the arguments see `moving`. The check uses the core of a beam; see `_MIDDLE`.
         """
         entered = self._on_receivers(rows, path, sun)
         return {
@@ -427,7 +428,7 @@ class BeamCheck:
     ) -> npt.NDArray[np.bool_]:
         """Return a mask of the beams on a receiver, (K,), with the axes at angles (K, 2).
 
-        For ``sun`` see `problems`; the check uses the middle of a beam.
+        For ``sun`` see `problems`; the check uses the core of a beam.
         """
         still = np.repeat(angles[:, None], 2, axis=1)
         return np.asarray(self._on_receivers(rows, still, sun).any(axis=-1))
@@ -435,7 +436,7 @@ class BeamCheck:
     def _on_receivers(
         self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return masks of the beams whose middles cross R receivers on a path, (K, R)."""
+        """Return masks of the beams whose cores cross R receivers on a path, (K, R)."""
         if not (len(rows) and self.solids and sun[..., 2].max() > 0.0):
             return np.zeros((len(rows), len(self.solids)), dtype=np.bool_)
         armature = Armature(self.armature.table[rows])
@@ -447,10 +448,10 @@ class BeamCheck:
         counts: FloatArray,
         tables: tuple[FloatArray, FloatArray] | None = None,
     ) -> dict[str, str]:
-        """Return the heliostats whose resting beams come too near something in a year, and why.
+        """Return the heliostats whose resting beams come too close to something in a year, and why.
 
-        That is a receiver, a target or a keep-out volume, with the heliostats at rest at counts (K,
-        2) and the sun at any position of the year. See also `Machine.stow_lights`.
+        The check covers receivers, targets and keep-out volumes, with the heliostats at rest at
+        counts (K, 2) and the sun at any position of the year. See also `Machine.stow_lights`.
 
         Parameters
         ----------
@@ -496,7 +497,7 @@ class BeamCheck:
         return standing_beams(vertex, normal, sun, mirrors, FAR)
 
     def inside(self, row: int, poses: FloatArray, sun: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return in which poses, axis angles (K, 2), the beam of a heliostat is in a volume.
+        """Return the poses, axis angles (K, 2), in which the beam of a heliostat is in a volume.
 
         For ``sun`` see `problems`.
         """
@@ -515,7 +516,7 @@ class BeamCheck:
         aims: FloatArray,
         sun: FloatArray,
     ) -> None:
-        """Add the volumes on the way from one point to another."""
+        """Add the volumes that beams cross on the way from one point to another."""
         before = self.poses(rows, start, sun)
         counts = before.best_counts
         after = self.poses(rows, aims, sun, counts)
@@ -558,7 +559,7 @@ def _rows_of(mirrors: MirrorOptics, rows: npt.NDArray[np.intp] | list[int]) -> M
 
 
 def _disc(eye: FloatArray, aim: FloatArray, radius: float, apart: float) -> FloatArray:
-    """Return points (P, 3) of the disc that a cone of half angle ``radius`` makes at the aim."""
+    """Return points (P, 3) of the disc at the aim that a cone of half angle ``radius`` covers."""
     ray = aim - eye
     distance = float(np.linalg.norm(ray))
     right = np.cross(ray, (0.0, 0.0, 1.0)) if ray[:2].any() else np.array([1.0, 0.0, 0.0])
@@ -573,5 +574,5 @@ def _disc(eye: FloatArray, aim: FloatArray, radius: float, apart: float) -> Floa
 
 
 def point_text(point: FloatArray) -> str:
-    """Return a point (3,), m, as an error names it."""
+    """Return a point (3,), m, in the form used in error messages."""
     return "(" + ", ".join(f"{x:.1f}" for x in point) + ")"

@@ -36,24 +36,24 @@ Places = dict[str, tuple[float, ...]]
 KINDS = tuple(sorted(messages.POINTS))
 #: Points before the assigned one that a local controller may still have.
 BEFORE = 4
-#: Kinds under which they are stored, the latest first.
+#: Kinds under which these earlier points are stored, latest first.
 EARLIER = {kind: tuple(f"{kind}-{i}" for i in range(1, BEFORE + 1)) for kind in KINDS}
 #: What visits hold, by kind: when they locked a heliostat (POSIX s, then zeros), the aim to which
-#: its beam goes back (ENU, m), and that it steps roughly when no visit needs it (zeros).
+#: its beam returns (ENU, m), and that it must return to rough steps when no visit needs it (zeros).
 HELD = ("LOCKED", "LENT", "ROUGH")
-#: A record of what no visit holds is removed after this time, s: the command that takes it may be
-#: on its way until then.
+#: A record of something that no visit holds is removed after this time, s. Until then, the command
+#: that takes it may be on its way.
 _TAKEN_WITHIN = 5.0
 VERSION = 1
 
 Rows = npt.NDArray[np.intp]
-#: Points by kind and heliostat; None: there is none any more.
+#: Points by kind and heliostat; None: there no longer is one.
 Held = Mapping[str, Mapping[str, tuple[float, ...] | None]]
 NOTHING: Held = MappingProxyType({})
 
 
 class AssignedError(HeliotropeError):
-    """Points that could not be stored."""
+    """Points could not be stored."""
 
 
 class Assigned(Protocol):
@@ -161,10 +161,10 @@ class Points:
     Attributes
     ----------
     aims, standbys
-        ENU, m, (N, 3); NaN where there is none.
+        ENU, m, (N, 3); NaN if there is none.
     earlier
-        By kind, the points before that a local controller may still have, the latest first,
-        (`BEFORE`, N, 3); NaN where there is none: the assigned point was taken.
+        By kind, the earlier points that a local controller may still have, latest first, (`BEFORE`,
+        N, 3); NaN if there is none, because the assigned point was acknowledged.
     held
         What visits held when the last program ended, by kind (`HELD`) and heliostat.
     """
@@ -177,14 +177,15 @@ class Points:
         every = self._arrays | {
             name: self.earlier[kind][i] for kind in KINDS for i, name in enumerate(EARLIER[kind])
         }
-        #: The points in the store; only work of the disk changes them.
+        #: The points in the store; only disk work changes them.
         self._stored: dict[str, Places] = {kind: {} for kind in (*every, *HELD)}
-        #: Since when a record of `HELD` has stood for nothing, monotonic s.
+        #: Since when a record of `HELD` has been without effect, monotonic s.
         self._idle: dict[tuple[str, str], float] = {}
-        #: Points that were taken since the store was last told, by kind, each with its mark.
+        #: Points acknowledged since the store was last updated, by kind, each with its mark.
         self._taken: dict[str, dict[str, tuple[tuple[float, ...], object]]]
         self._taken = {kind: {} for kind in KINDS}
-        #: Who stored the assigned point last, by kind: the same point may be given twice.
+        #: Who last stored the assigned point, by kind, because the same point may be assigned
+        #: twice.
         self._marks: dict[str, dict[str, object]] = {kind: {} for kind in KINDS}
         index = {name: row for row, name in enumerate(names)}
         for kind, places in ({} if store is None else store.read()).items():
@@ -196,14 +197,14 @@ class Points:
         self.held = {kind: dict(self._stored[kind]) for kind in HELD}
 
     def assign(self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray) -> None:
-        """Assign points (K, 3) to heliostats (K,); they must be stored (`storing`)."""
+        """Assign points (K, 3) to heliostats (K,), which must also be stored (`storing`)."""
         known = self._arrays[kind]
         changed = np.asarray(rows)[differ(known[rows], points)]
         put_before(self.earlier[kind], changed, known[changed])
         known[rows] = points
 
     def taken(self, kind: str, rows: npt.NDArray[np.intp]) -> None:
-        """Note that local controllers have the points that are assigned now; see `settling`."""
+        """Note that local controllers have acknowledged their assigned points; see `settling`."""
         self.earlier[kind][:, rows] = np.nan
         marks = self._marks[kind]
         for row, place in zip(rows, self._arrays[kind][rows].tolist(), strict=True):
@@ -213,16 +214,16 @@ class Points:
     def unknown(self, kind: str, rows: slice = slice(None)) -> npt.NDArray[np.bool_]:
         """Return a mask of the local controllers, all (N,) or some (K,), that may have any point.
 
-        The assigned one was not taken, and none before it is known: it was the first, or the store
-        is a restored backup.
+        The assigned point was not acknowledged, and no earlier one is known, because it was the
+        first or the store is a restored backup.
         """
         return np.asarray((self.earlier[kind][0, rows] == self._arrays[kind][rows]).all(axis=-1))
 
     def possible(self, kind: str, rows: npt.NDArray[np.intp]) -> list[tuple[Rows, FloatArray]]:
-        """Return where local controllers (K,) may send their beams.
+        """Return the points to which local controllers (K,) may send their beams.
 
-        First the assigned points, of those that have one; then the points before, of those that may
-        still have them.
+        The first entry holds the assigned points; the next entries hold the earlier points, for the
+        heliostats that may still have them.
         """
         choices = []
         for points in (self._arrays[kind], *self.earlier[kind]):
@@ -234,16 +235,17 @@ class Points:
     def storing(
         self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray, held: Held = NOTHING
     ) -> tuple[Work, Callable[..., None]]:
-        """Return work of a disk that stores points (K, 3) of heliostats (K,), and its reverse.
+        """Return disk work that stores points (K, 3) of heliostats (K,), and work that reverts it.
 
-        ``held`` is stored in the same piece; see `holding`. Both raise `AssignedError` if they
-        cannot be stored. The reverse leaves points alone that were replaced meanwhile; it may be
-        done again, and be called with the heliostats that it is about, by default all.
+        ``held`` is stored in the same write; see `holding`. Both raise `AssignedError` if storing
+        fails. The second leaves alone points that have been replaced in the meantime. It may be
+        repeated, and accepts the heliostats to revert, by default all of them.
         """
         new = {self._names[i]: tuple(p) for i, p in zip(rows, points.tolist(), strict=True)}
         present = self._arrays[kind][rows]
         known = np.isfinite(present).all(axis=-1)
-        # Where none is stored: the one that machines store, or the new one, not taken yet.
+        # If no point is stored: the one that the machines store, or the new one, not acknowledged
+        # yet.
         first = np.where(known[:, None], present, points).tolist()
         before = {self._names[i]: tuple(p) for i, p in zip(rows, first, strict=True)}
         kinds, mark = (kind, *EARLIER[kind]), object()
@@ -267,9 +269,9 @@ class Points:
         return store, take_back
 
     def settling(self) -> Work | None:
-        """Return work of a disk that forgets what came before points that were taken, if any.
+        """Return disk work that deletes the points before acknowledged ones, if there are any.
 
-        It raises `AssignedError` if that cannot be stored, and may be done again.
+        It raises `AssignedError` if that cannot be stored, and may be repeated.
         """
         if not any(self._taken.values()):
             return None
@@ -292,10 +294,10 @@ class Points:
         return settle
 
     def holding(self, held: Held) -> tuple[Work, Work]:
-        """Return work of a disk that stores what visits hold, and its reverse.
+        """Return disk work that stores what visits hold, and disk work that reverts it.
 
-        None means that a visit holds it no longer. Only what differs is written. Both raise
-        `AssignedError` if it cannot be stored.
+        None means that a visit no longer holds it. Only differences are written. Both raise
+        `AssignedError` if storing fails.
         """
         old: dict[str, dict[str, tuple[float, ...] | None]] = {}
 
@@ -313,9 +315,10 @@ class Points:
         return store, take_back
 
     def released(self, held: Mapping[str, Collection[str]], now: float) -> Work | None:
-        """Return work of a disk that forgets what visits hold no longer, if any.
+        """Return disk work that deletes records of what visits no longer hold, if there are any.
 
-        ``held`` are the heliostats of which they hold something, by kind; ``now`` is monotonic s.
+        ``held`` names the heliostats of which visits hold something, by kind; ``now`` is monotonic
+        s.
         """
         free = {(k, n) for k, names in held.items() for n in self._stored[k].keys() - set(names)}
         self._idle = {key: self._idle.get(key, now) for key in free}
@@ -338,15 +341,15 @@ class Points:
 
 
 def differ(a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a mask of the points (K, 3) that differ, (K,); NaN is like NaN."""
+    """Return a mask of the points (K, 3) that differ, (K,); NaN equals NaN."""
     return np.asarray(~np.all((a == b) | (np.isnan(a) & np.isnan(b)), axis=-1))
 
 
 def put_before(earlier: FloatArray, rows: npt.NDArray[np.intp], points: FloatArray) -> None:
     """Put points (K, 3) of heliostats (K,) before all earlier ones (`BEFORE`, N, 3).
 
-    The oldest stays, since it is the one that was taken; where there is no more room, the one after
-    it is forgotten.
+    The oldest point stays, because it is the one that was acknowledged; if there is no room, the
+    point after it is dropped.
     """
     oldest = earlier[-1, rows]
     full = np.isfinite(oldest).all(axis=-1, keepdims=True)
@@ -363,7 +366,7 @@ def _followed(
     if last == point:
         return chain
     last = before if last is None else last
-    if earlier[0] == last:  # only said that it was not taken yet
+    if earlier[0] == last:  # this only reports that it was not acknowledged yet
         earlier = [*earlier[1:], None]
     oldest = earlier[-2] if earlier[-1] is None else earlier[-1]
     return [point, last, *earlier[:-2], oldest]
@@ -381,7 +384,7 @@ def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
     Raises
     ------
     InputError
-        No points, one that is not finite, or one beyond the range of the wire.
+        If there are no points, or a point is not finite or beyond the range of the wire.
     """
     if not points:
         raise InputError(f"{kind}: no points; specify one for each heliostat")
@@ -395,7 +398,7 @@ def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
 
 
 def grouped(names: Sequence[str], points: FloatArray) -> dict[tuple[float, ...], list[str]]:
-    """Return the heliostats of each point (K, 3), which share one command."""
+    """Return the heliostats for each point (K, 3), which share one command."""
     groups: dict[tuple[float, ...], list[str]] = {}
     for name, point in zip(names, points, strict=True):
         groups.setdefault(tuple(float(x) for x in point), []).append(name)

@@ -20,7 +20,8 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.field.flights import Flights
 
-#: Stores sightings of a heliostat on a target; returns their numbers, (M,), 0 where it failed.
+#: Function that stores sightings of a heliostat on a target and returns their numbers, (M,), 0 on
+#: failure.
 Numbering = Callable[[str, str, Sightings], Identities]
 Subscriber = Callable[[HeliostatCalibration], None]
 
@@ -36,9 +37,10 @@ class KnownSightings:
     identities
         Numbers given by the store; 0 for a sighting that is not stored, (M,).
     targets
-        Name of the target of each, M.
+        Name of the target of each sighting, M.
     missed
-        Beam error under the mechanism believed when it was taken, rad, (M,); NaN if recalled.
+        Beam error under the mechanism that was believed when the sighting was taken, rad, (M,); NaN
+        if recalled.
     """
 
     sightings: Sightings
@@ -85,7 +87,7 @@ class Beliefs:
             subscriber(record)
 
     def subscribe_drift(self, subscriber: Subscriber) -> None:
-        """Call a function with each calibration whose covariance grows otherwise from now on."""
+        """Call a function with each calibration whose covariance growth changes from now on."""
         self._drifting.append(subscriber)
 
     def number_with(self, numbering: Numbering) -> None:
@@ -100,7 +102,7 @@ class Beliefs:
         return group.mechanism[np.array([row])]
 
     def present(self, heliostat: str) -> Mechanism:
-        """Return the mechanism that is believed now, batch shape (1,).
+        """Return the present believed mechanism, batch shape (1,).
 
         Before the first calibration it is the mechanism of the plant file, with its parameters.
         """
@@ -120,7 +122,7 @@ class Beliefs:
         return self._growth[heliostat]
 
     def hyper(self, heliostat: str) -> Hyperparameters | None:
-        """Return the hyperparameters of the heliostat's group; None while the defaults hold."""
+        """Return the hyperparameters of the heliostat's group; None while the defaults apply."""
         return self._hyper.get(heliostat)
 
     def known(self, heliostat: str) -> KnownSightings | None:
@@ -128,7 +130,7 @@ class Beliefs:
         return self._known.get(heliostat)
 
     def count(self, heliostat: str) -> int:
-        """Return the number of known sightings of a heliostat, by photograph and from the air."""
+        """Return the number of known sightings of a heliostat, photographed and airborne."""
         known = self._known.get(heliostat)
         return (0 if known is None else len(known)) + self.flights.count(heliostat)
 
@@ -142,9 +144,9 @@ class Beliefs:
     # -- taking --------------------------------------------------------------------------------
 
     def note(self, heliostat: str, target: str, new: Sightings) -> KnownSightings:
-        """Add sightings of a heliostat (row 0) on a target; return all that are known now.
+        """Add sightings of a heliostat (row 0) on a target; return all known sightings.
 
-        Sightings that the store could not keep before are offered to it again.
+        Sightings that the store failed to keep earlier are offered to it again.
         """
         missed = beam_errors(self.present(heliostat), new).beam
         added = KnownSightings(new, np.zeros(len(new), np.int64), (target,) * len(new), missed)
@@ -163,7 +165,7 @@ class Beliefs:
     def take(self, record: HeliostatCalibration) -> HeliostatCalibration:
         """Make a calibration the current one, pass it to all subscribers, and return it.
 
-        Its covariance grows from now on as its group drifts.
+        From now on its covariance grows with the drift of its group.
         """
         record = record.growing(self.growth(record.heliostat))
         self._records[record.heliostat] = record
@@ -172,10 +174,10 @@ class Beliefs:
         return record
 
     def adopt(self, group: str, hyper: Hyperparameters, source: str) -> None:
-        """Put the hyperparameters of a group of the design in force.
+        """Put the hyperparameters of a group of the design into force.
 
-        Later fits follow the drift by them, and the covariances of the present calibrations grow as
-        they say; the values of these stay as they are until the next visit.
+        Later fits use them for the drift. The covariances of present calibrations grow by them from
+        now on, but their values stay unchanged until the next visit.
         """
         growth, names = Growth.of(hyper, source), self.design.groups[group].names
         self._hyper |= dict.fromkeys(names, hyper)

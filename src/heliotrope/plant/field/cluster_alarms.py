@@ -11,10 +11,10 @@ _Key = tuple[str, str]
 
 
 class ClusterAlarms(Part):
-    """Alarms of clusters, each reported once if repeated, and ended even if its end was lost.
+    """Alarms of clusters, each reported once even if repeated, and ended even if its end was lost.
 
-    A message may be lost with its connection, or come while the plant's program is frozen. So a
-    cluster repeats its alarms, and lists them; see `ClusterStatus`.
+    A message may be lost with its connection, or arrive while the plant's program is suspended. A
+    cluster therefore repeats its alarms and lists them; see `ClusterStatus`.
 
     Parameters
     ----------
@@ -27,22 +27,22 @@ class ClusterAlarms(Part):
         self._active: dict[str, dict[_Key, Alarm]] = {}
 
     def on_alarm(self, cluster: str, alarm: Alarm) -> None:
-        """Report an alarm of a cluster if it is news."""
+        """Report an alarm of a cluster if it is new."""
         for news in self.take(cluster, alarm):
             self._tell(news)
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Report the ends of those alarms that a cluster no longer lists."""
+        """Report the end of each alarm that a cluster no longer lists."""
         del now
         for news in self.compare(cluster, status):
             self._tell(news)
 
     def take(self, cluster: str, alarm: Alarm) -> list[Alarm]:
-        """Take an alarm of a cluster; return it if it is news."""
+        """Accept an alarm of a cluster; return it if it is new."""
         alarm = replace(alarm, subject=alarm.subject or cluster)
         kind = alarms.KINDS.get(alarm.condition)
         if kind is not None and not kind.over:
-            return [alarm]  # an event: it neither lasts nor ends
+            return [alarm]  # an event, which neither lasts nor ends
         active, key = self._active.setdefault(cluster, {}), (alarm.condition, alarm.subject)
         if not alarm.active:
             active.pop(key, None)
@@ -53,7 +53,7 @@ class ClusterAlarms(Part):
         return [alarm]
 
     def compare(self, cluster: str, status: ClusterStatus) -> list[Alarm]:
-        """Return the ends of those alarms that a cluster no longer lists."""
+        """Return the ends of the alarms that a cluster no longer lists."""
         if not status.alarms_listed:
             return []
         pairs = (line.partition(" ") for line in status.alarms)

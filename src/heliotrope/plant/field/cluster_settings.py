@@ -7,26 +7,27 @@ from heliotrope.links.messages import ClusterStatus
 from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 
-#: An alarm waits this long, s: after a start, the first clusters heard need not be most of them.
+#: An alarm waits this long, s, because after a start the first clusters to report may be the
+#: minority.
 PATIENCE = 5.0
-#: From what a cluster differs, where the plant knows what every cluster should have.
+#: Name of the reference if the plant knows what every cluster should have.
 EXPECTED = "this plant"
 
 
 class ClusterSettings(Part):
-    """The comparison of the clusters' settings with those that the plant expects.
+    """Compares the clusters' settings with the settings that the plant expects.
 
-    Where it expects none, they are compared with each other: a cluster is named if its checksum
-    differs from those of more than half of the others; of two that differ, both are. A cluster
-    that has fallen silent counts with its last checksum; one that sends none, as an older one, is
-    not compared.
+    If the plant expects none, the clusters are compared with each other: a cluster is named if its
+    checksum differs from the checksums of more than half of the others; if there are only two and
+    they differ, both are named. A cluster that has fallen silent counts with its last checksum. An
+    older cluster that sends no checksum is not compared.
 
     Parameters
     ----------
     tell
-        Called with each alarm, raised or over, and again when its text changes.
+        Called with each alarm, when it is raised or ends, and again when its text changes.
     expected
-        Checksum of the settings that every cluster should have; "": none is known.
+        Checksum of the settings that every cluster should have; "": unknown.
     """
 
     def __init__(self, tell: Callable[[Alarm], None], expected: str = "") -> None:
@@ -39,7 +40,7 @@ class ClusterSettings(Part):
         self._raised: dict[str, Alarm] = {}
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Take a cluster's status that has arrived at a monotonic time, s."""
+        """Accept a cluster's status that arrived at a monotonic time, s."""
         self._learn(cluster, status.settings)
         others = self._differing(cluster)
         if not others:

@@ -19,7 +19,7 @@ from heliotrope.links.messages import (
 )
 from heliotrope.plant.settings import Counters
 
-#: A question is sent within this time or not at all, and its answer is awaited this long, s.
+#: A query is sent within this time or not at all, and its reply is awaited for this long, s.
 QUESTION_LIFE, ANSWER_PATIENCE = 5.0, 60.0
 
 
@@ -33,15 +33,15 @@ class _Post:
 class ClusterEnd:
     """The plant's end of the link to one cluster.
 
-    A posted message does not wait for a connection: if it cannot be sent now, its outcome says so
-    at once. Urgent messages pass all others that have not been sent yet.
+    A posted message does not wait for a connection: if it cannot be sent now, its outcome reports
+    that at once. Urgent messages overtake all other messages not sent yet.
 
     Attributes
     ----------
     name, members
         Name of the cluster; names of its heliostats.
     link
-        To the cluster.
+        Link to the cluster.
     """
 
     def __init__(self, name: str, members: tuple[str, ...], link: Link, clock: Clock) -> None:
@@ -62,7 +62,8 @@ class ClusterEnd:
     ) -> None:
         """Send a message as soon as possible, within ``lifetime`` s (None: at once or never).
 
-        A function makes the message when its turn comes; None: it is not sent any more.
+        If ``message`` is a function, it creates the message when its turn comes; if it returns
+        None, nothing is sent.
         """
         expires = None if lifetime is None else self._clock.monotonic() + lifetime
         box = self._urgent if urgent else self._normal
@@ -100,7 +101,7 @@ class ClusterEnd:
                 if self._greeted != opened:
                     self._greeted = opened
                     greet(self)
-                # A lease counts from its arrival, so an old one must not arrive at all.
+                # A lease counts from its arrival, so a late lease must not arrive at all.
                 self.post(lease(), period, urgent=True)
             await sleep_until(self._clock, due)
 
@@ -117,7 +118,7 @@ class Clusters:
     clock
         Clock of the plant.
     counters
-        Count refused messages.
+        Counters of refused messages.
 
     Attributes
     ----------
@@ -148,11 +149,11 @@ class Clusters:
         return self._home[heliostat]
 
     def connection(self, cluster: str) -> int:
-        """Return how often the link to a cluster has been opened."""
+        """Return the number of times the link to a cluster has been opened."""
         return self.ends[cluster].link.statistics.opened
 
     def parts(self, heliostats: Iterable[str]) -> list[tuple[ClusterEnd, tuple[str, ...]]]:
-        """Return heliostats by their clusters."""
+        """Return heliostats grouped by cluster."""
         members: dict[str, list[str]] = {}
         for name in heliostats:
             members.setdefault(self._home[name].name, []).append(name)
@@ -165,7 +166,7 @@ class Clusters:
     async def hear(
         self, end: ClusterEnd, take: Callable[[ClusterEnd, Message, float], None]
     ) -> None:
-        """Hand on each message of a cluster, until its link is closed."""
+        """Pass on each message of a cluster, until its link is closed."""
         async for data in received(end.link):
             now = self._clock.monotonic()
             try:
@@ -175,7 +176,7 @@ class Clusters:
                 self._counters.problems.append(f"cluster {end.name}: {error}")
 
     def number(self, what: str) -> str:
-        """Return a new identity for a question or an acknowledgement."""
+        """Return a new identity for a query or an acknowledgement."""
         self._numbers += 1
         return f"{what}-{self._numbers}"
 
@@ -187,9 +188,9 @@ class Clusters:
         heliostat: str = "",
         patience: float = ANSWER_PATIENCE,
     ) -> None:
-        """Send a question to a cluster.
+        """Send a query to a cluster.
 
-        ``take`` is called with its answer, if one comes within ``patience`` s.
+        ``take`` is called with the reply, if one arrives within ``patience`` s.
         """
         now = self._clock.monotonic()
         self._awaited = {i: a for i, a in self._awaited.items() if now < a[0]}
@@ -200,7 +201,7 @@ class Clusters:
     async def answer(
         self, cluster: str, what: str, timeout: float, heliostat: str = ""
     ) -> Answer | None:
-        """Ask a cluster, and return its answer; None if none comes within ``timeout`` s."""
+        """Query a cluster, and return its reply; None if there is none within ``timeout`` s."""
         future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
 
         def take(answer: Answer) -> None:
@@ -215,12 +216,12 @@ class Clusters:
             return None
 
     def take_answer(self, answer: Answer) -> None:
-        """Hand an answer to the part that asked.
+        """Pass a reply to the part that sent the query.
 
         Raises
         ------
         ProtocolError
-            If the answer cannot be read.
+            If the reply cannot be parsed.
         """
         _, take = self._awaited.pop(answer.identity, (math.nan, None))
         if take is not None:

@@ -33,12 +33,12 @@ class DoubtfulPositions(Part):
     field
         State of the field.
     design
-        Its targets may be aimed at in doubt: a photograph there ends it.
+        Heliostats in doubt may aim at its targets, because a photograph there resolves the doubt.
     tell
         Called with each alarm.
     unwitnessed
-        Returns the reason why no heliostat may join a receiver, None if heliostats may; see
-        `witnesses`.
+        Function that returns the reason why no heliostat may join a receiver, None if heliostats
+        may; see `witnesses`.
     stalled
         Heliostats whose drives stall; see `drive_checks`.
 
@@ -65,26 +65,26 @@ class DoubtfulPositions(Part):
         )
         #: Rows whose new parameters are being verified.
         self._unverified: set[int] = set()
-        #: Rows that a flight sees far from where their parameters say.
+        #: Rows that a flight observed far from the pose that their parameters predict.
         self._off_place: frozenset[int] = frozenset()
-        #: Boots of each local controller when its place was confirmed, -1 before.
+        #: Boot count of each local controller when its position was confirmed, -1 before.
         self._confirmed = np.full(len(field), -1, dtype=np.int64)
         self.standing: Mask = np.zeros(len(field), dtype=np.bool_)
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Judge the heliostats of a cluster by its status."""
+        """Evaluate the heliostats of a cluster from its status."""
         del status, now
         self._judge([self._field.index[name] for name in self._field.members[cluster]])
 
     def confirm(self, heliostat: str, boots: int | None = None) -> None:
-        """Take the step counts of a heliostat as right until it boots again.
+        """Accept the step counts of a heliostat as correct until its next boot.
 
         Parameters
         ----------
         heliostat
             Name.
         boots
-            Its number of boots when its place was seen; None: as last heard.
+            Its boot count when its position was observed; None: the last one reported.
         """
         row = self._field.place(heliostat)
         self._confirmed[row] = int(self._field.rows["boots"][row]) if boots is None else boots
@@ -105,15 +105,15 @@ class DoubtfulPositions(Part):
         return tuple(name for name in heliostats if self._field.place(name) in self._unverified)
 
     def keep_off(self, heliostats: Iterable[str]) -> None:
-        """Keep heliostats off the receiver that a flight sees far from where they should be.
+        """Keep heliostats off the receiver that a flight observed far from where they should be.
 
-        The others that were named before may join it again.
+        Heliostats named before, but not now, may join the receiver again.
         """
         self._off_place = frozenset(self._field.place(name) for name in heliostats)
 
     def _judge(self, rows: list[int]) -> None:
         nodes = self._field.rows[rows]
-        # Counts that are not known at all are a fault of their own, which only ZERO ends.
+        # Entirely unknown counts are a separate fault, which only ZERO ends.
         doubtful = nodes["flags"] & meanings.COUNTS_DOUBTFUL != 0
         doubtful &= nodes["flags"] & meanings.COUNTS_UNKNOWN == 0
         doubtful &= nodes["boots"] != self._confirmed[rows]
@@ -124,7 +124,7 @@ class DoubtfulPositions(Part):
             self._tell(kind.raised(name) if doubtful[i] else kind.ended(name))
 
     def reasons(self, names: Sequence[str], points: FloatArray) -> list[str | None]:
-        """Return the reasons why heliostats (K) may not join their points (K, 3), or None."""
+        """Return why heliostats (K) may not join the receiver at points (K, 3), or None."""
         rows = [self._field.place(name) for name in names]
         unverified, off_place = (
             np.isin(rows, list(s)) for s in (self._unverified, self._off_place)
@@ -144,7 +144,7 @@ class DoubtfulPositions(Part):
         return reasons
 
     def _on_target(self, points: FloatArray) -> Mask:
-        """Return a mask of the points (K, 3) at a target, and nearer to it than to a receiver."""
+        """Return a mask of the points (K, 3) at a target, and closer to it than to a receiver."""
         apart, away = (
             np.linalg.norm(points[:, None] - centers, axis=-1)
             for centers in (self._targets, self._receivers)

@@ -21,36 +21,36 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Alarm, alarms
 from heliotrope.sun import Site, solar_day
 
-#: What shows that a mirror follows its drives.
+#: Evidence that a mirror follows its drives.
 TILT_SENSOR, PHOTOGRAPH = "tilt sensor", "photograph"
 _MOVED = diagnosis.MOVED_PRIMARY | diagnosis.MOVED_SECONDARY
-#: Bit of a diagnosis, and number of the fault that a board latches, for each drive that stalls.
+#: Diagnosis bit, and number of the latched board fault, for each drive that stalls.
 _STALLS = (
     (diagnosis.STUCK_PRIMARY, FAULTS.index("primary drive stuck"), "primary"),
     (diagnosis.STUCK_SECONDARY, FAULTS.index("secondary drive stuck"), "secondary"),
 )
-#: Time between two checks of whether results have come, s.
+#: Interval at which arriving results are checked, s.
 _POLL = 0.5
 
 
 class DriveChecks(Part):
-    """The knowledge of the drives beyond their step counts.
+    """Evidence about the drives beyond their step counts.
 
     Parameters
     ----------
     field, clusters
-        State of the field, and the clusters, which are asked for results of diagnoses.
+        State of the field, and the clusters, which are queried for diagnosis results.
     sensed
-        Heliostats with a sensor of the mirror's tilt.
+        Heliostats with a tilt sensor on the mirror.
     site, clock
-        The plant's, whose day counts.
+        Site and clock of the plant, which define the day.
     tell
         Called with each alarm.
 
     Attributes
     ----------
     stalled
-        Heliostats whose drives stall, and how that was seen.
+        Heliostats whose drives stall, and how that was detected.
     """
 
     def __init__(
@@ -65,22 +65,23 @@ class DriveChecks(Part):
         self._field, self._clusters, self._sensed = field, clusters, frozenset(sensed)
         self._site, self._clock, self._tell = site, clock, tell
         self.stalled: dict[str, str] = {}
-        #: Day on which mirrors were last seen to follow their drives, and by what.
+        #: Day on which mirrors were last seen to follow their drives, and the evidence.
         self._shown: dict[str, tuple[date, str]] = {}
-        #: Day of the last diagnosis that came to its end, whatever its result.
+        #: Day of the last completed diagnosis, whatever its result.
         self._diagnosed: dict[str, date] = {}
-        #: Heliostats whose boards report a drive that stalls, and whose sensors do not answer.
+        #: Heliostats whose boards report a stalled drive; heliostats whose tilt sensors do not
+        #: respond.
         self._faulty: set[str] = set()
         self._silent: set[str] = set()
 
     async def checked(self, heliostats: Iterable[str], timeout: float) -> None:
-        """Wait until heliostats are no longer due, ``timeout`` s at most."""
+        """Wait until no given heliostat is due any longer, for at most ``timeout`` s."""
         until = self._clock.monotonic() + timeout
         while self.due.intersection(heliostats) and self._clock.monotonic() < until:
             await sleep_until(self._clock, self._clock.monotonic() + _POLL)
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Take the faults that the boards of a cluster report."""
+        """Note the faults that the boards of a cluster report."""
         del status, now
         faults = self._field.rows["fault"]
         for name in self._field.members[cluster]:
@@ -95,7 +96,7 @@ class DriveChecks(Part):
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Ask for the results of diagnoses that have come to their end."""
+        """Query the results of completed diagnoses."""
         del now
         if stage is not Stage.DONE or ticket.name != "DIAGNOSE":
             return
@@ -140,7 +141,7 @@ class DriveChecks(Part):
         self._follows(heliostat)
 
     def confirm(self, heliostat: str) -> None:
-        """Take a person's word that the mirror follows its drives; it is due to be diagnosed."""
+        """Accept a confirmation that the mirror follows its drives, which makes a diagnosis due."""
         self._diagnosed.pop(heliostat, None)
         self._follows(heliostat)
 
@@ -156,7 +157,7 @@ class DriveChecks(Part):
 
     @property
     def due(self) -> frozenset[str]:
-        """Heliostats with a tilt sensor whose movement has not been diagnosed today."""
+        """Heliostats with a tilt sensor whose motion has not been diagnosed today."""
         today = self._today()
         return self._sensed.difference(n for n, day in self._diagnosed.items() if day == today)
 

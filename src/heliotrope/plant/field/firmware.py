@@ -1,6 +1,7 @@
 """Firmware versions of the local controllers, compared with the version that the plant expects.
 
-A status does not contain them, so each cluster is asked to search its bus when it has connected.
+A status does not contain the versions, so each cluster is asked to search its bus once it is
+connected.
 """
 
 from collections.abc import Callable
@@ -10,9 +11,9 @@ from heliotrope.plant.field.clusters import Clusters
 from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 
-#: Longest search of a bus, s; after it a cluster that has not answered is asked again.
+#: Longest search of a bus, s; a cluster that has not replied by then is queried again.
 SEARCH = 600.0
-#: Most boards that one alarm names.
+#: Maximum number of boards named in one alarm.
 _NAMED = 5
 
 
@@ -24,7 +25,7 @@ class Firmware(Part):
     expected
         Version that every board should have; None: nothing is compared, and no bus is searched.
     clusters
-        The clusters, which are asked.
+        The clusters, which are queried.
     tell
         Called with each alarm.
     """
@@ -33,17 +34,17 @@ class Firmware(Part):
         self, expected: int | None, clusters: Clusters, tell: Callable[[Alarm], None]
     ) -> None:
         self._expected, self._clusters, self._tell = expected, clusters, tell
-        #: When clusters that have not answered are asked next, monotonic s.
+        #: When clusters that have not replied are queried next, monotonic s.
         self._due: dict[str, float] = {}
         self._raised: set[str] = set()
 
     def on_connected(self, cluster: str, now: float) -> None:
-        """Compare the boards of a cluster that has connected."""
+        """Have the boards of a newly connected cluster compared."""
         if self._expected is not None:
             self._due[cluster] = now
 
     def on_second(self, now: float) -> None:
-        """Ask the clusters that are due."""
+        """Query the clusters that are due."""
         for cluster, due in self._due.items():
             if now >= due:
                 self._due[cluster] = now + SEARCH
@@ -54,7 +55,7 @@ class Firmware(Part):
         def take(answer: Answer) -> None:
             boards = answer.data.get("found")
             if not isinstance(boards, list):
-                return  # it is asked again
+                return  # it is queried again
             self._due.pop(cluster, None)
             others = {
                 str(board.get("name") or f"serial number {board.get('serial')}"): board.get(

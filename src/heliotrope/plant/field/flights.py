@@ -18,26 +18,27 @@ from heliotrope.calibration.record import Identities
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.geometry import FloatArray
 
-#: Most flights in the fits, the last ones: each adds its shared errors to every heliostat's part.
+#: Maximum number of flights in the fits, the latest ones, because each flight adds its shared
+#: errors to the part of every heliostat.
 MOST = 8
 
 
 @dataclass(frozen=True)
 class TakenFlight:
-    """A flight that the plant has taken.
+    """A flight that was imported into the plant.
 
     Attributes
     ----------
     flight
         The flight.
     identities
-        Numbers of its sightings in the store, 0 without one, (M,).
+        Numbers of its sightings in the store, 0 without a store, (M,).
     at
-        When it was taken, POSIX s.
+        When it was imported, POSIX s.
     person
-        Who gave it.
+        Who imported it.
     left_out
-        Heliostats whose rows cannot be theirs, and are in no fit.
+        Heliostats whose records cannot be their own, and are left out of all fits.
     """
 
     flight: Flight
@@ -48,14 +49,14 @@ class TakenFlight:
 
 
 class Flights:
-    """The flights of a plant; a new one makes a new object.
+    """The flights of a plant; importing a flight creates a new object.
 
     Parameters
     ----------
     taken
-        In the order in which they were taken.
+        Flights in the order in which they were imported.
     parts
-        What each heliostat reveals of the shared errors of ``taken``: information and pull.
+        What each heliostat reveals about the shared errors of ``taken``: information and pull.
     """
 
     def __init__(
@@ -81,14 +82,14 @@ class Flights:
         return len(self._taken)
 
     def __iter__(self) -> Iterator[TakenFlight]:
-        """Iterate over the flights, the first taken first."""
+        """Iterate over the flights in the order in which they were imported."""
         return iter(self._taken)
 
     def __contains__(self, heliostat: str) -> bool:
         return heliostat in self._rows
 
     def count(self, heliostat: str) -> int:
-        """Return the number of a heliostat's rows."""
+        """Return the number of flight records of a heliostat."""
         return sum(map(len, self._rows.get(heliostat, ())))
 
     def adding(self, new: TakenFlight) -> "Flights":
@@ -106,21 +107,21 @@ class Flights:
         return Flights(taken[oldest:], parts)
 
     def learn(self, heliostat: str, information: FloatArray, pull: FloatArray) -> None:
-        """Keep the information on the shared errors from the last fit of a heliostat.
+        """Store the information about the shared errors from the last fit of a heliostat.
 
-        A fit that began before the last flight was taken knows nothing of its errors, and is left
-        out.
+        A fit that began before the last flight was imported lacks the errors of that flight, and is
+        ignored.
         """
         if heliostat in self._rows and len(pull) == self._edges[-1]:
             self._parts[heliostat] = information, pull
 
     def leave_out(self, heliostats: Collection[str]) -> None:
-        """Leave rows of the last flight out of all fits: they cannot be of these heliostats."""
+        """Leave records of the last flight out of all fits; they cannot be of these heliostats."""
         last = replace(self._taken[-1], left_out=frozenset(heliostats))
         self._set((*self._taken[:-1], last))
 
     def number(self, flight: str, identities: Identities) -> None:
-        """Keep the numbers that the store gave to the sightings of a flight, (M,)."""
+        """Store the numbers that the store assigned to the sightings of a flight, (M,)."""
         self._set(
             tuple(
                 replace(flown, identities=identities) if flown.flight.name == flight else flown
@@ -134,7 +135,7 @@ class Flights:
         Parameters
         ----------
         but
-            Heliostats whose word does not count.
+            Heliostats whose information is left out.
         """
         count = int(self._edges[-1])
         known, drawn = np.zeros((count, count)), np.zeros(count)
@@ -154,7 +155,7 @@ class Flights:
         return mean[part], covariance[part, part]
 
     def identities(self, heliostat: str) -> Identities:
-        """Return the numbers of a heliostat's rows, in the order of `common`."""
+        """Return the numbers of a heliostat's flight records, in the order of `common`."""
         rows = self._rows.get(heliostat, [])
         parts = [flown.identities[r] for flown, r in zip(self._taken, rows, strict=bool(rows))]
         return np.concatenate([np.zeros(0, np.int64), *parts])
@@ -167,9 +168,9 @@ class Flights:
         Parameters
         ----------
         heliostats
-            N names; the sightings count them from 0.
+            N names; the sightings refer to them by index from 0.
         photographed
-            The sightings of each by photograph, rows 0; None without any.
+            The sightings of each from photographs, with heliostat row 0; None if there are none.
         """
         parts: list[Sightings] = []
         shifts: list[FloatArray] = []
@@ -198,10 +199,10 @@ class Flights:
         return join(parts), errors
 
     def flown(self, heliostat: str) -> tuple[Flown, ...]:
-        """Return a heliostat's rows, flight by flight, with the errors that they share.
+        """Return a heliostat's records, flight by flight, with the errors that they share.
 
-        Of these errors counts what all others say. That those of two flights are known together is
-        left out.
+        The shared errors are estimated from all other heliostats. Correlations between the errors
+        of two flights are neglected.
         """
         mean, covariance = self.shared({heliostat})
         parts = []

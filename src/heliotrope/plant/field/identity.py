@@ -22,7 +22,7 @@ from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
 from heliotrope.safety import Act, Alarm, alarms
 
-#: Why a board proves nothing that stores an armature which the plant has never known.
+#: Why a board proves nothing if it stores an armature that the plant has never known.
 _UNKNOWN = "its local controller stores parameters that are unknown to this plant"
 
 
@@ -34,11 +34,11 @@ class Identities(Part):
     field
         State of the field.
     armatures
-        Armatures of the plant's beliefs at its start, (N, 18).
+        Armatures that the plant believes at start-up, (N, 18).
     expected
         Items that heliostats should store, by name and item.
     connections
-        Returns how often the link to a cluster has been opened.
+        Function that returns how often the link to a cluster has been opened.
     tell
         Called with each alarm.
     give_up
@@ -47,7 +47,7 @@ class Identities(Part):
     Attributes
     ----------
     mismatched
-        Why a heliostat is not what its address says, by name.
+        Why the board at a heliostat's address is not its own, by name.
     """
 
     def __init__(
@@ -65,12 +65,12 @@ class Identities(Part):
         self.mismatched: dict[str, str] = {}
         #: Rows of the heliostats that have ever had an armature, by its checksum.
         self._owners: defaultdict[int, set[int]] = defaultdict(set)
-        #: Checksums last reported, 0 before; whether they are the heliostat's own.
+        #: Last reported checksums, 0 before; whether they belong to the heliostat itself.
         self._stored = np.zeros(len(field), dtype=np.uint32)
         self._own = np.zeros(len(field), dtype=np.bool_)
-        #: Heliostats whose alarm says that they have no row.
+        #: Heliostats for which an alarm reports that their cluster sends no row.
         self._unlisted: set[str] = set()
-        #: Rows whose checksum is another's.
+        #: Rows whose checksum belongs to another heliostat.
         self._foreign: set[int] = set()
         self._rows = {
             name: np.array([field.index[n] for n in held], dtype=np.intp)
@@ -93,7 +93,7 @@ class Identities(Part):
         self._judge(np.flatnonzero(self._stored == crc).tolist())
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Judge the heliostats of a cluster by its status."""
+        """Evaluate the heliostats of a cluster from its status."""
         del status, now
         self._judged[cluster] = self._connections(cluster)
         self._compare_rows(cluster)
@@ -104,7 +104,7 @@ class Identities(Part):
         self._judge(rows[changed].tolist())
 
     def _compare_rows(self, cluster: str) -> None:
-        """Raise the alarm about heliostats for which their cluster reports no row, and end it."""
+        """Raise or end the alarm about heliostats for which their cluster reports no row."""
         unlisted = self._field.unlisted.intersection(self._field.members[cluster])
         known = self._unlisted.intersection(self._field.members[cluster])
         for name in sorted(unlisted - known):
@@ -114,7 +114,7 @@ class Identities(Part):
         self._unlisted = (self._unlisted - known) | unlisted
 
     def _judge(self, changed: list[int]) -> None:
-        """Judge rows whose checksum, or its owners, have changed, and with them their pairs."""
+        """Evaluate rows whose checksum, or its owners, have changed, together with their pairs."""
         for row in changed:
             self._own[row] = row in self._of(row)
             alien = not self._own[row] and bool(self._of(row))
@@ -144,17 +144,17 @@ class Identities(Part):
         return self._owners.get(int(self._stored[row]), set())
 
     def untrusted(self, heliostat: str) -> str | None:
-        """Return the reason why a heliostat's reports prove nothing of its beam, None if they do.
+        """Return why a heliostat's reports prove nothing about its beam, None if they count.
 
-        It is mismatched, or its board stores an armature that the plant has never known: its step
-        counts are those of the mirror that it was at before.
+        It is mismatched, or its board stores an armature that the plant has never known, so its
+        step counts belong to the heliostat at which the board was before.
         """
         row = self._field.index[heliostat]
         unknown = self._stored[row] != 0 and not self._own[row] and heliostat in self._expected
         return self.mismatched.get(heliostat) or (_UNKNOWN if unknown else None)
 
     def blocked(self, heliostat: str) -> str | None:
-        """Return the reason why a heliostat may be neither moved nor written, None if it may."""
+        """Return why a heliostat may be neither moved nor written to, None if it may."""
         field, row = self._field, self._field.place(heliostat)
         cluster = field.clusters[field.cluster[row]]
         if heliostat in self.mismatched:
@@ -169,8 +169,8 @@ class Identities(Part):
         if not self.mismatched:
             return {}
         field = self._field
-        # DEFOCUSED is not among them: a defocus is relative to goals, which may belong to the
-        # other mirror.
+        # DEFOCUSED is not included, because a defocus is relative to goals that may belong to the
+        # other heliostat.
         going = field.among(states.TO_STOW, now) | (field.rows["flags"] & meanings.AT_STOW != 0)
         needed = field.live(now) & ~going
         return {

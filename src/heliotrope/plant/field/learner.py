@@ -10,13 +10,13 @@ from heliotrope.calibration.learn import worker
 from heliotrope.calibration.learn.group import GroupHistory, LearntGroup, gathered
 from heliotrope.errors import InputError
 
-#: Longest time for one group, s; 60 mirrors of 120 sightings take some minutes.
+#: Longest time for one group, s; 60 heliostats with 120 sightings each take some minutes.
 LONGEST = 4 * 3600.0
 _MODULE = "heliotrope.calibration.learn.worker"
 
 
 class LearnerProcess:
-    """Learns groups, each in a process of its own that uses the computing time left by the plant.
+    """Learns groups, each in a separate process that uses the computing time left by the plant.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class LearnerProcess:
         Raises
         ------
         InputError
-            If it teaches nothing yet, or the process fails.
+            If nothing can be learnt from it yet, or the process fails.
         """
         run = _Run(self._longest)
         try:
@@ -43,7 +43,7 @@ class LearnerProcess:
 
 
 class _Run:
-    """One process, which can be ended from another thread before it has begun."""
+    """One process, which can be ended from another thread even before it has begun."""
 
     def __init__(self, longest: float) -> None:
         self._longest, self._ended = longest, False
@@ -61,7 +61,7 @@ class _Run:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 env={**os.environ, **worker.ENVIRONMENT},
-                # Ctrl-C in the plant's terminal is the plant's.
+                # Ctrl-C in the plant's terminal is only for the plant.
                 start_new_session=True,
             )
         with self._process as process:
@@ -75,7 +75,7 @@ class _Run:
         return worker.answered(out)
 
     def end(self) -> None:
-        """End the process; nothing, if it has ended."""
+        """End the process; do nothing if it has ended already."""
         with self._mine:
             self._ended = True
             if self._process is not None and self._process.poll() is None:

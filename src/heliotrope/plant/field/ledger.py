@@ -23,11 +23,11 @@ from heliotrope.plant.orders.tickets import Ticket
 
 #: A kind of order: the names of its commands.
 Kind = frozenset[str]
-#: Orders after which a heliostat may be out again.
+#: Orders after which a heliostat's beam may be out again.
 _OUT = messages.MOTIONS | messages.RELEASES
-#: Orders that move. A new point moves only in some states: see `_POINTS`.
+#: Orders that move a heliostat. A new point moves it only in some states; see `_POINTS`.
 MOVING = messages.MOTIONS | messages.SAFE | messages.POINTS
-#: Single orders.
+#: Kinds with a single order.
 STOWING, LOCKING, TO_REST, STEPPING = (frozenset({n}) for n in ("STOW", "LOCK", "IDLE", "ROUGH"))
 #: The kinds that the ledger keeps.
 KINDS = (
@@ -36,16 +36,16 @@ KINDS = (
 )  # fmt: skip
 #: States in which a new point moves a heliostat.
 _POINTS = {"AIM": states.ON_AIM, "STANDBY": (states.IDLE,)}
-#: From an order to a report that the board may have made before it took the order, s.
+#: Time after an order during which a report may have been made before the board took the order, s.
 _TAKEN_WITHIN = 1.0
-#: States in which a heliostat is off already: an order does not take it off.
+#: States in which a heliostat is already off, so that an order does not take it off.
 _GONE = (*states.LEAVING, states.STOWED)
 
 Rows = npt.NDArray[np.intp]
 
 
 class _Column:
-    """The last order of one kind of N heliostats.
+    """The last order of one kind to N heliostats.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class _Column:
     acknowledged, accepted
         When the last acknowledged order was acknowledged, and accepted by the plant, (N,).
     shown
-        From when on a report shows it, (N,).
+        Time from which a report shows its effect, (N,).
     """
 
     def __init__(self, count: int) -> None:
@@ -76,14 +76,14 @@ class Ledger(Part):
     def __init__(self, field: FieldState) -> None:
         self._field, self._number = field, 0
         self._kinds = {kind: _Column(len(field)) for kind in KINDS}
-        #: When heliostats that were out were ordered off, monotonic s, (N,).
+        #: When heliostats whose beams were out were ordered off, monotonic s, (N,).
         self._off_at = np.full(len(field), -np.inf)
         #: When they last refused a command, monotonic s, (N,).
         self._refused_at = np.full(len(field), -np.inf)
         #: Whether the order off was acknowledged, (N,).
         self._obeyed = np.zeros(len(field), dtype=np.bool_)
 
-    # -- what happens ----------------------------------------------------------------------
+    # -- events ----------------------------------------------------------------------------
 
     def on_sent(
         self,
@@ -100,7 +100,7 @@ class Ledger(Part):
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Note what some heliostats of a ticket have acknowledged or refused."""
+        """Note what some heliostats of a ticket acknowledged or refused."""
         if stage is Stage.ACKNOWLEDGED:
             self.acknowledged(ticket.name, ticket.accepted_at, heliostats, now)
         elif stage is Stage.REFUSED:
@@ -112,8 +112,8 @@ class Ledger(Part):
         """Note an order that has been sent, or repeated (``again``)."""
         rows = self._rows(heliostats)
         if name in messages.SAFE:
-            # One that is silent, off already, or has refused a command since it was last heard, may
-            # have left before: then the order is no cause.
+            # A heliostat that is silent, already off, or has refused a command since its last
+            # report may have left before; then the order is not the cause.
             out_at = self._kinds[_OUT].sent
             excused = np.isin(self._field.rows["state"][rows], _GONE)
             excused &= out_at[rows] + _TAKEN_WITHIN <= self._field.heard[rows]
@@ -130,7 +130,7 @@ class Ledger(Part):
     def acknowledged(
         self, name: str, accepted_at: float, heliostats: Sequence[str], now: float
     ) -> None:
-        """Note that an order has been acknowledged: it may have been long under way.
+        """Note that an order has been acknowledged, perhaps long after it was sent.
 
         The plant accepted it at ``accepted_at``, monotonic s.
         """
@@ -145,9 +145,10 @@ class Ledger(Part):
             column.acknowledged[mine], column.accepted[mine] = now, accepted_at
 
     def refused(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note that heliostats have refused a command: they may no longer be where they seem.
+        """Note that heliostats refused a command; they may not be where they were last reported.
 
-        A refusal that the reported state explains, such as of APPROACH in TRACKING, says nothing.
+        A refusal that the reported state explains, such as that of APPROACH in TRACKING, is
+        ignored.
         """
         state = self._field.rows["state"]
         leads_on = f" {name} " in states.TABLE
@@ -166,15 +167,15 @@ class Ledger(Part):
         return [(kind, column) for kind, column in self._kinds.items() if name in kind]
 
     def _moved(self, kind: Kind, name: str, rows: Rows) -> Rows:
-        """Return the rows (K,) for which an order is of a kind: some points move nothing."""
+        """Return the rows (K,) for which an order is of a kind; some points move nothing."""
         if kind is not MOVING or name not in _POINTS:
             return rows
         return rows[np.isin(self._field.rows["state"][rows], _POINTS[name])]
 
-    # -- questions -------------------------------------------------------------------------
+    # -- queries ---------------------------------------------------------------------------
 
     def reported(self, kind: Kind = MOVING) -> Mask:
-        """Return a mask of heliostats that reported after their last order of a kind, (N,)."""
+        """Return a mask of the heliostats that reported after their last order of a kind, (N,)."""
         return np.asarray(self._field.heard >= self._kinds[kind].shown)
 
     def sent_since(self, kind: Kind, at: float) -> Mask:
@@ -185,7 +186,7 @@ class Ledger(Part):
         return np.asarray(self._kinds[kind].sent >= at)
 
     def later(self, kind: Kind, other: Kind) -> Mask:
-        """Return a mask of heliostats sent an order of a kind after all of another, (N,)."""
+        """Return a mask of the heliostats sent an order of one kind after all of another, (N,)."""
         return np.asarray(self._kinds[kind].number > self._kinds[other].number)
 
     def obeyed_since(self, kind: Kind, at: float, after: Kind) -> Mask:
@@ -198,13 +199,13 @@ class Ledger(Part):
         return np.asarray(in_order & (column.acknowledged >= at))
 
     def off(self, out_at: FloatArray, now: float) -> Mask:
-        """Return a mask of the heliostats ordered off by anybody, (N,); call it at each check.
+        """Return a mask of the heliostats that anyone ordered off, (N,); call it at each check.
 
-        It is their last order, or was sent after they were last out (``out_at``, monotonic s,
-        (N,)). An order does not count, since the heliostat may have left by itself, if it was
-        silent, fell silent before it acknowledged the order, was off already, or had refused a
-        command since its last report. Nor does an order of the safety table to a whole cluster that
-        is silent, or has lost the time.
+        The order off was the last one, or was sent after the beam was last out (``out_at``,
+        monotonic s, (N,)). An order does not count if the heliostat may have left by itself: it was
+        silent, fell silent before it acknowledged the order, was already off, or had refused a
+        command since its last report. An order of the safety table to a whole cluster does not
+        count either if the cluster is silent or has lost the time.
         """
         self._off_at[~self._field.live(now) & ~self._obeyed] = -np.inf
         ordered = np.isfinite(self._off_at)

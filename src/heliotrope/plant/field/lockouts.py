@@ -16,14 +16,14 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.store.records import Kind, Lockout
 
-#: Name of the tower among what is locked.
+#: Name of the tower as a lockable object.
 TOWER = "tower"
 #: A beam whose aim is this close to the edge of a locked surface counts as on it, m.
 _BESIDE = 2.0
 
 
 class Lockouts:
-    """All locks of persons on a plant.
+    """All personal locks of a plant.
 
     Parameters
     ----------
@@ -50,11 +50,11 @@ class Lockouts:
 
     @property
     def heliostats(self) -> tuple[str, ...]:
-        """The heliostats that are locked themselves."""
+        """The heliostats that are individually locked."""
         return tuple(name for kind, name in self._locks if kind is Kind.HELIOSTAT)
 
     def put(self, locks: Iterable[Lockout]) -> None:
-        """Put locks; a person's new lock replaces their own one before."""
+        """Apply locks; a new lock replaces the same person's earlier lock."""
         for lock in locks:
             self._locks.setdefault((lock.kind, lock.name), {})[lock.who] = lock
 
@@ -66,15 +66,15 @@ class Lockouts:
             self._locks.pop((kind, name), None)
 
     def on(self, kind: Kind, name: str) -> tuple[Lockout, ...]:
-        """Return the locks on something, in the order in which they were put."""
+        """Return the locks on an object, in the order in which they were applied."""
         return tuple(self._locks.get((kind, name), {}).values())
 
     def text(self, kind: Kind, name: str) -> str:
-        """Return the locks on something in one line."""
+        """Return the locks on an object in one line."""
         return "; ".join(lock.text for lock in self.on(kind, name))
 
     def closed(self, points: FloatArray) -> dict[str, npt.NDArray[np.bool_]]:
-        """Return masks of the points (K, 3), ENU, m, on locked surfaces, by the reason."""
+        """Return masks of the points (K, 3), ENU, m, on locked surfaces, by reason."""
         masks = {}
         for kind, name in self._locks:
             surface = self._surfaces.get((kind, name))
@@ -87,14 +87,14 @@ class Lockouts:
     def reasons(
         self, heliostats: Sequence[str], points: FloatArray | None = None
     ) -> list[str | None]:
-        """Return the reasons why no command may move some heliostats, None where one may.
+        """Return why no command may move some heliostats, None for those that may be moved.
 
         Parameters
         ----------
         heliostats
             Names (K).
         points
-            Where their beams are to be sent, ENU, m, (K, 3); None: to no surface.
+            Points to which their beams are to be sent, ENU, m, (K, 3); None: to no surface.
         """
         tower = self.text(Kind.TOWER, TOWER)
         texts = np.full(len(heliostats), f"the tower is locked: {tower}" if tower else None, "O")

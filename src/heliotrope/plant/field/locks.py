@@ -21,19 +21,19 @@ from heliotrope.plant.field.assigned import Held, Places
 from heliotrope.plant.field.ledger import LOCKING, STOWING, Ledger
 from heliotrope.plant.field.state import FieldState
 
-#: Pause before an order is given again, s: it doubles from one to the next, up to the longest.
+#: Pause before an order is repeated, s; it doubles each time, up to the longest.
 _AGAIN, _LONGEST = 3.0, 300.0
-#: A lock that is older when a program starts is left to a person, s.
+#: If a lock is older than this when a program starts, only an operator removes it, s.
 CERTAIN = 3600.0
-#: Instead of an order: a person must give it.
+#: In place of an order: an operator must give the order.
 _WAIT = "wait"
 
 
 @dataclass
 class _Lock:
-    """A lock: under which mandate, the next attempt, and whether it was released.
+    """A lock: its mandate, the next attempt, and whether it was released.
 
-    ``at`` is when it was taken, POSIX s; an earlier program took it if it is ``recalled``.
+    ``at`` is when it was applied, POSIX s; an earlier program applied it if it is ``recalled``.
     """
 
     token: int
@@ -51,9 +51,9 @@ class Locks:
     Parameters
     ----------
     field, ledger
-        State of the field, and what was ordered.
+        State of the field, and the orders sent.
     utc
-        Returns the time, POSIX s.
+        Function that returns the time, POSIX s.
     """
 
     def __init__(self, field: FieldState, ledger: Ledger, utc: Callable[[], float]) -> None:
@@ -62,7 +62,7 @@ class Locks:
 
     @property
     def names(self) -> frozenset[str]:
-        """The heliostats that a visit has locked, or that wait to be unlocked."""
+        """The heliostats that a visit has locked, or that are waiting to be unlocked."""
         return frozenset(self._locked)
 
     def take(self, heliostats: Iterable[str], token: int, now: float) -> None:
@@ -71,7 +71,7 @@ class Locks:
         self._locked.update({name: _Lock(token, now, at) for name in heliostats})
 
     def recall(self, held: Places, now: float) -> None:
-        """Go on with the locks that an earlier program has left; see `record`."""
+        """Continue with the locks that an earlier program left; see `record`."""
         self._ledger.sent("LOCK", tuple(held), now)  # at the latest
         for name, (at, *_) in held.items():
             sure = 0.0 <= self._utc() - at <= CERTAIN
@@ -79,14 +79,14 @@ class Locks:
             self._locked[name] = lock
 
     def record(self, heliostats: Iterable[str], *, visit: bool) -> Held:
-        """Return the record to store before a visit, or a person, locks heliostats."""
+        """Return the record to store before a visit or an operator locks heliostats."""
         place = (self._utc(), 0.0, 0.0) if visit else None
         return {"LOCKED": dict.fromkeys(heliostats, place)}
 
     def reason(self, heliostat: str, visit: str, held: str = "") -> str:
-        """Return the reason why a heliostat is LOCKED, since when and until when, in words.
+        """Return why a heliostat is LOCKED, since when and until when, in words.
 
-        ``visit`` names the visit that it is in, if any. ``held`` is the reason why its cluster may
+        ``visit`` names the visit that holds it, if any. ``held`` is the reason why its cluster may
         begin no motion now, if there is one.
         """
         lock = self._locked.get(heliostat)
@@ -116,22 +116,22 @@ class Locks:
         )
 
     def forget(self, heliostats: Iterable[str]) -> None:
-        """Forget heliostats that a person locks: the person unlocks them."""
+        """Forget heliostats that an operator locks, because the operator unlocks them."""
         for name in heliostats:
             self._locked.pop(name, None)
 
     def due(
         self, now: float, released: Callable[[int, Iterable[str]], frozenset[str]]
     ) -> dict[str, list[str]]:
-        """Return the heliostats that are to be given an order now, by its name.
+        """Return the heliostats to which an order is due now, by name of the order.
 
         Parameters
         ----------
         now
             Monotonic s.
         released
-            Returns those that no visit holds any more: the visit has ended, or a person has
-            ordered something else.
+            Function that returns the heliostats that no visit holds any longer, because the visit
+            has ended or an operator has ordered something else.
         """
         orders: dict[str, list[str]] = {}
         fresh = self._ledger.reported(LOCKING) & self._field.live(now)
@@ -147,13 +147,13 @@ class Locks:
         return orders
 
     def _next(self, name: str, lock: _Lock) -> str | None:
-        """Return the next order for a heliostat, None when its lock is over.
+        """Return the next order for a heliostat, None once its lock is removed.
 
-        It waits for a person if it is not known whose lock it is.
+        It waits for an operator if the owner of the lock is unknown.
         """
         node = self._field.rows[self._field.index[name]]
         if node["state"] != states.LOCKED:
-            # It stays where it was unlocked until it is sent to its standby point.
+            # The heliostat stays where it was unlocked until it is sent to its standby point.
             return "IDLE" if lock.released and node["state"] == states.IDLE else None
         if lock.uncertain:
             return _WAIT
@@ -162,7 +162,7 @@ class Locks:
         )
 
     def sent(self, what: str, heliostats: Iterable[str]) -> None:
-        """Note an order that has been given; one that is not obeyed is given again."""
+        """Note an order that was sent; it is repeated if the heliostat does not obey."""
         for name in heliostats:
             lock = self._locked[name]
             if what == "UNLOCK":
@@ -171,7 +171,7 @@ class Locks:
                 del self._locked[name]
 
     def under_way(self, heliostats: Iterable[str]) -> frozenset[str]:
-        """Return those that were sent to stow since they were locked: nothing more is needed."""
+        """Return the heliostats sent to stow since they were locked, which need nothing more."""
         stowing = self._ledger.later(STOWING, LOCKING)
         return frozenset(name for name in heliostats if stowing[self._field.index[name]])
 

@@ -8,23 +8,23 @@ from heliotrope.safety import Alarm
 
 
 class Part:
-    """Base of the parts that the plant controller runs.
+    """Base class of the parts that the plant controller runs.
 
-    A part replaces the hooks that concern it; here they do nothing. The controller has one tuple of
-    parts, and calls a hook of each in the order of the tuple. All times are monotonic, s.
+    A part overrides the hooks that concern it; here they do nothing. The controller has one tuple
+    of parts, and calls a hook of each in the order of the tuple. All times are monotonic, s.
     """
 
     def on_connected(self, cluster: str, now: float) -> None:
-        """Act on a cluster that has connected: any boards may answer there."""
+        """Handle a newly connected cluster, where any boards may respond."""
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Take a cluster's status, which the state of the field holds already."""
+        """Handle a cluster's status, which the state of the field already contains."""
 
     def on_rows(self, cluster: str, now: float) -> None:
-        """Act on the rows of a cluster, once every part has taken its status."""
+        """Handle the rows of a cluster, once every part has handled its status."""
 
     def on_alarm(self, cluster: str, alarm: Alarm) -> None:
-        """Take an alarm of a cluster."""
+        """Handle an alarm of a cluster."""
 
     def on_sent(
         self,
@@ -34,12 +34,12 @@ class Part:
         now: float,
         again: bool,
     ) -> None:
-        """Note a command that has been sent, or repeated (``again``), DEFOCUS and STOW too."""
+        """Note a command that was sent or repeated (``again``), including DEFOCUS and STOW."""
 
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Note what some heliostats of a ticket have acknowledged, refused or done."""
+        """Note what some heliostats of a ticket acknowledged, refused or completed."""
 
     def on_beat(self, now: float) -> None:
         """Run the tasks of every beat (`PlantSettings.beat`)."""

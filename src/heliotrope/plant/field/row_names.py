@@ -7,17 +7,17 @@ from heliotrope.plant.field.clusters import Clusters
 from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
 
-#: A cluster is asked again for the names of its rows after this time, s.
+#: A cluster is queried again for the names of its rows after this time, s.
 _AGAIN = 5.0
 
 
 class RowNames(Part):
-    """The questions for the names of rows.
+    """Queries for the names of rows.
 
     Parameters
     ----------
     field, clusters
-        The state of the field, which learns the names; the clusters, which are asked.
+        The state of the field, which receives the names; the clusters, which are queried.
     """
 
     def __init__(self, field: FieldState, clusters: Clusters) -> None:
@@ -25,7 +25,7 @@ class RowNames(Part):
         self._asked_at = dict.fromkeys(field.clusters, -math.inf)
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Ask for the names of rows that the plant cannot read."""
+        """Query the names of rows that the plant cannot interpret."""
         del status
         if self._field.knows_order(cluster) or now - self._asked_at[cluster] < _AGAIN:
             return
@@ -35,5 +35,5 @@ class RowNames(Part):
             if "error" not in answer.data:
                 self._field.learn_order(cluster, tuple(answer.data))
 
-        # The statistics come in the same order.
+        # The statistics arrive in the same order.
         self._clusters.ask(self._clusters.ends[cluster], "statistics", learn)

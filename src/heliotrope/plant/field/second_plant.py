@@ -13,7 +13,7 @@ class SecondPlant(Part):
     Parameters
     ----------
     run
-        Name of this run of the plant, as its leases carry it.
+        Name of this plant run, as sent in its leases.
     tell
         Called with each alarm.
     """
@@ -24,7 +24,7 @@ class SecondPlant(Part):
         self._lost: dict[str, str] = {}
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Take a cluster's status."""
+        """Handle a cluster's status."""
         del now
         before = bool(self._lost)
         if self._run in status.barred:
@@ -41,7 +41,7 @@ class SecondPlant(Part):
             self._tell(alarms.SECOND_PLANT.ended())
 
     def refusal(self, clusters: Iterable[str]) -> str | None:
-        """Return the reason why clusters take no motion from this plant, None if they do."""
+        """Return why clusters accept no motion from this plant, None if they do."""
         lost = sorted(set(clusters) & self._lost.keys())
         if not lost:
             return None

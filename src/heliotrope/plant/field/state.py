@@ -23,7 +23,7 @@ from heliotrope.links.messages import NEVER, NODE, ClusterStatus
 #: Age from which a row is stale, s: three missed polls.
 STALE = 3.0
 
-#: States in which a mirror makes no motion but a turn away and the way to stow.
+#: States in which a heliostat moves only to turn away and to go to stow.
 _HELD = (states.LOCKED, states.FAULT)
 #: Goals that differ by more steps than this belong to another motion.
 _TURN = 200
@@ -109,8 +109,8 @@ class FieldState:
         Heliostats whose boards had restarted, or stored another armature, at the last status; the
         boards may have been replaced.
     turned
-        Whether a heliostat that is locked or in FAULT has moved since; it has turned away, and
-        turns no further, (N,). If it were locked again it would turn, which no status shows.
+        Whether a heliostat that is locked or in FAULT has moved since; if so, it has turned away
+        and turns no further, (N,). It would turn if it were locked again, which no status shows.
 
     Raises
     ------
@@ -150,7 +150,7 @@ class FieldState:
         return len(self.names)
 
     def take(self, cluster: str, status: ClusterStatus, at: float) -> list[str]:
-        """Take a status that arrived at ``at`` (monotonic s); return its problems.
+        """Accept a status that arrived at ``at`` (monotonic s); return its problems.
 
         Raises
         ------
@@ -208,7 +208,7 @@ class FieldState:
         return np.array([r if r >= 0 and self.cluster[r] == c else -1 for r in rows], np.intp)
 
     def _note_failures(self, mine: npt.NDArray[np.intp], new: npt.NDArray[Any], at: float) -> None:
-        """Note failed heliostats: in FAULT, or silent while their cluster reports."""
+        """Note failed heliostats: in FAULT, or silent although their cluster reports."""
         known = np.isfinite(self.heard[mine])
         before = self.rows["state"][mine] == states.FAULT
         faulty = known & ~before & (new["state"] == states.FAULT)
@@ -217,7 +217,7 @@ class FieldState:
         self.failed_at[mine[faulty | (known & silent & ~was_silent)]] = at
 
     def learn_order(self, cluster: str, names: tuple[str, ...]) -> None:
-        """Take the names of a cluster's rows, in order."""
+        """Accept the names of a cluster's rows, in order."""
         self._places[cluster] = (names, self._rows_of(cluster, names))
         members = self.members[cluster]
         self.unlisted.difference_update(members)

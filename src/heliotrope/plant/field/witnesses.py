@@ -28,15 +28,15 @@ from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 from heliotrope.sun import Site, fast_vector
 
-#: A sun that a witness sees this far from the plant's own contradicts it, beside the witness's
-#: error, rad: 14 s of time, or the limit at which a cluster's site differs.
+#: A witnessed sun vector that differs from the plant's own by more than this, plus the error of the
+#: witness, contradicts it, rad: 14 s of time, or the limit at which a cluster's site differs.
 AGREES = 1e-3
-#: Errors of the witnesses, rad: of a sun sensor, and of a beam whose mirror was calibrated (the
+#: Errors of the witnesses, rad: of a sun sensor, and of a beam whose heliostat was calibrated (the
 #: limit of `pointing_disagrees`).
 SENSOR_ERROR, BEAM_ERROR = 5e-3, 3e-3
-#: Elevation of the sun from which a plant says that no witness has seen it today, rad.
+#: Solar elevation above which the plant reports that no witness has seen the sun today, rad.
 _UP = math.radians(5.0)
-#: Name of the witness that calibration visits are.
+#: Name of calibration visits as a witness.
 PHOTOGRAPHS = "photographs"
 #: Longest text of a sun sensor, bytes.
 _LONGEST = 64
@@ -47,27 +47,27 @@ class Witness(Protocol):
 
     @property
     def name(self) -> str:
-        """Name for people."""
+        """Name for display."""
         ...
 
     async def sun(self, site: Site) -> tuple[FloatArray, float] | None:
-        """Return the unit vector to the sun now, ENU, (3,), and its error, rad; None: not known.
+        """Return the unit vector to the sun now, ENU, (3,), and its error, rad; None: unknown.
 
         Parameters
         ----------
         site
-            Of the plant, for its air; a witness that knows its own place takes that.
+            Site of the plant, for its atmosphere; a witness that knows its own position uses that.
         """
         ...
 
 
 class SatelliteWitness:
-    """A satellite receiver at the plant: its time and its place give a sun.
+    """A satellite receiver at the plant, whose time and position determine a sun vector.
 
     Parameters
     ----------
     gpsd
-        Run by others.
+        Client of the receiver; the owner runs it.
     clock
         Clock of the plant.
     """
@@ -78,7 +78,7 @@ class SatelliteWitness:
         self._gpsd, self._clock = gpsd, clock
 
     async def sun(self, site: Site) -> tuple[FloatArray, float] | None:
-        """Return the sun of the receiver's time and place; None without a fresh fix."""
+        """Return the sun vector at the receiver's time and position; None without a fresh fix."""
         ahead, receiver = self._gpsd.ahead, self._gpsd.receiver
         place = receiver.latitude_deg, receiver.longitude_deg
         if ahead is None or not np.isfinite(place).all():
@@ -90,7 +90,8 @@ class SatelliteWitness:
 class SunSensorFile:
     """A sun sensor, read from a file that another program replaces with each reading.
 
-    It holds the azimuth from north through east and the elevation of the apparent sun, degrees.
+    The file holds the azimuth from north through east and the elevation of the apparent sun,
+    degrees.
 
     Parameters
     ----------
@@ -104,15 +105,15 @@ class SunSensorFile:
         self._path, self._written = path, 0
 
     async def sun(self, site: Site) -> tuple[FloatArray, float] | None:
-        """Return the sun of a file that was replaced since the last call; None if it was not."""
-        del site  # the sensor sees the sun
+        """Return the sun vector from a file replaced since the last call; None if it was not."""
+        del site  # the sensor observes the sun itself
         return await asyncio.to_thread(self._read)
 
     def _read(self) -> tuple[FloatArray, float] | None:
         try:
             written = self._path.stat().st_mtime_ns
             if self._written in (0, written):
-                self._written = written  # the file that is there at the start may be old
+                self._written = written  # a file present at start-up may be old
                 return None
             self._written = written
             with self._path.open("rb") as file:
@@ -130,12 +131,13 @@ class Witnesses(Part):
     Parameters
     ----------
     names
-        Witnesses of which one must agree before the first heliostat of a day joins a receiver;
-        none: nothing is required, and the plant says so once a day; None: that is accepted.
+        Witnesses; one of them must agree before the first heliostat of a day joins a receiver.
+        Empty: none is required, and the plant says so once a day; None: none is required, and the
+        plant does not report it.
     site
-        Of the plant.
+        Site of the plant.
     utc
-        Returns the plant's time, POSIX s.
+        Function that returns the plant's time, POSIX s.
     tell
         Called with each alarm.
     """
@@ -148,17 +150,17 @@ class Witnesses(Part):
         tell: Callable[[Alarm], None],
     ) -> None:
         self._names, self._site, self._utc, self._tell = names, site, utc, tell
-        #: Day on which a witness agreed last, and on which the plant said that none has.
+        #: Day on which a witness last agreed, and day on which the plant reported that none had.
         self._agreed_on = self._told_on = -1
-        #: Witnesses that contradict, and what they say.
+        #: Witnesses that contradict, and their statements.
         self._contradicting: dict[str, str] = {}
-        #: Offsets of the sun by photographs of today that contradict, (3,), by heliostat.
+        #: Sun offsets from today's contradicting photographs, (3,), by heliostat.
         self._offsets: dict[str, FloatArray] = {}
         #: Heliostats whose photographs have agreed since one contradicted.
         self._agreeing: set[str] = set()
 
     def _day(self, utc: float) -> int:
-        """Return the number of the day at the site, from midnight to midnight of mean time."""
+        """Return the number of the day at the site, from midnight to midnight, mean solar time."""
         return math.floor(utc / 86_400.0 + self._site.longitude_deg / 360.0)
 
     @property
@@ -182,7 +184,7 @@ class Witnesses(Part):
         return refusals.UNWITNESSED.text.format(problem=problem)
 
     def take(self, name: str, observed: FloatArray, error: float) -> None:
-        """Take the sun (3,) that a witness sees now, with its error, rad."""
+        """Accept the sun vector (3,) that a witness observes now, with its error, rad."""
         off = float(angle_between(observed, fast_vector(self._utc(), self._site)))
         if off <= AGREES + error:
             self._agrees(name)
@@ -192,18 +194,18 @@ class Witnesses(Part):
     def photographed(
         self, record: HeliostatCalibration | None, mechanism: Mechanism, sightings: Sightings
     ) -> str | None:
-        """Take photographs of a heliostat's beam on a target, before they are learnt from.
+        """Compare photographs of a heliostat's beam on a target, before they are used in a fit.
 
-        The beam shows where the sun stands, if the mirror was calibrated before today: what it
-        has learnt today may have come from the wrong sun. One mirror that misses by more may have
-        moved; two that put the sun at the same wrong place have not. Returns the
-        reason why not to learn from the photographs, if there is one: the sun that they assume may
-        be wrong.
+        The beam reveals the sun direction if the heliostat was calibrated before today; a
+        calibration of today may come from a wrong sun direction. One heliostat that misses by more
+        may have moved; two heliostats that indicate the same wrong sun direction have not. Returns
+        the reason not to use the photographs, if there is one: the sun direction that they assume
+        may be wrong.
 
         Parameters
         ----------
         record, mechanism
-            The calibration believed, None before the first; and its mechanism, batch shape (1,).
+            The believed calibration, None before the first; and its mechanism, batch shape (1,).
         sightings
             Sightings of the photographs.
         """
@@ -214,7 +216,7 @@ class Witnesses(Part):
         offset = np.mean(reflect(path, pose.normal) - source, axis=0)
         if float(np.linalg.norm(offset)) <= BEAM_ERROR:
             self._agreeing.add(record.heliostat)
-            # What two mirrors have contradicted, one does not settle.
+            # One heliostat is not enough to settle what two have contradicted.
             if PHOTOGRAPHS in self._contradicting and len(self._agreeing) < 2:
                 return self.refusal
             self._offsets.clear()
@@ -228,16 +230,16 @@ class Witnesses(Part):
         return self.refusal
 
     def testifies(self, record: HeliostatCalibration | None) -> bool:
-        """Return whether photographs of a heliostat show where the sun stands."""
+        """Return whether photographs of a heliostat reveal the sun direction."""
         return record is not None and self._day(record.at) < self._day(self._utc())
 
     @property
     def awaits_photographs(self) -> bool:
-        """Whether photographs count and no witness has agreed today, or one contradicts."""
+        """Whether photographs count and either no witness has agreed today or one contradicts."""
         return PHOTOGRAPHS in (self._names or ()) and bool(self.refusal)
 
     def on_second(self, now: float) -> None:
-        """Say once a day that no witness has seen the sun, if that is so."""
+        """Report once a day that no witness has seen the sun, if that is the case."""
         del now
         utc_s = self._utc()
         day = self._day(utc_s)

@@ -12,7 +12,7 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.local import Buckets
 from heliotrope.plant.orders.authority import Person
 
-#: Orders of one person, and of all: 1/s, and at once.
+#: Orders of one person, and of all persons: rate, 1/s, and burst.
 OWN, ALL = (10.0, 100.0), (30.0, 200.0)
 
 
@@ -26,9 +26,9 @@ class Admission:
     Parameters
     ----------
     monotonic
-        Returns the time, s.
+        Function that returns the time, s.
     own, everybody
-        Orders of one person, and of all: 1/s, and at once.
+        Orders of one person, and of all persons: rate, 1/s, and burst.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Admission:
         Raises
         ------
         BusyError
-            If there were too many of this person or of all.
+            If there were too many orders of this person or of all persons.
         """
         whose, wait = f"of {person.name}", self._own.take(person.name)
         if wait == 0.0:

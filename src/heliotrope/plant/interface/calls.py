@@ -46,7 +46,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 VIEWER, OPERATOR, ENGINEER = Role
 #: Time for which all viewers share a view, s.
 FRESH = 0.5
-#: The same of a view that never changes.
+#: The same for a view that never changes.
 ALWAYS = float("inf")
 _LINK = re.compile(r"\[([^\]]+)\]\([^)]+\)")
 
@@ -147,7 +147,7 @@ CALLS: dict[str, Call] = {}
 
 
 def _call(request: str = "", group: str = "", role: Role = VIEWER, **more: Any) -> Callable[[F], F]:
-    """Put a function into the table, under its name; see `Call`."""
+    """Add a function to the table, under its name; see `Call`."""
 
     def add(function: F) -> F:
         hints = get_type_hints(function)

@@ -21,24 +21,24 @@ from heliotrope.plant.interface.service import PlantInterface
 from heliotrope.safety import Alarm, AlarmKind, alarms
 
 _LOG = logging.getLogger(__name__)
-#: Time between two looks at the process, s.
+#: Interval between two checks of the process, s.
 _LOOK = 0.2
-#: Time for the process to end by itself, s.
+#: Time allowed for the process to end by itself, s.
 _END = 1.0
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a console, in a process of its own.
+    """A part of a console, in its own process.
 
     Attributes
     ----------
     name
-        In its signs of life.
+        Name in its signs of life.
     module
-        The program.
+        Module of the program.
     alarm
-        Stands while there is none.
+        Alarm that is active while the process is not running.
     """
 
     name: str
@@ -58,13 +58,13 @@ class Patience:
     Attributes
     ----------
     begin
-        Until its first sign of life.
+        Maximum time until its first sign of life.
     silent
-        Between two signs of life.
+        Maximum time between two signs of life.
     pause, longest
-        Before it is started again: at first, and at most.
+        First and longest pause before it is restarted.
     well
-        Time at work after which the pause is short again.
+        Running time after which the pause is short again.
     """
 
     begin: float = 90.0
@@ -131,7 +131,7 @@ class ConsoleProcess:
             pause = min(2.0 * pause, self._patience.longest)
 
     async def _one(self) -> str:
-        """Run the process; return why it has to be started again."""
+        """Run the process; return why it must be restarted."""
         try:
             process = await asyncio.to_thread(self._start)
         except InputError as error:
@@ -139,7 +139,7 @@ class ConsoleProcess:
             return f"cannot begin ({error})"
         try:
             problem = await self._watch(process)
-            process.kill()  # nothing, if it has ended
+            process.kill()  # does nothing if it has ended
             return problem
         finally:
             self.pid = 0
@@ -151,7 +151,7 @@ class ConsoleProcess:
             [sys.executable, "-m", self._part.module],
             stdin=subprocess.PIPE,
             pass_fds=[line.fileno()],
-            # Ctrl-C in the plant's terminal is the plant's: it stows the field first.
+            # Ctrl-C in the plant's terminal is only for the plant, which stows the field first.
             start_new_session=True,
         )
         self.starts += 1
@@ -196,7 +196,7 @@ class ConsoleProcess:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """End the process: it ends by itself when its input does; one that does not is killed."""
+    """End the process, which ends when its input does; if it does not, kill it."""
     if process.stdin is not None:
         with contextlib.suppress(OSError):
             process.stdin.close()

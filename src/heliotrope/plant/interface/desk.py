@@ -32,7 +32,7 @@ from heliotrope.plant.orders.authority import Person, RefusedError
 from heliotrope.plant.orders.queue import RECORDING
 from heliotrope.plant.orders.tickets import Ticket
 
-#: An emergency order with the word of an earlier one is that one for this long, s.
+#: For this long, an emergency order with the identifier of an earlier one counts as that order, s.
 SAME, _MOST_CALLED = 30.0, 100
 #: A holder of the authority counts as present for this long after renewing it, s.
 PRESENT = 8.0
@@ -115,27 +115,28 @@ class CameraReading:
 
 
 class Desk:
-    """The plant at work, as the calls see it; used in the plant's loop only.
+    """The running plant, as the calls see it; used only in the plant's event loop.
 
     Parameters
     ----------
     operations
-        The plant at work.
+        Operations of the running plant.
 
     Attributes
     ----------
     tickets
-        The last commands.
+        Tickets of the last commands.
     readings
-        Readings that programs give.
+        Readings that programs supply.
     """
 
     def __init__(self, operations: Operations) -> None:
         self.operations, self.tickets = operations, Tickets()
         self.readings = GivenReadings(operations.plant, operations.logbook)
-        #: When each holder of the authority was last present, monotonic time of the machine, s.
+        #: When each holder of the authority was last present, monotonic time of the computer, s.
         self._present: dict[str, float] = {}
-        #: When emergencies were ordered, by person and word, monotonic time of the machine, s.
+        #: When emergencies were ordered, by person and identifier, monotonic time of the computer,
+        #: s.
         self._called: dict[tuple[str, str], float] = {}
 
     async def keep_authority(self) -> None:
@@ -186,8 +187,8 @@ class Desk:
     async def told(self, person: Person, new: bool) -> AuthorityState:
         """Return the holder once a new token is known.
 
-        Clusters get it with a lease, their nodes a second later; until then the field would refuse
-        commands.
+        Clusters get it with a lease, and their local controllers a second later; until then the
+        field would refuse commands.
         """
         if new:
             await asyncio.sleep(1.5 * self.operations.plant.settings.period + 1.0)
@@ -199,7 +200,7 @@ class Desk:
         return self._is_present(person)
 
     def release(self, person: Person) -> AuthorityState:
-        """Release the command authority; automatic control goes on."""
+        """Release the command authority; automatic control continues."""
         self._present.pop(person.name, None)
         self.operations.release_authority(person, self.token_of(person))
         return self.authority_of(person)
@@ -211,7 +212,7 @@ class Desk:
     # -- commands --------------------------------------------------------------------------
 
     def order_emergency(self, who: Person, given: orders.EmergencyCall) -> EmergencyView:
-        """Order an emergency, once for each word: the page sends its order by two ways."""
+        """Order an emergency, once per identifier: the page sends its order over two paths."""
         key, now = (who.name, given.call), time.monotonic()
         if not given.call or now - self._called.get(key, -math.inf) >= SAME:
             self.operations.emergency(who, given.act, given.reason)
@@ -222,16 +223,16 @@ class Desk:
         return self.operations.viewer.emergency()
 
     async def recorded(self, ticket: Ticket) -> TicketState:
-        """Keep a ticket; return its progress once it is recorded, or once that has failed.
+        """Store a ticket; return its progress once it is recorded, or once that has failed.
 
-        The next command of the same client then finds the points that this one has assigned.
+        The next command from the same client then finds the points that this command has assigned.
         """
         self.tickets.put(ticket)
         await ticket.written(RECORDING + 1.0)
         return TicketState.of(ticket)
 
     async def resume(self, who: Person) -> None:
-        """Let automatic control go on; an order that was just withdrawn is waited for.
+        """Let automatic control continue, after waiting for an order that was just withdrawn.
 
         Raises
         ------
@@ -253,19 +254,19 @@ class Desk:
     # -- photographs -----------------------------------------------------------------------
 
     async def kept(self, heliostat: str, limit: int) -> list[PictureRow]:
-        """Return the newest kept photographs of a heliostat."""
+        """Return the newest stored photographs of a heliostat."""
         pictures = self.operations.pictures
         if pictures is None:
             return []
         return await _answer(lambda then: pictures.find(heliostat, limit, then))
 
     async def kept_picture(self, identity: int) -> bytes:
-        """Return a kept photograph as JPEG.
+        """Return a stored photograph as JPEG.
 
         Raises
         ------
         UnknownNameError
-            If there is none of that number.
+            If there is no photograph with that number.
         """
         pictures = self.operations.pictures
         if pictures is None:
@@ -276,7 +277,7 @@ class Desk:
 
     @property
     def marking(self) -> Marking:
-        """Takes views that persons mark.
+        """The part that accepts target views marked by operators.
 
         Raises
         ------
@@ -314,12 +315,12 @@ class Desk:
 
 
 async def _answer(ask: Callable[[Callable[[T | Exception], None]], None]) -> T:
-    """Wait for the answer of a disk."""
+    """Wait for the reply of a disk."""
     told: asyncio.Future[T] = asyncio.get_running_loop().create_future()
 
     def then(found: T | Exception) -> None:
         if told.done():
-            return  # who asked has gone
+            return  # the caller has gone
         if isinstance(found, Exception):
             told.set_exception(found)
         else:

@@ -7,7 +7,7 @@ from heliotrope.plant.orders.audit import AuditError
 from heliotrope.plant.refusals import RefusedError
 from heliotrope.store.records import StoreError
 
-#: By kind; a class comes before those that it derives from.
+#: Classes by kind; a class precedes its base classes.
 _CLASSES: dict[str, type[HeliotropeError]] = {
     "busy": BusyError,
     "unknown": UnknownNameError,
@@ -29,7 +29,7 @@ def kind_of(error: HeliotropeError) -> tuple[str, str]:
 def remade(error: CallError) -> HeliotropeError:
     """Return the error that the plant's process raised."""
     kind = _CLASSES.get(error.kind, HeliotropeError)
-    # The text is complete: the constructor of an unknown name would make another.
+    # The text is complete; the constructor of `UnknownNameError` would create another text.
     made = kind.__new__(kind)
     made.args = (str(error),)
     return made

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 #: Time for which a link is valid, s.
 VALID = 600.0
-#: Random bytes of a link.
+#: Number of random bytes in a link.
 _RANDOM = 32
 
 
@@ -21,7 +21,7 @@ class OneTimeLink:
     Parameters
     ----------
     now
-        Gives monotonic time, s.
+        Function that returns monotonic time, s.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -36,7 +36,7 @@ class OneTimeLink:
         return secret
 
     def use(self, secret: str) -> str | None:
-        """Return the account that a secret signs in, and end it; None if it is not valid (now)."""
+        """Return the account that a secret signs in, and end the link; None if it is not valid."""
         with self._turn:
             if self._made is None:
                 return None

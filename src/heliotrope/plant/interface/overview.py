@@ -7,7 +7,7 @@ from heliotrope.plant.interface.encoding import plain
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import ClusterRow
 
-#: Health of a cluster as the page colours it.
+#: Health of a cluster, which determines its colour on the page.
 WELL, TROUBLED, SILENT = 0, 1, 2
 
 
@@ -52,5 +52,5 @@ def _newest(operations: Operations) -> float:
 def _health(row: ClusterRow) -> int:
     if not row.alive:
         return SILENT
-    # NaN, not yet known, is not a problem.
+    # NaN means not yet known, and is not a problem.
     return TROUBLED if row.live < row.heliostats or row.answered < 0.95 or row.acts else WELL

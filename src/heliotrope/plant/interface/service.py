@@ -42,20 +42,21 @@ from heliotrope.store.people import People
 
 T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
-#: Share of the plant's loop that the calls of the two sockets may take.
+#: Fraction of the plant's event loop time that the calls of the two sockets may take.
 _SHARE = {ORDINARY: 0.25, EMERGENCY: 0.5}
-#: Role at the two sockets of the plant's user and of root, who need no token.
+#: Role of the plant's user and of root at the two sockets, where they need no token.
 _WITHOUT = {ORDINARY: Role.VIEWER, EMERGENCY: Role.OPERATOR}
 #: Longest pause after a call, s.
 _PAUSE = 1.0
-#: Time for the store to find a token, and how long one that it found is good if it cannot, s.
+#: Time allowed for the store to find a token, and time for which a token found earlier is trusted
+#: if the store fails, s.
 _STORE, _TRUSTED = 1.0, 3600.0
-#: Refused callers are noted at most this often, s.
+#: Refused callers are recorded at most this often, s.
 _NOTED = 10.0
 _MOST_KNOWN = 100
-#: Both processes of a console have a place in each socket, and so have those that replace them.
+#: Both processes of a console have a place at each socket, and so have their replacements.
 _LIMITS = LocalLimits(reserved=4)
-#: Time for the threads to end, s.
+#: Time allowed for the threads to end, s.
 _END = 5.0
 
 
@@ -67,7 +68,7 @@ class LocalCaller:
 
     @property
     def reserved(self) -> bool:
-        """A console has a place of its own."""
+        """Whether this caller has a reserved place, as a console does."""
         return self.person is None
 
 
@@ -105,7 +106,7 @@ class PlantInterface:
         self._known: dict[str, tuple[float, Person]] = {}
         self._noted = -math.inf
         self.admission, self._link = Admission(), OneTimeLink()
-        #: Threads that wait for the store; those that hang take no place from others.
+        #: Threads that wait for the store; if they hang, they block nothing else.
         self._threads = ThreadPoolExecutor(4, "plant people")
         self._plant: asyncio.AbstractEventLoop | None = None
 
@@ -178,7 +179,7 @@ class PlantInterface:
         return done
 
     async def _wait_in_plant(self, work: Coroutine[Any, Any, T]) -> T:
-        """Do work in the plant's loop that waits there; awaited in another loop."""
+        """Run work in the plant's event loop that waits there; awaited in another event loop."""
         assert self._plant is not None
         return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self._plant))
 
@@ -187,8 +188,8 @@ class PlantInterface:
     async def _caller(self, socket: str, hello: dict[str, Any], user: int) -> LocalCaller | None:
         """Return the caller of a first frame, None if key or token is not valid.
 
-        The plant's own user and root need none: they could stop the plant, or read its store.
-        They may give EMERGENCY, DEFOCUS and STOW, and see all.
+        The plant's own user and root need neither, because they could stop the plant or read its
+        store anyway. They may order EMERGENCY, DEFOCUS and STOW, and see everything.
         """
         key, token = hello.get("key"), hello.get("token")
         if hello == {"user": True}:
@@ -204,12 +205,12 @@ class PlantInterface:
         return None
 
     def _note(self, kind: SecurityEvent, who: str, detail: str) -> None:
-        """Record a security event; the log bounds their number."""
+        """Record a security event; the log limits their number."""
         note = self._desk.operations.security.note
         self.in_plant(lambda: note(kind, who, detail=detail))
 
     async def _person(self, token: str) -> Person | None:
-        """Return the person of a token; one known lately also if the store cannot say."""
+        """Return the person of a token; if the store does not respond, as last known."""
         name = hashlib.sha256(token.encode()).hexdigest()
         try:
             async with asyncio.timeout(_STORE):
@@ -254,7 +255,7 @@ class PlantInterface:
     async def _answer(
         self, calls: dict[str, Call], turns: "_Turns", caller: LocalCaller, frame: Frame
     ) -> tuple[Any, bytes]:
-        """Return value and blob of the answer to a request."""
+        """Return the value and blob of the reply to a request."""
         name, given = _called(frame.head)
         if caller.person is None and name == "heartbeat":
             beat = _checked(Beat, given)
@@ -271,7 +272,7 @@ class PlantInterface:
         arguments = _checked(call.arguments, given)
         person = caller.person or _on_behalf(frame.head.get("for"))
         if person.role < call.role:
-            if caller.person is not None:  # a console has noted it, with the caller's address
+            if caller.person is not None:  # a console has recorded it, with the caller's address
                 self._note(SecurityEvent.ORDER_REFUSED, person.name, f"{name} on this machine")
             raise refusals.ROLE_TOO_LOW.error(
                 what=name, person=person.name, role=person.role.title, needed=call.role.title
@@ -287,14 +288,14 @@ class PlantInterface:
 
 
 class _Turns:
-    """One call at a time in the plant's loop, for a share of its time."""
+    """Runs one call at a time in the plant's event loop, for a fraction of its time."""
 
     def __init__(self, interface: PlantInterface, share: float) -> None:
         self._interface, self._rest = interface, 1.0 / share - 1.0
         self._turn, self._free_at = asyncio.Lock(), -math.inf
 
     async def do(self, call: Call, desk: Desk, person: Person, given: Any, blob: bytes) -> Any:
-        """Do a call; return its value."""
+        """Run a call; return its value."""
         async with self._turn:
             await asyncio.sleep(max(0.0, self._free_at - time.monotonic()))
             took = 0.0
@@ -314,7 +315,7 @@ class _Turns:
 
 
 class _LoopThread:
-    """A thread with an ordinary loop that serves one socket; a failure opens it again."""
+    """A thread with an ordinary event loop that serves one socket, reopened after a failure."""
 
     def __init__(
         self,
@@ -333,7 +334,7 @@ class _LoopThread:
         self._thread.start()
 
     def close(self) -> None:
-        """End."""
+        """End the thread."""
         self._over.set()
         if self._loop is not None and self._main is not None and not self._loop.is_closed():
             with contextlib.suppress(RuntimeError):
@@ -365,7 +366,7 @@ class _LoopThread:
 
 
 def _called(head: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return name and arguments of a call, which may be given as a request of the API.
+    """Return the name and arguments of a call, which may also be written as an API request.
 
     Raises
     ------
@@ -384,7 +385,7 @@ def _called(head: dict[str, Any]) -> tuple[str, dict[str, Any]]:
 def _people_calls(
     people: People, factors: Factors, link: OneTimeLink
 ) -> dict[str, Callable[..., Any]]:
-    """Return the calls that only a console may make, done in threads and not in the loop."""
+    """Return the calls that only a console may make, run in threads rather than in the loop."""
     return {
         "people.account": people.account,
         "people.accounts": people.accounts,
@@ -407,12 +408,12 @@ def _people_calls(
 
 
 def _checked(model: Any, given: dict[str, Any]) -> Any:
-    """Return checked arguments.
+    """Return validated arguments.
 
     Raises
     ------
     InputError
-        If they do not fit.
+        If they are invalid.
     """
     try:
         return model.model_validate(given)
@@ -423,7 +424,7 @@ def _checked(model: Any, given: dict[str, Any]) -> Any:
 
 
 def _on_behalf(given: Any) -> Person:
-    """Return the person whom a console speaks for; nobody in particular may look only."""
+    """Return the person for whom a console acts; without a person, only viewing is allowed."""
     if given is None:
         return Person("console", Role.VIEWER)
     try:

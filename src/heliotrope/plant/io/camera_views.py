@@ -19,9 +19,9 @@ from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.target_light import TargetLight
 
-#: JPEG quality (0 to 100) and gamma of the pictures for people.
+#: JPEG quality (0 to 100) and gamma of the displayed pictures.
 _JPEG, _GAMMA = 80, 0.45
-#: What people read under a photograph of a joint visit.
+#: Caption under a photograph of a joint visit.
 SEVERAL = "joint visit: several beams, distinguished by their movements over many photographs"
 
 
@@ -36,11 +36,11 @@ class Views:
         return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
     def show(self, name: str, at: float, jpeg: bytes, line: str) -> None:
-        """Keep a picture that is not read by itself, at a time (POSIX s), with a line about it."""
+        """Store a picture without a reading, at a time (POSIX s), with a line of text."""
         self._views[name] = CameraView(name, self.view(name).version + 1, at, jpeg, (line,))
 
     def keep(self, name: str, at: float, seen: Photograph, jpeg: bytes) -> None:
-        """Keep the reading of a target at a time (POSIX s), with its picture."""
+        """Store the reading of a target at a time (POSIX s), with its picture."""
         reading = seen.reading(name)
         lines = [f"{reason.name}: {reason.text}" for reason in reading.reasons]
         centroid = None
@@ -63,12 +63,12 @@ def light_of(
 ) -> TargetLight:
     """Return the light on a target in a frame taken at ``at``, monotonic s.
 
-    The target is searched for among those of the camera, unless its view is given.
+    The target is searched for among the camera's targets, unless its view is given.
 
     Raises
     ------
     InputError
-        If it is not found.
+        If the target is not found.
     """
     linear = frame.linear(settings.gamma)
     found: Sequence[FoundTarget] = ()
@@ -91,7 +91,7 @@ def beam_of(
     settings: PhotographSettings,
     without: Frame | None = None,
 ) -> tuple[Photograph, bytes]:
-    """Return a frame as it is read, see `read_photograph`, and its picture for people."""
+    """Return a frame's evaluation, see `read_photograph`, and its picture for display."""
     seen = read_photograph(frame, targets, camera, settings=settings, without=without)
     return seen, picture_of(seen)
 
@@ -115,7 +115,7 @@ def picture_of(seen: Photograph) -> bytes:
 
 
 def _brightened(seen: Photograph) -> Photograph:
-    """Return a brighter photograph: beside a beam the target would look black."""
+    """Return a brightened photograph, because beside a beam the target would look black."""
     frame = seen.frame
     top = 255.0 if frame.pixels.dtype == np.uint8 else 65535.0
     table = np.round(255.0 * np.linspace(0.0, 1.0, int(top) + 1) ** _GAMMA).astype(np.uint8)

@@ -38,13 +38,13 @@ from heliotrope.safety import Alarm, alarms
 
 #: Longest wait for a photograph, and the time between checks for its frame, s.
 PATIENCE, _LOOK = 15.0, 0.05
-#: Time until a source that failed is opened again, s.
+#: Time after which a failed source is opened again, s.
 _AGAIN = 5.0
-#: Largest standard deviation of a frame's time, s: in 1 s the sun moves a normal by 36 µrad.
+#: Largest standard deviation of a frame's time, s; in 1 s the sun turns a mirror normal by 36 µrad.
 _UNSURE = 1.0
-#: Largest delay of a stream whose delay is not stated, s.
+#: Longest assumed delay of a stream whose delay is not specified, s.
 _LATE = 2.0
-#: Photographs after which the models of empty targets are saved.
+#: Number of photographs after which the models of empty targets are saved.
 _OFTEN = 20
 
 
@@ -54,16 +54,16 @@ def source_of(camera: Camera, folder: Path, stop: threading.Event) -> Source:
     Parameters
     ----------
     camera
-        With a ``source``; see docs/how-to/camera-sources.md.
+        Camera with a ``source``; see docs/how-to/camera-sources.md.
     folder
         Folder of the plant file.
     stop
-        Ends the source.
+        Event that ends the source.
 
     Raises
     ------
     InputError
-        No source, a recording, or a folder that does not exist.
+        If there is no source, it is a recording, or its folder does not exist.
     """
     who = f"camera {camera.name}"
     if not camera.source:
@@ -94,7 +94,7 @@ class Feed:
     newest
         The last frame, None before the first.
     problem
-        Why no frame comes, empty if nothing is wrong.
+        Why no frame arrives, empty if nothing is wrong.
     """
 
     def __init__(self, source: Source) -> None:
@@ -115,7 +115,7 @@ class Feed:
             self._thread.join(2.0)
 
     def ask(self) -> None:
-        """Take a frame now, if the source takes them at intervals."""
+        """Request a frame now, if the source takes frames at intervals."""
         self._source.wanted.set()
 
     def _run(self) -> None:
@@ -134,7 +134,7 @@ class Feed:
 
 @dataclass(frozen=True)
 class _Eye:
-    """A camera with its feed and the targets that it serves."""
+    """A camera with its feed and its targets."""
 
     camera: Camera
     targets: tuple[Target, ...]
@@ -147,32 +147,32 @@ class RealCameras:
     Parameters
     ----------
     design
-        The plant; the first camera that names a target serves it. One of receiver visits serves the
-        receiver, and the targets that it names.
+        The plant; the first camera that names a target serves it. A camera for receiver visits
+        serves the receiver, and the targets that it names.
     folder
         Folder of the plant file.
     clock
         Clock of the plant.
     watched
-        Receivers that are watched beside receiver visits, by name: their cameras.
+        Cameras of receivers that are monitored apart from receiver visits, by receiver name.
     memory
-        Folder in which models of empty targets are kept; None: they are learnt again at each start.
+        Folder for models of empty targets; None: they are learnt again at each start.
     patience
         Longest wait for a frame, s.
     sources
-        Makes the source of a camera.
+        Function that creates the source of a camera.
     worker
-        Reads photographs.
+        Evaluates photographs.
 
     Attributes
     ----------
     silent
-        Targets whose camera gave no frame when it was last asked.
+        Targets whose camera delivered no frame at the last request.
 
     Raises
     ------
     InputError
-        A camera without a live source.
+        If a camera has no live source.
     """
 
     def __init__(
@@ -190,7 +190,8 @@ class RealCameras:
         self._clock, self._patience = clock, patience
         self._on_alarm: Callable[[Alarm], None] = lambda _: None
         self._stop = threading.Event()
-        # Each photograph is read with what those before it have taught of the empty targets.
+        # Each photograph is evaluated with what earlier photographs revealed about the empty
+        # targets.
         self._worker, self._reading = worker, asyncio.Lock()
         self._memory = Memory() if memory is None else Memory.load(memory)
         self._folder, self._views, self._taken = memory, Views(), 0
@@ -212,7 +213,7 @@ class RealCameras:
         self._settings = PhotographSettings(pictures=read_pictures(folder, design.targets))
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
-        """Begin to take frames; ``on_alarm`` is called when a camera falls silent or comes back."""
+        """Begin to take frames; ``on_alarm`` is called when a camera falls silent or recovers."""
         self._on_alarm = on_alarm
         for feed in {id(eye.feed): eye.feed for eye in self._eyes.values()}.values():
             feed.start()
@@ -223,7 +224,7 @@ class RealCameras:
         Raises
         ------
         InputError
-            If they cannot be written.
+            If the models cannot be written.
         """
         self._stop.set()
         for eye in self._eyes.values():
@@ -232,11 +233,11 @@ class RealCameras:
             self._memory.save(self._folder)
 
     def view(self, target: str) -> CameraView:
-        """Return the last photograph of a target, for people."""
+        """Return the last photograph of a target, for display."""
         return self._views.view(target)
 
     def eye(self, target: str) -> Camera:
-        """Return the camera of a target, as it is known; see `plant.ports.Cameras`."""
+        """Return the camera of a target, as currently known; see `plant.ports.Cameras`."""
         return self._eye(target).camera
 
     def frame(self, target: str) -> Frame:
@@ -248,7 +249,7 @@ class RealCameras:
         return eye.feed.newest
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
-        """Read later photographs by a camera and a target's marks; see `plant.ports.Cameras`."""
+        """Evaluate later photographs with a camera and target marks; see `plant.ports.Cameras`."""
         old = self._eye(target.name)
         targets = tuple(target if t.name == target.name else t for t in old.targets)
         new = _Eye(camera, targets, old.feed)
@@ -262,7 +263,7 @@ class RealCameras:
         return self._eyes[target]
 
     def sees(self, target: str) -> bool:
-        """Return whether a camera looks at a target."""
+        """Return whether a camera observes a target."""
         return target in self._eyes
 
     def awake(self, target: str) -> bool:
@@ -278,14 +279,14 @@ class RealCameras:
         return target not in self.silent
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return the beam seen on a target; the camera cannot tell which heliostat it belongs to.
+        """Return the beam seen on a target; the camera cannot tell which heliostat sent it.
 
         Raises
         ------
         FetchError
-            No frame comes.
+            If no frame arrives.
         UnknownNameError
-            No camera looks at the target.
+            If no camera observes the target.
         """
         del heliostat
         return await self.look(target.name)
@@ -311,7 +312,7 @@ class RealCameras:
         Raises
         ------
         FetchError
-            No frame comes, or its time is not known well enough.
+            If no frame arrives, or its time is not known well enough.
         """
         eye = self._eye(target.name)
         frame = await self._frame(eye, target.name)
@@ -336,7 +337,7 @@ class RealCameras:
         return Exposed(at, asyncio.create_task(read()))
 
     async def _frame(self, eye: _Eye, target: str) -> Frame:
-        """Wait for a frame that is exposed from now on."""
+        """Wait for a frame exposed from now on."""
         asked, until = self._clock.utc(), self._clock.monotonic() + self._patience
         eye.feed.ask()
         while self._clock.monotonic() < until:
@@ -375,7 +376,7 @@ def _learning(
     settings: PhotographSettings,
     memory: Memory,
 ) -> tuple[Photograph, bytes, Memory]:
-    """Return the reading of a frame, its picture, and the updated models of empty targets."""
+    """Return the evaluation of a frame, its picture, and the updated models of empty targets."""
     seen, jpeg = beam_of(frame, targets, camera, replace(settings, empty=memory.models))
     memory.learn(seen.faces)
     return replace(seen, faces=()), jpeg, memory
@@ -396,7 +397,7 @@ def _watching(
 
 
 def dated(frame: Frame, camera: Camera) -> datetime:
-    """Return the earliest instant at which a frame may have been exposed."""
+    """Return the earliest time at which a frame may have been exposed."""
     if frame.time is None:
         raise InputError(
             f"camera {camera.name}: {frame.name} has no time with a time zone; set the camera to "

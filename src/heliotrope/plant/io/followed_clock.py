@@ -22,13 +22,13 @@ from urllib.request import ProxyHandler, build_opener
 from heliotrope.errors import FetchError
 from heliotrope.links.clock import VirtualClock
 
-#: Time between two questions before the field is up, and later at its speed; the shortest; longest
-#: wait for an answer, s.
+#: Interval between two polls before the field is ready, and later at its speed; the shortest
+#: interval; and the longest wait for a reply, s.
 _SOON, _LATER, _LEAST, _PATIENCE = 0.05, 0.2, 0.01, 5.0
-#: Longest time by which the plant goes on from the last answer, s: the field may be slower than its
-#: speed, and a plant far ahead of it would take its reports for old.
+#: Longest time by which the plant continues from the last reply, s. The field may be slower than
+#: its nominal speed, and a plant far ahead of it would consider its reports old.
 _AHEAD = 0.4
-#: Time that a simulated field may take to begin, s.
+#: Time that a simulated field may need to start, s.
 _STARTING = 30.0
 #: Time over which the true speed is measured, s.
 _SPAN = 30.0
@@ -41,15 +41,15 @@ class ClockState:
     Attributes
     ----------
     wall
-        When it was read, by this machine's monotonic clock, s.
+        When it was read, by this computer's monotonic clock, s.
     now, utc
         Its monotonic time, and its UTC in POSIX seconds.
     speed, asked
-        Its seconds per second now, and as it was asked for.
+        Its present and its requested seconds per second.
     waits, begun
-        Whether the field waits for its plant; whether the plant leads all of it.
+        Whether the field waits for its plant; whether the plant controls all of it.
     ahead
-        Longest time by which the plant goes on from it, s; infinite for a field that is gone.
+        Longest time by which the plant continues from it, s; infinite if the field has gone.
     """
 
     wall: float
@@ -62,7 +62,7 @@ class ClockState:
     ahead: float = _AHEAD
 
     def at(self, wall: float) -> float:
-        """Return its monotonic time at another instant of this machine, as far as it is known."""
+        """Return its monotonic time at another time of this computer, as far as it is known."""
         return self.now + min(self.speed * (wall - self.wall), self.ahead)
 
 
@@ -72,22 +72,22 @@ class ClockReader:
     Parameters
     ----------
     address
-        As the links file names it.
+        Address in the links file.
 
     Attributes
     ----------
     state
-        The last one.
+        The last state.
 
     Raises
     ------
     FetchError
-        If the simulated field does not answer.
+        If the simulated field does not reply.
     """
 
     def __init__(self, address: str) -> None:
         self._address = address
-        # A proxy of the environment is for other machines.
+        # A proxy from the environment is meant for other computers.
         self._opener = build_opener(ProxyHandler({}))
         self._states: deque[ClockState] = deque(maxlen=int(_SPAN / _LATER))
         self._stop = threading.Event()
@@ -118,7 +118,7 @@ class ClockReader:
         await asyncio.to_thread(self.fetch, "begin")
 
     async def led(self) -> None:
-        """Wait until the plant leads all of the field."""
+        """Wait until the plant controls all of the field."""
         while not self.state.begun:
             await asyncio.to_thread(time.sleep, _SOON)
 
@@ -128,7 +128,7 @@ class ClockReader:
         Raises
         ------
         FetchError
-            If it does not answer.
+            If it does not reply.
         """
         try:
             with self._opener.open(f"{self._address}/{path}", timeout=_PATIENCE) as answer:
@@ -162,7 +162,7 @@ class ClockReader:
             try:
                 self.state = self._read()
             except (FetchError, ValueError):
-                # Its plant goes on without it, and sees that it is silent.
+                # The plant continues without the field, and notices that it is silent.
                 wall = time.monotonic()
                 now = self.state.at(wall)
                 utc = self.state.utc + now - self.state.now
@@ -186,7 +186,7 @@ class _Followed(selectors.DefaultSelector):
             return list(super().select(None))
         speed = self.reader.state.speed
         wait = timeout / speed if speed > 0.0 else _SOON
-        # The speed may change while it waits.
+        # The speed may change during the wait.
         return list(super().select(max(0.0, min(wait, _LATER)) if timeout > 0.0 else 0.0))
 
 
@@ -196,7 +196,7 @@ class FollowedLoop(asyncio.SelectorEventLoop):
     Parameters
     ----------
     reader
-        Of the field's clock.
+        Reader of the field's clock.
     """
 
     def __init__(self, reader: ClockReader) -> None:

@@ -171,13 +171,13 @@ class LinksFile:
     Attributes
     ----------
     path
-        Links file; other files stand beside it.
+        Links file; other files are in the same folder.
     document
         Its tables.
     keys
-        By cluster; replaced while the links run when the key file changes.
+        Keys by cluster; replaced while the links run if the key file changes.
     password
-        For the broker; replaced like the keys.
+        Password for the broker; replaced like the keys.
     """
 
     path: Path
@@ -191,12 +191,12 @@ class LinksFile:
         Parameters
         ----------
         homes
-            Heliostats of each cluster, as `plant.settings.clusters_of` gives them.
+            Heliostats of each cluster, from `plant.settings.clusters_of`.
 
         Raises
         ------
         FormatError
-            A cluster without a link, a link without a cluster, or one without a key.
+            If a cluster has no link, a link has no cluster, or a key is missing.
         """
         for name in homes:
             if name not in self.document.clusters:
@@ -218,14 +218,14 @@ class LinksFile:
                 raise _keyless(self.path, name)
 
     def build(self, homes: Mapping[str, tuple[str, ...]], clock: Clock) -> "PlantLinks":
-        """Return the plant's ends of the links, and everything that has to run beside them.
+        """Return the plant's ends of the links, and everything that must run beside them.
 
         Raises
         ------
         FormatError
             See `check`.
         InputError
-            Certificates that cannot be used.
+            If certificates cannot be used.
         """
         self.check(homes)
         made = PlantLinks(Papers(clock))
@@ -255,7 +255,7 @@ class LinksFile:
         return made
 
     def _call(self, made: "PlantLinks", clock: Clock) -> None:
-        """Call the witnesses of the sun."""
+        """Create the connections to the witnesses of the sun."""
         table, names = self.document.witness, set()
         if table.gpsd:
             gpsd = Gpsd(clock, *gpsd_at(self.path, table.gpsd, "witness.gpsd"))
@@ -269,7 +269,7 @@ class LinksFile:
         made.witnessed = None if table.none else frozenset(names)
 
     def _take_keys(self) -> None:
-        """Read the key file again, and give the links their keys."""
+        """Read the key file again, and update the keys of the links."""
         path = self.path.parent / self.document.keys
         found = _keys_of(path, self.document)
         for name in self.keys:
@@ -360,7 +360,7 @@ class PlantLinks:
     twin: str = ""
 
     def facts(self) -> dict[str, str]:
-        """Return, by name, why the last connection was refused and whose new key is not used."""
+        """Return why the last connection was refused and which new keys are not used, by name."""
         found = {}
         if self.server is not None and self.server.refused:
             told = f"{self.server.last_refusal} ({self.server.refused} so far)"
@@ -381,7 +381,7 @@ def read_links(path: str | Path) -> LinksFile:
     Raises
     ------
     FormatError
-        If it cannot be used; the text names file, place, value and limit.
+        If the file cannot be used; the text names file, place, value and limit.
     """
     path = Path(path)
     document = read_document(path, "links", LinksDocument, TABLES)
@@ -472,7 +472,7 @@ def _check_encrypted(path: Path, document: LinksDocument) -> None:
 
 
 def _check_simulated(path: Path, document: LinksDocument) -> None:
-    """Refuse links to anything real beside a simulated field, whose clock the plant follows."""
+    """Refuse links to real equipment beside a simulated field, whose clock the plant follows."""
     for name, how in document.clusters.items():
         if how != "tcp":
             raise FormatError(

@@ -30,7 +30,7 @@ from heliotrope.plant.ports import Cameras
 from heliotrope.safety import FLUX_READING
 from heliotrope.safety.proof import FLUX_AGE, FLUX_LIMIT
 
-#: Time between two readings, s.
+#: Interval between two readings, s.
 EVERY = 1.0
 #: A frame may be this far ahead of the plant's clock, s.
 AHEAD = 0.5
@@ -42,8 +42,8 @@ def check_reference(design: Plant, reference: ReceiverReference) -> None:
     Raises
     ------
     InputError
-        No such receiver, several receivers, no such camera, frames of another size, or receiver
-        visits by another camera.
+        If the receiver or the camera does not exist, there are several receivers, the frames have
+        another size, or receiver visits use another camera.
     """
     sight = reference.sight
     who = f"{FLUX_READING}: a reference of receiver {sight.receiver}, camera {sight.camera}"
@@ -74,14 +74,14 @@ def check_reference(design: Plant, reference: ReceiverReference) -> None:
 def flux_by(
     cameras: Cameras, clock: Clock, reference: ReceiverReference, receiver: Receiver
 ) -> "ReceiverFlux":
-    """Return the flux of a receiver by the camera that a plant's cameras have for it.
+    """Return the flux sensor of a receiver, using the plant camera that observes it.
 
-    With a map where the receiver is planar and the camera's pose is known.
+    It includes a map if the receiver is planar and the camera's pose is known.
 
     Raises
     ------
     UnknownNameError
-        If no camera looks at it.
+        If no camera observes the receiver.
     """
     eye = cameras.eye(receiver.name)
     newest = partial(cameras.frame, receiver.name)
@@ -89,7 +89,7 @@ def flux_by(
 
 
 def cell_places(receiver: Receiver, eye: Camera) -> FloatArray | None:
-    """Return the pixels of a receiver's cells, (H, W, 2); None where a camera cannot map them."""
+    """Return the pixels of a receiver's cells, (H, W, 2); None if the camera cannot map them."""
     if receiver.kind != "planar" or eye.position is None:
         return None
     cells = surface_of(receiver).cells
@@ -104,18 +104,18 @@ class ReceiverFlux:
     eye
         The camera.
     newest
-        Returns its newest frame, or raises a `HeliotropeError` if there is none.
+        Function that returns its newest frame, or raises a `HeliotropeError` if there is none.
     clock
         Clock of the plant.
     reference
-        Of this camera.
+        Reference of this camera.
     places
-        Pixels of the receiver's cells, (H, W, 2); None: only the whole is measured.
+        Pixels of the receiver's cells, (H, W, 2); None: only the total is measured.
 
     Attributes
     ----------
     names
-        The one reading.
+        Name of the only reading.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class ReceiverFlux:
         self._kind = ""
 
     async def news(self) -> Readings:
-        """Return a reading each second, or why there is none."""
+        """Return a reading each second, or the reason why there is none."""
         now = self._clock.monotonic()
         if now - self._read_at < EVERY:
             return Readings()
@@ -148,7 +148,7 @@ class ReceiverFlux:
             problem = f"camera {self._eye.name}: {type(error).__name__}: {error}"
         if problem is None:
             return found
-        # Its numbers change each second; the alarm is told once.
+        # The numbers in the text change each second; the alarm is raised once.
         kind = re.sub(r"[\d.]+", "", problem)
         if kind != self._kind:
             found.problems[FLUX_READING] = problem
@@ -156,7 +156,7 @@ class ReceiverFlux:
         return found
 
     async def _read(self, found: Readings) -> str | None:
-        """Take a reading; return why there is none, empty if there is, None if nothing is new."""
+        """Take a reading; return why there is none, empty if there is, None if it is not new."""
         frame, who = self._newest(), f"camera {self._eye.name}"
         made = dated(frame, self._eye)
         age = (self._clock.utc() - made).total_seconds()
@@ -175,7 +175,7 @@ class ReceiverFlux:
             return (
                 f"{who}: successive frames are identical in every pixel, so the camera has frozen"
             )
-        # Light needs no proof that the camera sees all of it.
+        # To show that there is light, the camera need not see all of it.
         if light.doubt and not light.share >= FLUX_LIMIT:
             return f"{who}: {light.doubt}"
         found.values[FLUX_READING] = light.share
@@ -187,11 +187,11 @@ class ReceiverFlux:
         return ""
 
     def _measure(self, frame: Frame) -> ReceiverLight | None:
-        """Return the flux in a frame; None if it repeats the last one."""
+        """Return the flux in a frame; None if the frame repeats the last one."""
         if self._seen is not None:
             rows, columns = self._reference.sight.box
             before, after = self._seen[1][rows, columns], frame.pixels[rows, columns]
-            # A sensor's noise differs from frame to frame.
+            # Sensor noise differs from frame to frame.
             if before.shape == after.shape and np.array_equal(before, after):
                 return None
         return receiver_light(frame, self._reference, self._places)

@@ -28,7 +28,7 @@ _LONGEST = 64
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings that changed since the last look.
+    """Readings that changed since the last check.
 
     Attributes
     ----------
@@ -37,10 +37,10 @@ class Readings:
     problems
         Why a reading cannot be read, by reading; "" once it can be read again.
     made
-        When a new value was made, by reading, monotonic s; one that is not named: now.
+        When a new value was measured, by reading, monotonic s; now for readings not listed.
     seen
-        Of a value by a camera: its fraction in the cells of the receiver, (H, W), or on all of it,
-        (); None if the value is only a lower bound.
+        For a value measured by a camera: its fraction in the cells of the receiver, (H, W), or on
+        the whole receiver, (); None if the value is only a lower bound.
     """
 
     values: dict[str, float] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class Sensors(Protocol):
         ...
 
     async def news(self) -> Readings:
-        """Return the changes since the last call; it must not hold up the loop."""
+        """Return the changes since the last call, without blocking the event loop."""
         ...
 
 
@@ -68,12 +68,12 @@ class AllSensors:
     Parameters
     ----------
     parts
-        Each feeds other readings.
+        Sensors that supply different readings.
 
     Attributes
     ----------
     names
-        Readings of all.
+        Readings of all sensors.
     """
 
     def __init__(self, parts: Sequence[Sensors]) -> None:
@@ -81,7 +81,7 @@ class AllSensors:
         self.names = frozenset[str]().union(*(part.names for part in parts))
 
     async def news(self) -> Readings:
-        """Return the changes of all since the last call."""
+        """Return the changes of all sensors since the last call."""
         found = Readings()
         for part in self._parts:
             news = await part.news()
@@ -93,12 +93,12 @@ class AllSensors:
 
 
 class SensorFiles:
-    """Files of sensors.
+    """Sensor files.
 
     Parameters
     ----------
     files
-        By reading of the safety table, one of `FED`.
+        Files by reading of the safety table, one of `FED`.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class SensorFiles:
                     continue
                 value = float(_content(path))
                 if math.isfinite(value):
-                    # The file that is there at the start may be old.
+                    # A file present at start-up may be old.
                     if name in self._written:
                         found.values[name] = value
                     self._written[name] = written
@@ -144,7 +144,7 @@ class SensorFiles:
 
 
 def _content(path: Path) -> bytes:
-    """Return the start of a file; a pipe or an endless file does not hold up the reading."""
+    """Return the start of a file, without blocking on a pipe or an endless file."""
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         return os.read(handle, _LONGEST)

@@ -32,13 +32,13 @@ _SECURITY, _LOCAL = 10, 16
 _SEVERITIES = {
     Severity.INFO: 6, Severity.WARNING: 4, Severity.ALARM: 3, Severity.EMERGENCY: 1,
 }  # fmt: skip
-#: Longest message, octets: every receiver of RFC 5424 should take it.
+#: Longest message, octets; every receiver of RFC 5424 should accept it.
 _LONGEST = 2048
-#: Messages that may wait.
+#: Number of messages that may wait.
 _WAITING = 10_000
 #: Time limit for connecting and for sending, and pauses between attempts, s.
 _PATIENCE, _FIRST_PAUSE, _LONGEST_PAUSE = 5.0, 0.5, 30.0
-#: The numbers begin again with 1 (section 7.3.1).
+#: After this number, the numbers restart at 1 (section 7.3.1).
 _LAST_NUMBER = 2_147_483_647
 
 
@@ -101,7 +101,7 @@ class _Message:
         )
         text = "".join(c if c.isprintable() else " " for c in self.text)
         made = head.encode() + b"\xef\xbb\xbf" + text.encode(errors="replace")
-        # Cut where a letter begins.
+        # Cut at a character boundary.
         return made[:_LONGEST].decode(errors="ignore").encode()
 
 
@@ -111,18 +111,18 @@ class Syslog:
     Parameters
     ----------
     receiver
-        Where they go.
+        Destination of the messages.
     now
-        Returns the time of an alarm, POSIX s.
+        Function that returns the time of an alarm, POSIX s.
     most
-        Messages that may wait.
+        Maximum number of waiting messages.
 
     Attributes
     ----------
     receiver
         As given.
     lost
-        Number of messages that found no place in the queue.
+        Number of messages for which there was no room in the queue.
     problem
         Why messages cannot be sent now, empty if they can.
     """
@@ -146,7 +146,7 @@ class Syslog:
         self._put(_SECURITY, note.kind.severity, note.at, note.kind.name, f"{note.text}{who}")
 
     def alarm(self, alarm: Alarm) -> None:
-        """Send that an alarm begins or is over."""
+        """Report that an alarm begins or has ended."""
         about = f" {alarm.subject}" if alarm.subject else ""
         text = f"{alarm.condition}{about}: {alarm.text}" + ("" if alarm.active else " (over)")
         severity = alarm.severity if alarm.active else Severity.INFO
@@ -160,7 +160,7 @@ class Syslog:
             self.lost += 1
 
     def close(self, timeout: float = 5.0) -> None:
-        """Send what waits, for ``timeout`` s at most, and end."""
+        """Send the waiting messages, for at most ``timeout`` s, and end."""
         self._ending.set()
         self._thread.join(timeout)
 
@@ -179,7 +179,7 @@ class Syslog:
                 self.problem = f"{self.receiver} ({error.strerror or error})"
                 self._disconnect()
                 if self._ending.wait(pause) and pause > _FIRST_PAUSE:
-                    break  # what waits is lost with the program
+                    break  # waiting messages are lost with the program
                 pause = min(2.0 * pause, _LONGEST_PAUSE)
             else:
                 self.problem, message, pause = "", None, _FIRST_PAUSE
@@ -205,7 +205,7 @@ class Syslog:
         return None
 
     def _look(self) -> None:
-        """Notice between messages that the receiver has ended the connection."""
+        """Detect, between messages, that the receiver has closed the connection."""
         if self._socket is None or self.receiver.scheme == "udp":
             return
         self._socket.settimeout(0.0)
@@ -243,7 +243,7 @@ class Syslog:
         if to.scheme == "tcp":
             return made
         try:
-            # Made for each connection, so that a renewed authority counts at once.
+            # Created for each connection, so that a renewed authority takes effect at once.
             tls = ssl.create_default_context() if to.authority is None else client_tls(to.authority)
             return tls.wrap_socket(made, server_hostname=to.host)
         except InputError as error:
@@ -261,6 +261,6 @@ class Syslog:
 
 
 def _host_name() -> str:
-    """Return this machine's name in printable ASCII, as the header wants it."""
+    """Return this computer's name in printable ASCII, as the header requires."""
     name = "".join(c for c in socket.gethostname() if "!" <= c <= "~")
     return name[:255] or "-"

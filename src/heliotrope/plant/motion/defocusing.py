@@ -1,8 +1,8 @@
 """Where DEFOCUS and STOW lead a beam, and which of them moves it out of a keep-out volume.
 
 Anyone may give both orders, and a local controller accepts them in every state, so no command
-authority is needed. The paths are those of a heliostat without a sun vector: by the defocus angles,
-or straight to stow, azimuth last.
+authority is needed. The paths are those of a heliostat without a sun vector: a turn by the defocus
+angles, or straight to stow, azimuth last.
 """
 
 import numpy as np
@@ -18,9 +18,10 @@ from heliotrope.safety import Act
 
 Rows = npt.NDArray[np.intp]
 
-#: Turn of the axes between two poses that are checked, rad.
+#: Rotation of the axes between two poses that are checked, rad.
 _PIECE = 0.02
-#: One in IDLE or LOCKED stands by if its axes are this near to the angles of standby, rad.
+#: A heliostat in IDLE or LOCKED is at standby if its axes are this close to the standby angles,
+#: rad.
 _STANDS_BY = 0.02
 
 
@@ -33,9 +34,9 @@ def order_out(
     aim: FloatArray | None = None,
     standby: FloatArray | None = None,
 ) -> Act:
-    """Return DEFOCUS or STOW: the one whose path ends outside, and is inside for the smaller turn.
+    """Return DEFOCUS or STOW, whichever has a path that ends outside and turns less inside.
 
-    Where the stow position is not known it is DEFOCUS.
+    If the stow position is unknown, it is DEFOCUS.
 
     Parameters
     ----------
@@ -46,9 +47,9 @@ def order_out(
     sun
         Unit vector to the sun, (3,).
     state
-        Of the heliostat; see `lcu.states`.
+        State of the heliostat; see `lcu.states`.
     aim, standby
-        Its points, m, (3,); None: not known.
+        Its points, m, (3,); None: unknown.
     """
     stow = paths.stow[row]
     if not np.isfinite(stow).all():
@@ -75,7 +76,7 @@ def defocused(
     *,
     alike: bool = False,
 ) -> FloatArray:
-    """Return the angles (K, 2) where DEFOCUS ends.
+    """Return the angles (K, 2) at which DEFOCUS ends.
 
     Parameters
     ----------
@@ -86,9 +87,10 @@ def defocused(
     sun
         Unit vector to the sun, (3,).
     aims, standbys
-        Their points, m, (K, 3); NaN: not known.
+        Their points, m, (K, 3); NaN: unknown.
     alike
-        Whether all turn by the smallest angles among them, as if they were not spread.
+        Whether all turn by the smallest defocus angles among them, as if the angles were not
+        spread.
     """
     check, turn = paths.check, paths.defocus[rows]
     begin = paths.angles(rows, counts)
@@ -104,7 +106,7 @@ def defocused(
     other = np.where(tracks[:, None], standbys, aims)
     end = turned(begin, offsets(pose, other, begin, turn), *paths.stops(rows))
 
-    # Down the safe path from standby and from an approach, as far as the path is known.
+    # From standby and from an approach, down the safe path, as far as the path is known.
     goes = np.isin(state, (states.IDLE, states.LOCKED, states.APPROACHING))
     goes &= np.isfinite(standbys).all(axis=-1) & np.isfinite(paths.stow[rows]).all(axis=-1)
     down = np.flatnonzero(goes)
@@ -114,7 +116,7 @@ def defocused(
     exists = np.arange(points.shape[1]) < length[:, None]
     apart = np.where(good.reshape(apart.shape) & exists, apart, np.inf)
     place = apart.argmin(axis=-1) if apart.size else length
-    # One that stands elsewhere has been moved there by a person.
+    # A heliostat that stands elsewhere has been moved there by an operator.
     at_standby = (place == length - 1) & (apart.min(axis=-1, initial=np.inf) <= _STANDS_BY)
     on_path = (state[down] == states.APPROACHING) | at_standby
     _, lower = end_down_the_path(
@@ -131,7 +133,7 @@ def defocused(
 def defocused_field(
     check: BeamCheck, aims: FloatArray, sun: FloatArray, *, alike: bool = False
 ) -> FloatArray:
-    """Return the angles (N, 2) where DEFOCUS ends for a field that tracks its aims (N, 3).
+    """Return the angles (N, 2) at which DEFOCUS ends for a field that tracks its aims.
 
     Parameters
     ----------
@@ -140,7 +142,8 @@ def defocused_field(
     aims, sun
         ENU, m, (N, 3), and the unit vector to the sun, (3,).
     alike
-        Whether all turn by the smallest angles of the field, as if they were not spread.
+        Whether all turn by the smallest defocus angles of the field, as if the angles were not
+        spread.
     """
     rows = np.arange(len(check.names))
     counts = check.poses(rows, aims, sun).best_counts
@@ -152,7 +155,7 @@ def defocused_field(
 
 
 def _cost(check: BeamCheck, row: int, path: FloatArray, sun: FloatArray) -> tuple[bool, float]:
-    """Return whether a path (K, 2) ends inside a volume, and the turn made inside, rad."""
+    """Return whether a path (K, 2) ends inside a volume, and the rotation made inside, rad."""
     turns = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path, axis=0)).max(axis=-1))])
     at = np.linspace(0.0, turns[-1], 2 + int(turns[-1] / _PIECE))
     poses = np.stack([np.interp(at, turns, path[:, i]) for i in (0, 1)], axis=-1)

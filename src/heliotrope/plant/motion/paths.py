@@ -19,12 +19,12 @@ from heliotrope.plant.field.aims import BeamCheck, point_text
 
 Rows = npt.NDArray[np.intp]
 
-#: Parts of a ramp at whose ends the positions of both axes are computed: they are then off by at
-#: most 1/36 of the path that a ramp takes.
+#: Number of parts of a ramp at whose ends the positions of both axes are computed; the error is
+#: then at most 1/36 of the path that a ramp takes.
 _PARTS = 3
-#: Time that a local controller takes between two points of the path, s.
+#: Time that a local controller needs between two points of the path, s.
 _PAUSE = 0.15
-#: Time over which the sun is taken to move evenly, s.
+#: Time over which the sun is assumed to move uniformly, s.
 _LONG = 60.0
 _WHEN = "on its way from stow to standby"
 
@@ -35,14 +35,14 @@ class Paths:
     Parameters
     ----------
     check
-        Mirrors with their machines, keep-out volumes and receivers.
+        Heliostats with their machines, keep-out volumes and receivers.
 
     Attributes
     ----------
     check
         As given.
     stow
-        Steps, (N, 2); NaN where it is not known.
+        Step counts of stow, (N, 2); NaN if unknown.
     azimuth
         The axis that leaves stow first, (N,).
     defocus
@@ -54,7 +54,7 @@ class Paths:
         self.stow = np.full((count, 2), np.nan)
         self.azimuth = np.zeros(count, dtype=np.intp)
         self.defocus = np.tile(as_float(Config().defocus), (count, 1))
-        # Of a machine that is not known, both axes turn at the same rate, without stops.
+        # For an unknown machine, both axes turn at the same rate, without stops.
         self._rate = np.full((count, 2), 1e4)
         self._ramp = np.full((count, 2), 0.5)
         self._backlash = np.zeros((count, 2))
@@ -94,7 +94,7 @@ class Paths:
     def turns(self, rows: Rows, begin: FloatArray, end: FloatArray) -> FloatArray:
         """Return the angles (K, 3, 2) from counts (K, 2) to others, one axis after the other.
 
-        The azimuth turns first, as when stow is left.
+        The azimuth turns first, as when leaving stow.
         """
         corner = begin.copy()
         every = np.arange(len(rows))
@@ -111,8 +111,8 @@ class Paths:
         rows, begin, end
             Rows of the heliostats, (K,); steps, (K, 2).
         ramps
-            Whether the path goes there at full rate and then back as the ramps round it, for a
-            motion from rest to rest; if not, it only goes there.
+            Whether the path goes there at full rate and then back in the curve due to the ramps,
+            for a motion from rest to rest; if not, it only goes there.
         """
         turned = self._turned(rows, begin, end)
         steps, sign, rate = np.abs(turned - begin), np.sign(turned - begin), self._rate[rows]
@@ -124,7 +124,7 @@ class Paths:
         return self.angles(rows, np.stack(path, axis=1))
 
     def _turned(self, rows: Rows, begin: FloatArray, end: FloatArray) -> FloatArray:
-        """Return the counts (K, 2) where motions turn back: a goal is reached from below."""
+        """Return the counts (K, 2) at which motions reverse: a goal is reached from below."""
         below = np.maximum(end - self._backlash[rows], self._low[rows])
         return as_float(np.where(end < begin, np.minimum(below, end), end))
 
@@ -135,7 +135,7 @@ class Paths:
         return np.asarray((spans.sum(axis=-1) if turns else spans.max(axis=-1)) + _PAUSE)
 
     def angles(self, rows: Rows, counts: FloatArray) -> FloatArray:
-        """Return the angles of axes, rad, at counts; both (K, 2) or (K, W, 2)."""
+        """Return the axis angles, rad, at counts; both (K, 2) or (K, W, 2)."""
         table = self.check.drives.table[rows]
         return as_float(Drive(table[:, None] if counts.ndim > 2 else table).angles(counts))
 
@@ -157,7 +157,7 @@ class Paths:
         standbys
             Standby points, ENU, m, (K, 3).
         sun
-            Returns the unit vector to the sun, (3,), some seconds from now.
+            Function that returns the unit vector to the sun, (3,), some seconds from now.
         """
         check, reasons = self.check, dict[str, str]()
         now, later = sun(0.0), sun(_LONG)
@@ -200,7 +200,7 @@ def _time(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
 
 
 def _bends(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return instants (M, K, 1), the last first, between which motions are straight enough, s."""
+    """Return instants (M, K, 1), last first, between which motions are nearly straight, s."""
     last = _time(steps, rate, ramp)
     part = np.minimum(ramp, 0.5 * last) * (np.arange(_PARTS + 1) / _PARTS)[:, None, None]
     times = np.concatenate([part[1:], last - part])
@@ -208,7 +208,7 @@ def _bends(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
 
 
 def _gone(time: FloatArray, steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return the steps (..., K, 2) that are made by times (..., K, 1), s; see `_time`."""
+    """Return the steps (..., K, 2) made by times (..., K, 1), s; see `_time`."""
     last, faster = _time(steps, rate, ramp), rate / ramp
     t, part = np.minimum(time, last), np.minimum(ramp, 0.5 * last)
     even = faster * part * (t - 0.5 * part)

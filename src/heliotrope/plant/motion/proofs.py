@@ -35,8 +35,8 @@ Rows = npt.NDArray[np.intp]
 _MOVES = 200
 #: Commands whose whole motion is proven before they are sent.
 _PROVEN = messages.TO_STANDBY | messages.BY_COUNTS
-#: States from which IDLE moves a heliostat straight to its standby point; from the last two it
-#: does so once the heliostat has been unlocked, or its fault cleared, which no report may show yet.
+#: States from which IDLE moves a heliostat straight to its standby point. From the last two it does
+#: so once the heliostat has been unlocked, or its fault cleared, which no report may show yet.
 _TO_STANDBY = (
     states.TRACKING,
     states.SEARCHING,
@@ -73,11 +73,11 @@ class PathProofs:
     paths
         Paths of the heliostats past the keep-out volumes.
     field, ledger
-        State of the field, with the positions of the axes; what was ordered.
+        State of the field, with the positions of the axes; the orders sent.
     points
         Assigned aims and standby points.
     sun
-        Returns the unit vector to the sun, (3,), some seconds from now.
+        Function that returns the unit vector to the sun, (3,), some seconds from now.
 
     Attributes
     ----------
@@ -95,13 +95,13 @@ class PathProofs:
     ) -> None:
         self.paths, self._check = paths, paths.check
         self.field, self.ledger, self.points, self.sun = field, ledger, points, sun
-        #: Tables that unverified ones have replaced, by row.
+        #: Tables that have been replaced by unverified ones, by row.
         self._earlier: dict[int, Tables] = {}
 
     def check_points(
         self, name: str, rows: Rows, points: FloatArray, tracking: npt.NDArray[np.bool_]
     ) -> None:
-        """Prove that heliostats (K,) may be given points (K, 3) by AIM or STANDBY.
+        """Prove that heliostats (K,) may be sent to points (K, 3) by AIM or STANDBY.
 
         Raises
         ------
@@ -122,12 +122,13 @@ class PathProofs:
     def _early(self, name: str, rows: Rows) -> dict[str, str]:
         """Return the heliostats that may not have a new point before their next report, and why.
 
-        The path to it is proven from the point before. One that goes there, or may by an order
-        that no report shows yet, would go to the new point from elsewhere.
+        The path to the new point is proven from the previous point. A heliostat that is on the way
+        to the previous point, or may be by an order that no report shows yet, would come from
+        elsewhere.
         """
         if not self._check.volumes:
             return {}
-        if name == "AIM":  # those that track join it, and are examined then
+        if name == "AIM":  # tracking heliostats join it, and are examined then
             return self._unplaced(rows, messages.JOINING)
         state = self.field.rows["state"][rows]
         blocked = self._unplaced(rows[np.isin(state, _TO_STANDBY)])
@@ -138,7 +139,7 @@ class PathProofs:
     ) -> list[tuple[FloatArray, npt.NDArray[np.intp]]]:
         """Return points (M, 3) where the beams of some of K heliostats may be, and which, (M,).
 
-        All are among the first, NaN where no point is known.
+        The first points include all heliostats, with NaN if no point is known.
         """
         points = self.points
         start = np.where(tracking[:, None], points.aims[rows], points.standbys[rows])
@@ -159,13 +160,13 @@ class PathProofs:
         Raises
         ------
         BeamError
-            If none may.
+            If no heliostat may.
         """
         solids = self._check.solids if name == "APPROACH" else ()
         if name not in _PROVEN or not (self._check.volumes or solids):
             return heliostats, {}
         rows = np.array([self.field.place(n) for n in heliostats], dtype=np.intp)
-        # A heliostat without known counts is left to its local controller.
+        # A heliostat with unknown counts is left to its local controller.
         rows = rows[np.isfinite(self.field.counted_at[rows])]
         if name == "APPROACH":
             blocked = self._from_stow(rows)
@@ -185,7 +186,7 @@ class PathProofs:
         early = self._unplaced(rows, messages.SAFE)
         rows, blocked = self._resting(rows)
         if not self._check.volumes:
-            blocked = {}  # a path to a point that is not known here is not proven
+            blocked = {}  # a path to a point that is unknown here is not proven
         stow, counts = self.paths.stow[rows], self.field.counts(rows)
         begin = dict(zip(rows.tolist(), np.where(np.isfinite(stow), stow, counts), strict=True))
         for some, standbys in self.points.possible("STANDBY", rows):
@@ -196,8 +197,8 @@ class PathProofs:
     def _back_to_standby(self, rows: Rows, now: float) -> dict[str, str]:
         """Return the heliostats whose straight path to standby is blocked, and the reasons.
 
-        A path is proven from where a heliostat stands. One that moves is no longer there, and does
-        not turn at once.
+        A path is proven from where a heliostat stands. A moving heliostat is no longer there, and
+        does not turn back at once.
         """
         early = self._unsettled(rows) | self._unplaced(rows, now=now)
         rows, blocked = self._resting(rows)
@@ -209,16 +210,16 @@ class PathProofs:
         return blocked | early
 
     def _unsettled(self, rows: Rows) -> dict[str, str]:
-        """Return the heliostats that move, or were ordered to since their last report."""
+        """Return the heliostats that move, or were ordered to move since their last report."""
         blocked = {self.field.names[row]: STILL_MOVING.text for row in rows[self.moving(rows)]}
         return blocked | self._unplaced(rows)
 
     def _unplaced(
         self, rows: Rows, kind: Kind = MOVING, now: float | None = None
     ) -> dict[str, str]:
-        """Return the heliostats (K,) without a report from after an order of a kind.
+        """Return the heliostats (K,) without a report since an order of a kind.
 
-        With ``now`` (monotonic s) those that are not live are among them. Others wait for them.
+        With ``now`` (monotonic s), heliostats that are not live are included; others wait for them.
         """
         placed = self.ledger.reported(kind)
         if now is not None:
@@ -227,7 +228,7 @@ class PathProofs:
         return {self.field.names[row]: PLACE_UNKNOWN.text for row in late}
 
     def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
-        """Return the heliostats whose standby points are known, and why the others do not go."""
+        """Return the heliostats with known standby points, and why the others do not go."""
         known = np.isfinite(self.points.standbys[rows]).all(axis=-1)
         return rows[known], {
             self.field.names[row]: "the plant does not know its standby point; set one (STANDBY) "
@@ -236,12 +237,12 @@ class PathProofs:
         }
 
     def tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
-        """Return the tables of a heliostat's mechanism now, and once items are stored."""
+        """Return the tables of a heliostat's mechanism now, and after items are stored."""
         before = self._tables(self.field.place(heliostat))
         return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
 
     def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str | None:
-        """Return the reason why a heliostat may not rest at the stow position in items."""
+        """Return why a heliostat may not rest at the stow position in some items."""
         if "stow" not in items:
             return None
         counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
@@ -251,11 +252,11 @@ class PathProofs:
         return blocked.get(heliostat)
 
     def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str | None:
-        """Return the reason why new parameters may not be written in place, None if they may.
+        """Return why new parameters may not be written in the present pose, None if they may.
 
-        With the present parameters and with the new ones, its beam must be free where it stands
-        and on the path from there to its standby point; and with the present ones on the path that
-        the new ones will lead it, since the new ones may be false.
+        With the present parameters and with the new ones, its beam must be clear where it stands
+        and on the path from there to its standby point. With the present parameters it must also be
+        clear on the path along which the new ones will lead it, because the new ones may be wrong.
 
         Parameters
         ----------
@@ -279,10 +280,10 @@ class PathProofs:
 
     @contextmanager
     def unverified(self, heliostat: str) -> Iterator[None]:
-        """Prove paths with the present parameters too, while others that replace them are verified.
+        """Prove paths with the present parameters too, while their replacements are being verified.
 
-        By those, the heliostat goes to a target and comes back; if they are false, its beam is
-        where the present ones say.
+        Under the replacements, the heliostat goes to a target and returns; if they are wrong, its
+        beam is where the present parameters say.
         """
         row = self.field.place(heliostat)
         self._earlier[row] = self._tables(row)
@@ -292,7 +293,7 @@ class PathProofs:
             self._earlier.pop(row, None)
 
     def misled(self, heliostat: str, point: FloatArray) -> str | None:
-        """Return the reason, if any, why unverified parameters block a path to a point (3,)."""
+        """Return why unverified parameters block a path to a point (3,), if they do."""
         rows = np.array([self.field.place(heliostat)])
         blocked = self._by_earlier(rows, point[None])
         return blocked[heliostat].partition(";")[0] if blocked else None
@@ -302,7 +303,7 @@ class PathProofs:
 
     @contextmanager
     def _believing(self, row: int, tables: Tables) -> Iterator[None]:
-        """Prove with other tables of a heliostat."""
+        """Prove with other tables for a heliostat."""
         present = self._tables(row)
         self._check.replace(row, *tables)
         try:
@@ -313,7 +314,7 @@ class PathProofs:
     def _misled(self, rows: Rows, point: FloatArray, tables: Tables) -> dict[str, str]:
         """Return the reason why the path of one heliostat to a point (1, 3) is blocked.
 
-        The parameters of the check lead it, and the beam goes by ``tables``.
+        The parameters of the check lead the heliostat, and the beam goes where ``tables`` say.
         """
         if not np.isfinite(point).all():
             return {}
@@ -323,7 +324,7 @@ class PathProofs:
             return self._check.moving(rows, self.paths.motion(rows, counts, ends), light)
 
     def _by_earlier(self, rows: Rows, points: FloatArray) -> dict[str, str]:
-        """Return the paths to points (K, 3) that are blocked by parameters that were replaced."""
+        """Return the paths to points (K, 3) that are blocked according to replaced parameters."""
         reasons: dict[str, str] = {}
         for i, row in enumerate(rows.tolist()):
             if row in self._earlier:
@@ -331,7 +332,7 @@ class PathProofs:
         return reasons
 
     def _from_here(self, rows: Rows) -> dict[str, str]:
-        """Return the heliostats that may not go from their present place to standby, and why."""
+        """Return the heliostats that may not go from their present pose to standby, and why."""
         light = self.sun(0.0)
         present = self.paths.angles(rows, self.field.posed[rows])
         blocked = self._check.moving(rows, np.repeat(present[:, None], 2, axis=1), light)
@@ -348,7 +349,8 @@ class PathProofs:
     ) -> dict[str, str]:
         """Return the heliostats that may not join their aims now, and the reasons.
 
-        AIM brings a new aim, its values; every other command leads to those that they may have.
+        AIM brings a new aim in its values; every other command leads to an aim that they may
+        already have.
         """
         if not self._check.volumes:
             return {}
@@ -376,7 +378,7 @@ class PathProofs:
     def _begins(self, rows: Rows) -> list[tuple[npt.NDArray[np.bool_], FloatArray]]:
         """Return where motions of heliostats (K,) may begin: which, (K,), and their counts (M, 2).
 
-        One that moves may be anywhere between its counts and its goals.
+        A moving heliostat may be anywhere between its counts and its goals.
         """
         counts, goals = self.field.counts(rows), self.field.goals(rows)
         moving = self.moving(rows)
@@ -398,7 +400,7 @@ class PathProofs:
         return rows, self.paths.motion(rows, counts[good], ends)
 
     def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:
-        """Return the angles that a command passes, from where the axes stand, (K, W, 2)."""
+        """Return the angles that a command passes through, from the present pose, (K, W, 2)."""
         counts = self.field.counts(rows)
         if name == "DIAGNOSE":
             begin = self.paths.angles(rows, counts)
@@ -419,5 +421,5 @@ class PathProofs:
 
 
 def _refusals(reasons: Mapping[str, str]) -> dict[str, str]:
-    """Mark the reasons of heliostats whose paths are not free; the others only wait for reports."""
+    """Mark the reasons of heliostats whose paths are not clear; others only await reports."""
     return {n: text if text in SOON else NoFreePath(text) for n, text in reasons.items()}

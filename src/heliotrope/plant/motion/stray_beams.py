@@ -22,24 +22,24 @@ from heliotrope.safety import Act
 
 #: A heliostat that stands still is checked once in this many checks.
 TURNS = 3
-#: A heliostat moves if its counts and goals differ by more steps than this, and comes nearer to its
-#: goal if it has made more steps than that since the last check.
+#: A heliostat moves if its counts and goals differ by more steps than the first number, and
+#: approaches its goal if it has made more steps than the second since the last check.
 _MOVES, _GAINS = 200, 20
 
 
 class StrayBeams:
-    """Watch over stray beams on a receiver.
+    """Monitors stray beams on a receiver.
 
     Parameters
     ----------
     paths
-        Paths of the heliostats, with their mirrors and receivers.
+        Paths of the heliostats, with their mechanisms and receivers.
     field
         State of the field, with the positions of the axes.
     points
         Assigned aims and standby points.
     sun
-        Returns the unit vector to the sun, (3,), some seconds from now.
+        Function that returns the unit vector to the sun, (3,), some seconds from now.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class StrayBeams:
 
     @property
     def watches(self) -> bool:
-        """Whether there are receivers to watch."""
+        """Whether there are receivers to monitor."""
         return bool(self._check.solids)
 
     def on_receiver(self, rows: npt.NDArray[np.intp]) -> Mask:
@@ -67,7 +67,7 @@ class StrayBeams:
         return self._check.lights(rows, drives.angles(self._field.counts(rows)), self._sun(0.0))
 
     def check(self, now: float) -> None:
-        """Check the heliostats that move, and a part of those that stand."""
+        """Check the moving heliostats, and some of those that stand still."""
         field = self._field
         self._turn = (self._turn + 1) % TURNS
         every = np.arange(len(field))
@@ -85,7 +85,7 @@ class StrayBeams:
         )
 
     def order_out(self, name: str, *, again: bool) -> Act:
-        """Return DEFOCUS, or STOW where DEFOCUS has not helped or would end on a receiver too."""
+        """Return DEFOCUS, or STOW if DEFOCUS has not helped or would also end on a receiver."""
         row = self._field.place(name)
         if again or self._field.rows["state"][row] in states.LEAVING or self._field.turned[row]:
             return Act.STOW

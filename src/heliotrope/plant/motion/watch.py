@@ -12,32 +12,32 @@ from heliotrope.safety import Act, Reading
 
 Rows = npt.NDArray[np.intp]
 
-#: Pause between two checks of the beams, s.
+#: Interval between two checks of the beams, s.
 CHECK_PERIOD = 1.0
-#: Where stow is not known: an approach turns by more than this (rad) only when it leaves stow.
+#: If stow is unknown: an approach turns an axis by more than this (rad) only when it leaves stow.
 _FROM_STOW = 0.15
 
 
 class BeamWatch:
-    """Watch over the beams of all heliostats.
+    """Monitors the beams of all heliostats.
 
-    It sees errors that a proof cannot: false counts, changed parameters, a local controller that
-    disobeys, the sun that carries the beam of a standing mirror on. Every heliostat is checked,
-    whatever its state, as long as its step counts have been known: where they are unknown or it is
-    silent, it is taken to stand where it was last reported. Those that move are checked each
-    second, the others in turn.
+    It detects errors that a proof cannot: false counts, changed parameters, a local controller that
+    disobeys, and the motion of the sun, which moves the beam of a heliostat at rest. Every
+    heliostat is checked, whatever its state, if its step counts have ever been known; if they are
+    unknown or the heliostat is silent, it is assumed to stand where it was last reported. Moving
+    heliostats are checked each second, the others in turn.
 
     Parameters
     ----------
     proofs
-        Proofs of commands: their paths, field, points and sun are those of the watch.
+        Proofs of commands; their paths, field, points and sun are used here too.
 
     Attributes
     ----------
     proofs
         As given.
     stray
-        Watch over beams on a receiver that were not sent there.
+        Monitor of beams on a receiver that were not sent there.
     """
 
     def __init__(self, proofs: PathProofs) -> None:
@@ -50,15 +50,15 @@ class BeamWatch:
 
     @property
     def watched(self) -> frozenset[str]:
-        """Names of the readings: of keep-out volumes and of receivers, where there are any."""
+        """Names of the readings, for keep-out volumes and for receivers, if there are any."""
         surfaces = {"keep_out_predicted": self._check.volumes, "beam_unsent": self._check.solids}
         return frozenset(name for name, places in surfaces.items() if places)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
         """Return 1 for each heliostat whose beam is where it may not be, 0 for others.
 
-        That is in a volume or heading for one, or stray on a receiver. The beams are checked once
-        a second; between two checks the last one counts.
+        This means in a volume or heading for one, or stray on a receiver. The beams are checked
+        once a second; between two checks, the last result counts.
         """
         if now - self._at >= CHECK_PERIOD:
             self._at = now
@@ -80,7 +80,7 @@ class BeamWatch:
         name
             Name of the heliostat.
         again
-            Whether it has been ordered off already, and its beam is still there.
+            Whether the heliostat has already been ordered off, but its beam is still there.
         """
         row = self._field.place(name)
         if name not in self._entering:
@@ -94,7 +94,7 @@ class BeamWatch:
         return order_out(self._paths, row, counts, self.proofs.sun(0.0), state, aim, standby)
 
     def turned(self, name: str) -> bool:
-        """Return whether a beam rests where it may not be, and DEFOCUS turns it no further."""
+        """Return whether a beam rests where it may not be, and DEFOCUS can turn it no further."""
         if name not in self._entering and name not in self.stray.shining:
             return False
         row = self._field.place(name)
@@ -116,8 +116,8 @@ class BeamWatch:
         rows, moves, state = every[chosen], moves[chosen], state[chosen]
         begin, end = begin[chosen], end[chosen]
         light = self.proofs.sun(0.0)
-        # A commanded motion is checked on its whole path; of every other, the present pose and the
-        # end are, as a path to safety is never held up.
+        # A commanded motion is checked along its whole path. Of every other motion only the present
+        # pose and the end are checked, because a path to safety is never held up.
         follows = moves & np.isin(state, states.BEAM_OUT)
         turns = follows & self._leaves_stow(rows, state, begin, end)
         both, ends = follows & ~turns, moves & ~follows

@@ -1,11 +1,11 @@
-"""Aims of a plant under a flux limit: computed beside the loop, given a few heliostats at a time.
+"""Aims of a plant under a flux limit: computed outside the loop, sent to few heliostats at a time.
 
-Every so many seconds `heliotrope.aims.rounds` finds the aims of most power, and the moves to them
-that pass the limit nowhere. Heliostats get their aims by the same commands as a person's, with the
-same proofs. A heliostat at standby joins the receiver only at the aim that it has here, and one
-without an aim stays there. Beams that a person has aimed, or that automatic control may not move,
-stay and take their share of the limit. Without new aims the last good ones stay, and later the safe
-spread: fewer heliostats at the aims of the plant file.
+At regular intervals `heliotrope.aims.rounds` finds the aims with the highest power, and moves to
+them that exceed the limit nowhere. Heliostats get their aims by the same commands as an operator's,
+with the same proofs. A heliostat at standby joins the receiver only at the aim assigned here, and a
+heliostat without an aim stays at standby. Beams that an operator has aimed, or that automatic
+control may not move, stay and use their share of the limit. Without new aims the last good ones
+stay in force; later the safe spread follows, with fewer heliostats at the aims of the plant file.
 """
 
 import asyncio
@@ -32,19 +32,19 @@ from heliotrope.plant.operations.predicted_flux import PredictedFlux
 from heliotrope.plant.workers import Worker
 from heliotrope.safety import alarms
 
-#: A beam that is not heard may be where it was for this time, s.
+#: A beam without reports may still be where it was for this time, s.
 HOLD = 120.0
 #: Most of a heliostat's own error that counts, rad of the beam per axis. Beyond it the flux is no
 #: longer of first order: the beam is elsewhere, as sharp as ever, and the greatest flux is that of
 #: beams that hit their aims. The blur of a larger error would hide that.
 BLUR = 5e-4
-#: Longest wait for a move to end, and wait after it until beams are at rest, s.
+#: Longest wait for a move to end, and wait after it until the beams are at rest, s.
 MOVED, SETTLED = 60.0, 4.0
-#: Time for which a heliostat whose beam may not go to its new aim keeps its old one, s.
+#: Time for which a heliostat keeps its old aim if its beam may not go to its new one, s.
 BLOCKED = 300.0
-#: The safe spread follows when the last good aims are so many times the deadline old.
+#: The safe spread follows when the age of the last good aims exceeds this multiple of the deadline.
 SAFE = 5.0
-#: States from which a heliostat cannot join without a person.
+#: States from which a heliostat cannot join without an operator.
 _OUT = (states.LOCKED, states.FAULT, states.UNCONFIGURED)
 
 Mask = npt.NDArray[np.bool_]
@@ -108,9 +108,9 @@ class Aiming:
     plant, log
         The controller, and the logbook for alarms and events.
     automatic
-        Gives the commands, while it has the command authority.
+        Issues the commands, while it has the command authority.
     flux
-        Knows the field as it stands.
+        Flux prediction, which knows the present field.
     worker
         Place for the computation.
     """
@@ -138,7 +138,7 @@ class Aiming:
     # -- people ----------------------------------------------------------------------------
 
     def by_person(self, heliostats: Sequence[str], *, aimed: bool) -> None:
-        """Note that a person has aimed heliostats (() for all), or given them back."""
+        """Note that an operator has aimed heliostats (() for all), or returned them."""
         rows = [self._plant.field.place(name) for name in heliostats or self._plant.field.names]
         self._by_person[rows] = aimed
 
@@ -191,16 +191,16 @@ class Aiming:
         while True:
             begun = self._plant.now()
             if self._automatic.idle:
-                self._good_at = begun  # nothing moves, so nothing is late
+                self._good_at = begun  # nothing moves, so no aims are late
             else:
                 await self._step(begun)
             await sleep_until(self._plant.clock, begun + self._settings.every)
 
     async def _step(self, now: float) -> None:
-        """Compute aims, and give them; a failure leaves the last good ones."""
+        """Compute and send aims; after a failure the last good aims stay in force."""
         given = self._round(now)
         if not given.free.any():
-            self._good_at = now  # none may be moved, so no aims are late
+            self._good_at = now  # no heliostat may be moved, so no aims are late
             return
         try:
             answer = await asyncio.wait_for(
@@ -225,7 +225,7 @@ class Aiming:
             await self._go(answer.moves)
 
     def _take(self, answer: Answer) -> None:
-        """Note an answer, and tell what is above the limit or no longer late."""
+        """Accept a result, and report what is above the limit or no longer late."""
         self._answer, self._source = answer, "optimiser"
         if self._problem:
             self._problem = ""
@@ -239,7 +239,7 @@ class Aiming:
         self._above = above
 
     async def _failed(self, problem: str) -> None:
-        """Keep the last good aims; when they are old, go to the safe spread."""
+        """Keep the last good aims; once they are too old, go to the safe spread."""
         if not self._problem:
             self._log.take_alarm(alarms.AIMS.raised(problem=problem))
         self._problem = problem
@@ -253,7 +253,7 @@ class Aiming:
             await self._to_safe(self._answer.safe)
 
     async def _to_safe(self, safe: FloatArray) -> None:
-        """Go to the safe spread: all beams that are elsewhere leave first, so that none meet."""
+        """Go to the safe spread; all beams elsewhere leave first, so that no beams meet."""
         on = self._on(self._plant.now()) & self._movers(self._plant.now())
         apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
         rows = np.flatnonzero(on & apart)
@@ -276,7 +276,7 @@ class Aiming:
         return np.asarray(tracks & near)
 
     def _movers(self, now: float) -> Mask:
-        """Return a mask of the heliostats that may be given other aims now, (N,)."""
+        """Return a mask of the heliostats that may be assigned other aims now, (N,)."""
         field = self._plant.field
         free = self._automatic.movable() & field.live(now) & ~field.among(_OUT, now)
         free &= ~self._by_person & (self._blocked_until < now)
@@ -284,17 +284,17 @@ class Aiming:
         return np.asarray(free)
 
     def _allotted(self) -> FloatArray:
-        """Return the aims that heliostats have, (N, 3); NaN: none."""
+        """Return the assigned aims of the heliostats, (N, 3); NaN: none."""
         none, aims = np.full(3, np.nan), self._automatic.aims
         return np.array([aims.get(name, none) for name in self._plant.field.names])
 
     def _round(self, now: float) -> Round:
-        """Return what is known now, and leave out what has no part in it any more."""
+        """Return what is known now, and drop what is no longer relevant."""
         plant, settings = self._plant, self._settings
         assert settings.limit is not None
         on, free, allotted = self._on(now), self._movers(now), self._allotted()
         visiting = np.isin(plant.field.names, sorted(self._automatic.visiting))
-        # One that waits for its turn joins at the aim that it was given.
+        # A heliostat that waits for its turn joins at the aim that it was assigned.
         waits = free & ~on & plant.field.among((states.IDLE,), now) & (plant.waiting > 0)
         aims = np.where((on & free)[:, None], plant.aims, allotted)
         comes = visiting | waits | (~on & self._automatic.movable() & (self._blocked_until >= now))
@@ -327,7 +327,7 @@ class Aiming:
         return replace(scene, surfaces=(surface_of(receiver),), mirrors=mirrors, dni=dni)
 
     def _demand(self, limit: FluxLimit) -> Demand:
-        """Return the limit, and with which certainty it must hold."""
+        """Return the limit, and the certainty with which it must hold."""
         plant, settings = self._plant, self._settings
         clusters = np.unique(plant.field.cluster, return_inverse=True)[1]
         latitude = math.radians(plant.design.site.latitude_deg)
@@ -338,7 +338,7 @@ class Aiming:
     # -- moves -----------------------------------------------------------------------------
 
     async def _go(self, moves: tuple[Move, ...]) -> None:
-        """Make the moves one after the other; one that fails ends them until the next round."""
+        """Make the moves one after the other; a failed move ends them until the next round."""
         until = self._plant.now() + 2.0 * self._settings.every
         names, aims = self._plant.field.names, self._automatic.aims
         for move in moves:
@@ -358,7 +358,7 @@ class Aiming:
                 return
 
     async def _move(self, points: dict[str, FloatArray]) -> bool:
-        """Move tracking beams; return whether all of them went."""
+        """Move tracking beams; return whether all of them moved."""
         if not points:
             return True
         place = self._plant.field.place
@@ -378,7 +378,7 @@ class Aiming:
         return not refused
 
     async def _rest(self, rows: npt.NDArray[np.intp]) -> bool:
-        """Send beams to standby; return whether the order was taken."""
+        """Send beams to standby; return whether the order was accepted."""
         names = tuple(self._plant.field.names[row] for row in rows)
         if not names:
             return True

@@ -1,9 +1,9 @@
 """Changes of parameters that wait for the approval of a second engineer.
 
-Where the plant file asks for it (``[approval]``), a change of a heliostat's parameters by a person,
-or their roll-back, is checked and then waits: nothing goes to the board until another engineer has
-approved it. Its author may withdraw it, another engineer may refuse it, and it ends by itself when
-its time is over or when the heliostat gets new parameters otherwise. It outlasts a restart.
+If the plant file requires it (``[approval]``), a change of a heliostat's parameters by a person, or
+their roll-back, is checked and then waits: nothing is sent to the board until another engineer has
+approved it. Its author may withdraw it, and another engineer may refuse it. It ends by itself when
+its time is over or when the heliostat gets other new parameters. It survives a restart.
 
 This is the dual approval of IEC 62443-3-3, SR 2.1 RE 4.
 """
@@ -30,13 +30,13 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records, StoreError
 
-#: Longest time of writing an approved change, s, beyond the wait for the approval.
+#: Longest time for writing an approved change, s, in addition to the wait for approval.
 _WRITING = 900.0
 
 
 @dataclass(frozen=True)
 class AskedParameter:
-    """A parameter that a change sets: its value in use when it was asked for, and the new one."""
+    """A parameter that a change sets: its value in use at the request, and the new value."""
 
     name: str
     unit: str
@@ -46,24 +46,25 @@ class AskedParameter:
 
 @dataclass(frozen=True)
 class WaitingChange:
-    """A change that waits for an approval.
+    """A change that waits for approval.
 
     Attributes
     ----------
     number
-        Of the change; no other one of the plant has it.
+        Number of the change, unique within the plant.
     heliostat, author, reason
-        Of whose parameters; who asked for it, and why.
+        Heliostat whose parameters it changes; the person who requested it, and why.
     at, until
-        When it was asked for, and when it ends by itself, POSIX s.
+        Time of the request, and time when it ends by itself, POSIX s.
     version
-        Version that it brings back; 0: the values were typed.
+        Version that it restores; 0: the values were entered.
     based_on
-        Version in use when it was asked for; it ends once there is another.
+        Version in use at the time of the request; the change ends once there is another.
     parameters
-        What it changes.
+        Parameters that it changes.
     beam_rms, beam_most
-        Change of the beam at its aim over the suns of that day, m; see `ParameterComparison`.
+        Change of the beam at its aim over the sun positions of that day, m; see
+        `ParameterComparison`.
     """
 
     number: int
@@ -95,7 +96,7 @@ class _Course:
         self.ended = Step("")
 
     def step(self) -> Step:
-        """Return how far it is."""
+        """Return its present step."""
         if self.ended.text:
             return self.ended
         if self.written is None:
@@ -110,7 +111,7 @@ class _Course:
 
 
 class Approvals:
-    """The changes that wait, and what becomes of them.
+    """The waiting changes, and what becomes of them.
 
     Parameters
     ----------
@@ -119,9 +120,9 @@ class Approvals:
     typed
         Checks and writes parameters.
     errands
-        Follows a change for its author.
+        Tracks a change for its author.
     records
-        Keeps the waiting changes; None: they end with the program.
+        Store of the waiting changes; None: they end with the program.
     """
 
     def __init__(
@@ -145,11 +146,11 @@ class Approvals:
 
     @property
     def waiting(self) -> tuple[WaitingChange, ...]:
-        """The changes that wait, the oldest first."""
+        """The waiting changes, oldest first."""
         return tuple(course.change for course in self._courses.values())
 
     def recall(self) -> None:
-        """Go on with the changes that waited when the plant's program ended."""
+        """Continue with the changes that were waiting when the plant's program ended."""
         if self._records is None:
             return
         try:
@@ -173,7 +174,7 @@ class Approvals:
                 self._end(change, "the heliostat is no longer in the plant file")
 
     def step(self) -> None:
-        """End the changes whose time is over, or that have been overtaken."""
+        """End the changes whose time is over, or that have been superseded."""
         for change in self.waiting:
             if reason := self._over(change):
                 self._end(change, reason)
@@ -188,14 +189,14 @@ class Approvals:
         version: int,
         reason: str,
     ) -> Ticket:
-        """Ask for a change: values of parameters, or an earlier version; nothing is written yet.
+        """Request a change: values of parameters, or an earlier version; nothing is written yet.
 
         The ticket ends once the change is written, or with the reason why it is not.
 
         Raises
         ------
         RefusedError
-            If the person is no engineer, or another change of this heliostat waits.
+            If the person is not an engineer, or another change of this heliostat is waiting.
         InputError, UnknownNameError
             See `TypedParameters.prepare`.
         """
@@ -225,15 +226,15 @@ class Approvals:
         Raises
         ------
         RefusedError
-            If the person is no engineer or is its author, if neither has the command authority, or
-            if it cannot be written now; it then waits on.
+            If the person is not an engineer or is its author, if neither has the command authority,
+            or if it cannot be written now, in which case it continues to wait.
         UnknownNameError
-            If no such change waits.
+            If no such change is waiting.
         """
         change = self._others(person, number)
         typed = {} if change.version else {p.name: p.asked for p in change.parameters}
         prepared = await self._prepared(change.heliostat, typed, change.version, change.reason)
-        change = self._others(person, number)  # it may have ended meanwhile
+        change = self._others(person, number)  # it may have ended in the meantime
         grant = self._grant(change, person)
         second = SecondPerson(change.author, person.name)
         ticket = self._typed.write(grant.holder, grant.token, prepared, second)
@@ -249,9 +250,9 @@ class Approvals:
         Raises
         ------
         RefusedError
-            If the person is no engineer or is its author, or gives no reason.
+            If the person is not an engineer or is its author, or states no reason.
         UnknownNameError
-            If no such change waits.
+            If no such change is waiting.
         """
         change = self._others(person, number)
         if not reason.strip():
@@ -259,14 +260,14 @@ class Approvals:
         self._end(change, f"refused by {person.name}: {reason.strip()}", person)
 
     def withdraw(self, person: Person, number: int) -> None:
-        """Withdraw one's own change.
+        """Withdraw a person's own change.
 
         Raises
         ------
         RefusedError
-            If another person has asked for it.
+            If another person requested it.
         UnknownNameError
-            If no such change waits.
+            If no such change is waiting.
         """
         change = self._find(number)
         if person.name != change.author:
@@ -292,7 +293,7 @@ class Approvals:
     ) -> WaitingChange:
         before, after = self._typed.in_use(heliostat), prepared.record.parameters
         mechanism, now = self._plant.beliefs.nominal(heliostat), self._now()
-        # Whoever sees an earlier change can never approve a later one in its place.
+        # Anyone who sees an earlier change can never approve a later one in its place.
         self._last = max(self._last + 1, int(1e3 * now))
         parameters = tuple(
             AskedParameter(
@@ -315,7 +316,7 @@ class Approvals:
         )
 
     def _others(self, person: Person, number: int) -> WaitingChange:
-        """Return a change of another person that an engineer may decide upon."""
+        """Return a change of another person on which an engineer may decide."""
         person.must_be(Role.ENGINEER, "approval")
         change = self._find(number)
         if person.name == change.author:
@@ -335,7 +336,7 @@ class Approvals:
         return self._courses[number].change
 
     def _over(self, change: WaitingChange) -> str:
-        """Return the reason why a change can wait no longer, or an empty text."""
+        """Return the reason why a change can no longer wait, or an empty text."""
         if self._now() >= change.until:
             return f"nobody approved it by {_utc(change.until)}"
         if (version := self._version(change.heliostat)) != change.based_on:

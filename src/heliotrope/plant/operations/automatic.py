@@ -46,13 +46,13 @@ from heliotrope.store.records import Kind, PlannedVisit, Records
 
 #: The person under whose name it commands.
 AUTOMATIC = Person("automatic control", Role.ENGINEER)
-#: What a person does about a state from which automatic control raises nothing.
+#: What an operator should do about a state from which automatic control raises nothing.
 _REMEDIES = {
     states.LOCKED: "unlock it",
     states.FAULT: "find the cause, then clear the fault",
     states.UNCONFIGURED: "store its parameters",
 }
-#: Parts of the work that failed: each failure is an alarm, and it is tried again soon.
+#: Parts of the work that failed; each failure raises an alarm, and the part is soon retried.
 PARTS = RetryLaw(
     "part of automatic control",
     1,
@@ -61,24 +61,25 @@ PARTS = RetryLaw(
     rest=5.0,
     alarm=alarms.WORK,
 )
-#: Why nothing is moved before it has taken the command authority.
+#: Why nothing is moved before automatic control has taken the command authority.
 _STARTING = "it is starting"
-#: Outcomes of a visit that a person asked for and that has shown what it can.
+#: Outcomes of a requested visit that has shown what it can.
 _AS_WANTED = (
     CalibrationOutcome.CALIBRATED,
     CalibrationOutcome.UNCHANGED,
     CalibrationOutcome.NO_BETTER,
 )
-#: Time in which a heliostat that automatic control has must follow, s; and until it is heard.
+#: Time within which a heliostat under automatic control must follow, s; and within which it must
+#: report.
 _FOLLOWS, _HEARD = 120.0, 15.0
-#: Time in which an emergency must have ended that a person's Resume has acknowledged, s.
+#: Time within which an emergency must have ended after an operator's Resume has acknowledged it, s.
 _ENDED = 5.0
-#: Time between checks of the sun's elevation, s: a mirror that is locked for its parameters at one
-#: check in the evening is stowed at the next.
+#: Interval between checks of the sun's elevation, s; a heliostat that is locked for its parameters
+#: at one check in the evening is stowed at the next.
 _SUN_EVERY = 10.0
-#: Wait after a person has given the command authority back, before it is taken, s.
+#: Wait after an operator has released the command authority before it is taken, s.
 _COURTESY = 5.0
-#: Time between predictions of the field's errors, s.
+#: Interval between predictions of the field errors, s.
 _LOOK_EVERY = 10.0
 
 
@@ -335,7 +336,7 @@ class AutomaticControl:
             self._calibrating.ask(heliostat, target, search=search)
 
     def _check_calibration(self, heliostats: Sequence[str]) -> None:
-        """Refuse a calibration that cannot be made; one that has to wait a little is accepted."""
+        """Refuse a calibration that cannot be made; one that must wait a little is accepted."""
         idle, wanted = self._why_not(), self._raising.wanted
         for name in heliostats:
             why = "" if idle == _STARTING else idle
@@ -345,7 +346,7 @@ class AutomaticControl:
                 raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
 
     def _locked(self, heliostats: Sequence[str]) -> list[str | None]:
-        """Return the locks that keep heliostats from their aims, in words; None where none does."""
+        """Return the locks that keep heliostats from their aims, in words; None without a lock."""
         aims = self._plant.aims[[self._plant.field.place(name) for name in heliostats]]
         return self._plant.lockouts.reasons(heliostats, aims)
 
@@ -394,7 +395,7 @@ class AutomaticControl:
     def _up_step(self, name: str, state: int, age: float, waits: str, *, able: bool) -> Step:
         """Return the step of a heliostat that automatic control may move.
 
-        ``waits`` is what it waits for beside its turn, "" for nothing.
+        ``waits`` is what it waits for apart from its turn, "" for nothing.
         """
         shown = self._plant.field.of(name, self._plant.now())
         if not shown.live:
@@ -482,7 +483,7 @@ class AutomaticControl:
         self._losses.resume()
         if not self._plant.sentinel.on:
             return self._raising.resume()
-        self._resumed_at = self._plant.now()  # an emergency that is acknowledged ends soon
+        self._resumed_at = self._plant.now()  # an emergency that has been acknowledged ends soon
         return int((self._raising.left | self._raising.wanted).sum())
 
     def give_up(self, why: str) -> None:
@@ -513,12 +514,12 @@ class AutomaticControl:
             self._plant.release_authority(AUTOMATIC, self._token)
 
     def _wait(self) -> None:
-        """Begin to wait for a person's Resume: visits under way end, too."""
+        """Begin to wait for an operator's Resume; visits in progress end, too."""
         self.give_way()
         self._end_visits("automatic control waits for Resume")
 
     def _end_visits(self, why: str) -> None:
-        """Refuse all further commands of visits under way: their beams are taken off."""
+        """Refuse all further commands of visits in progress; their beams are moved off."""
         self._plant.authority.end_mandates(AUTOMATIC, why)
 
     # -- aims ------------------------------------------------------------------------------
@@ -599,7 +600,7 @@ class AutomaticControl:
     async def _again(self, name: str, part: Callable[[], Awaitable[None]], pause: float) -> None:
         """Repeat a part of the work; a failure raises an alarm and ends nothing."""
         refused = ""
-        # A cancelled visit brings its beam home, and may end with another error then.
+        # A cancelled visit brings its beam home, and may then end with another error.
         while not self._stopped:
             try:
                 await part()
@@ -665,7 +666,7 @@ class AutomaticControl:
         self._night()
 
     def _night(self) -> None:
-        """Stow the wanted heliostats before the sun is low, and any found up afterwards."""
+        """Stow the wanted heliostats before the sun is low, and any found out of stow later."""
         now = self._plant.now()
         if now - self._sun_at < _SUN_EVERY:
             return
@@ -674,8 +675,8 @@ class AutomaticControl:
         lowest = self._settings.lowest
         if elevation < lowest:
             falls, self._day = self._day, False
-            # One that was not heard then, or was given back since, is stowed when it is seen; not
-            # while a person has the command authority.
+            # A heliostat that was not heard then, or was returned since, is stowed when it is seen,
+            # but not while an operator has the command authority.
             if falls or self._plant.authority.grant is None or self._has_authority():
                 self._stow_up(told=falls)
             self._withdraw(
@@ -686,7 +687,7 @@ class AutomaticControl:
             self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
 
     def _stow_up(self, *, told: bool) -> None:
-        """Stow the wanted heliostats that are up; with ``told`` say so even if there are none."""
+        """Stow the wanted heliostats out of stow; with ``told``, report it even if none are."""
         up = self._plant.field.among(states.UP, self._plant.now()) & self._raising.wanted
         names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
         if names:
@@ -714,13 +715,13 @@ class AutomaticControl:
         return self._losses.settling() | self.service.rows() | self._raising.given_up()
 
     async def _diagnose(self) -> None:
-        """Check each day, before mirrors are raised, that their drives turn them."""
+        """Check each day, before heliostats are raised, that their drives turn their mirrors."""
         if not self._why_idle():
             free = self._raising.wanted & ~self._left_alone()
             await self._checks.step(self._token, free)
 
     def _start_again(self, rows: npt.NDArray[np.intp]) -> None:
-        """Send heliostats to stow that cannot go on from where they are; they are raised again."""
+        """Send heliostats to stow that cannot continue where they are; they are raised again."""
         if len(rows):
             names = tuple(self._plant.field.names[row] for row in rows)
             self._plant.stow(AUTOMATIC.name, names)

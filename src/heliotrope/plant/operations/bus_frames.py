@@ -12,7 +12,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import BusFrame
 
-#: Longest wait for a record, s: it takes five seconds, and is sent with the next.
+#: Longest wait for a recording, s; it takes five seconds, and is sent in the next second.
 PATIENCE = 20.0
 _HEAD = struct.calcsize(BUS_ENTRY)
 
@@ -20,7 +20,8 @@ _HEAD = struct.calcsize(BUS_ENTRY)
 async def record(plant: PlantController, cluster: str) -> tuple[BusFrame, ...]:
     """Record the frames of a cluster's bus for five seconds; return them, the oldest first.
 
-    They are decoded in a thread: hundreds take tens of milliseconds, which leases do not wait for.
+    They are decoded in a thread, because hundreds of frames take tens of milliseconds, which would
+    delay leases.
 
     Raises
     ------
@@ -46,7 +47,7 @@ async def record(plant: PlantController, cluster: str) -> tuple[BusFrame, ...]:
 
 
 def decoded(answer: Answer) -> tuple[BusFrame, ...]:
-    """Return the frames in a cluster's answer.
+    """Return the frames in a cluster's reply.
 
     Raises
     ------
@@ -73,7 +74,7 @@ def _entries(block: bytes) -> Iterator[tuple[float, int, bytes]]:
 
 
 def _shown(at: float, way: str, data: bytes, names: dict[str, Any]) -> Iterator[BusFrame]:
-    """Give the frames in some bytes; answers of several controllers may come together."""
+    """Yield the frames in some bytes; replies of several controllers may arrive together."""
     for piece in data.split(b"\0"):
         if not piece:
             continue

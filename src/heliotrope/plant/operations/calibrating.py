@@ -29,7 +29,7 @@ from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
 from heliotrope.safety import alarms
 from heliotrope.store.records import PlannedVisit
 
-#: Visits to a target that failed through no fault of a heliostat: the camera, clouds, refusals.
+#: Visits to a target that failed through no fault of a heliostat: camera, clouds, refusals.
 PLACES = RetryLaw(
     "visits to this target",
     5,
@@ -39,15 +39,15 @@ PLACES = RetryLaw(
     rest=3600.0,
     alarm=alarms.VISITS_FAIL,
 )
-#: Outcomes of visits that were broken off.
+#: Outcomes of visits that were aborted.
 _BROKEN = (
     CalibrationOutcome.REFUSED,
     CalibrationOutcome.TAKEN_OUT,
     CalibrationOutcome.ERROR,
 )
-#: A heliostat that was on a target leaves it to all others for this time, s.
+#: A heliostat that was on a target leaves it to others for this time, s.
 FRESH = 600.0
-#: Time between computations of the true errors, s.
+#: Interval between computations of the true errors, s.
 _TRUTH_EVERY = 5.0
 
 
@@ -72,7 +72,7 @@ class Scheduling(Foreseeing, Protocol):
     ) -> PlannedVisit | None:
         """Return the next of the ready heliostats (N,) for a free target, None if none is due.
 
-        With ``beside`` it goes there together with those returned before.
+        With ``beside``, the heliostat goes there together with those returned before.
         """
         ...
 
@@ -81,7 +81,7 @@ class Scheduling(Foreseeing, Protocol):
         ...
 
     def done(self, entry: CalibrationEntry) -> None:
-        """Take the result of a visit."""
+        """Accept the result of a visit."""
         ...
 
     def shone(self, mirrors: int, lit: int, seconds: float) -> None:
@@ -91,7 +91,7 @@ class Scheduling(Foreseeing, Protocol):
 
 @dataclass(frozen=True)
 class Visits:
-    """The visits that a plant can make, and what chooses and keeps them.
+    """The visits that a plant can make, and the parts that choose and store them.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Visits:
     receiver
         Calibrates heliostats on a receiver; None: they go to targets.
     pictures
-        Keeps photographs with their results; None: they are not kept.
+        Stores photographs with their results; None: they are not stored.
     """
 
     cycle: CalibrationCycle
@@ -120,9 +120,9 @@ class TrueErrors:
     Parameters
     ----------
     plant
-        The errors are timed by its clock.
+        Plant whose clock times the errors.
     truth
-        Returns the errors, rad, (N,); None: they are unknown.
+        Function that returns the errors, rad, (N,); None: they are unknown.
     """
 
     def __init__(self, plant: PlantController, truth: Callable[[], FloatArray] | None) -> None:
@@ -160,13 +160,14 @@ class Calibrating:
     visits
         The visits that the plant can make.
     book, keeping
-        Take the results.
+        Accept the results.
     truth
         True errors, known to a twin only.
     first
-        Returns the heliostats to be visited first, after those in doubt.
+        Function that returns the heliostats to be visited first, after the doubtful ones.
     ruled
-        Returns a mask of the heliostats under a rule of the timetable, (N,); None: none is.
+        Function that returns a mask of the heliostats under a timetable rule, (N,); None: there are
+        none.
     """
 
     def __init__(
@@ -190,10 +191,10 @@ class Calibrating:
         self._receiver = None if receiver is None else ReceiverVisits(plant, book, receiver, tell)
         self._running: dict[str, Running] = {}
         self._asked: dict[str, tuple[str, bool]] = {}
-        #: Why requests of persons were given up, and the last result, by heliostat.
+        #: Why operators' requests were dropped, and the last result, by heliostat.
         self._withdrawn: dict[str, str] = {}
         self._last: dict[str, CalibrationEntry] = {}
-        #: When each was on a target last, POSIX s, (N,).
+        #: When each heliostat was last on a target, POSIX s, (N,).
         self._visited = np.full(len(plant.field.names), -np.inf)
         self._flown: frozenset[str] = frozenset()
         self._places = Attempts(PLACES, log.take_alarm)
@@ -201,24 +202,24 @@ class Calibrating:
 
     @property
     def asked(self) -> tuple[str, ...]:
-        """Heliostats that persons want calibrated next, in the order in which they were asked."""
+        """Heliostats that operators want calibrated next, in the order of the requests."""
         return (*self._asked, *(name for each in self._requests for name in each.asked))
 
     @property
     def _requests(self) -> tuple[Requests, ...]:
-        """The requests of persons for joint visits and receiver visits."""
+        """The requests of operators for joint visits and receiver visits."""
         return tuple(each.requests for each in (self._joint, self._receiver) if each is not None)
 
     def ask(self, heliostat: str, target: str, *, search: bool = False) -> None:
-        """Calibrate a heliostat before all others, on a target or, for "", on the next free one.
+        """Calibrate a heliostat before all others, on a target or, if "", on the next free one.
 
-        With ``search`` its beam is only searched for.
+        With ``search``, its beam is only searched for.
         """
         self._forget((heliostat,))
         self._asked[heliostat] = target, search
 
     def _forget(self, heliostats: Sequence[str]) -> None:
-        """Forget why earlier requests for heliostats were given up."""
+        """Forget why earlier requests for heliostats were dropped."""
         for name in heliostats:
             self._withdrawn.pop(name, None)
 
@@ -240,7 +241,7 @@ class Calibrating:
         heliostats
             Names.
         surface
-            A target, or "" for the next free one; or the receiver.
+            A target, "" for the next free target, or the receiver.
         """
         visits = self._receiver if surface and surface == self.receiver else self._joint
         if visits is not None:
@@ -248,7 +249,7 @@ class Calibrating:
             visits.requests.ask(heliostats, surface)
 
     def withdraw(self, heliostats: Collection[str], why: str) -> None:
-        """Withdraw persons' requests to calibrate these heliostats, with the reason."""
+        """Withdraw operators' requests to calibrate these heliostats, with the reason."""
         self._withdrawn |= dict.fromkeys(set(self.asked).intersection(heliostats), why)
         for each in self._requests:
             each.withdraw(heliostats)
@@ -257,20 +258,20 @@ class Calibrating:
 
     @property
     def running(self) -> Mapping[str, Running]:
-        """Visits under way, by target, with the heliostats that no order has taken out."""
+        """Visits in progress, by target, with the heliostats that no order has removed."""
         left = self._plant.authority.taken_out
         present = ((place, run.without(left(place))) for place, run in self._running.items())
         return {place: run for place, run in present if run is not None}
 
     def result(self, heliostat: str, since: float) -> CalibrationEntry | str:
-        """Return the result of a visit that ended since a time, POSIX s; without one, why not."""
+        """Return the result of a visit that ended since a time, POSIX s, or why there is none."""
         found, why = self._last.get(heliostat), self._withdrawn.get(heliostat)
         if why is None and found is not None and found.at >= since:
             return found
         return f"withdrawn: {why or 'the visit was aborted'}"
 
     def retries(self) -> tuple[Retry, ...]:
-        """Return the visits that are tried again, or were given up."""
+        """Return the visits that are being retried or were given up."""
         now, joint, receiver = self._plant.now(), self._joint, self._receiver
         return (
             *self._scheduler.attempts.shown(self._now()),
@@ -297,9 +298,10 @@ class Calibrating:
     ) -> tuple[str, ...]:
         """Calibrate the next of the ready heliostats (N,), or several together; return which.
 
-        Those that persons asked for come first, then those whose step counts are in doubt: a
-        photograph ends it. Then those for which a flight has brought a large change, which a
-        photograph confirms. One that was on a target a moment ago comes after all others.
+        Heliostats requested by operators come first, then heliostats with doubtful step counts,
+        because a photograph resolves the doubt. Then come those for which a flight has brought a
+        large change, which a photograph confirms. A heliostat that was on a target a moment ago
+        comes after all others.
         """
         if not self.asked and not self._places.due(target, self._plant.now()):
             return ()
@@ -345,7 +347,7 @@ class Calibrating:
     async def _for_joint_visit(
         self, joint: JointVisits, target: str, ready: npt.NDArray[np.bool_]
     ) -> tuple[str, ...]:
-        """Return the heliostats of a joint visit; () if the next visit is of one alone."""
+        """Return the heliostats of a joint visit; () if the next visit is a single one."""
         if names := joint.requests.next(target, ready):
             return names
         alone = any(
@@ -368,7 +370,7 @@ class Calibrating:
     async def receiver_visit(
         self, ready: npt.NDArray[np.bool_], person: Person, token: int
     ) -> tuple[str, ...]:
-        """Calibrate those of the ready heliostats (N,) on the receiver that are due; return which.
+        """Calibrate the ready heliostats (N,) that are due on the receiver; return which.
 
         A heliostat with a doubtful result is measured on a target next.
         """
@@ -379,7 +381,7 @@ class Calibrating:
             return ()
         begun, lit, cycle = self._now(), self._receiver.lit, self._receiver.cycle
         results = await self._coded_visit(cycle, names, self.receiver, person, token)
-        # One that is broken off, or came to nothing, does not tell how long a visit takes.
+        # A visit that was aborted or yielded nothing does not show how long a visit takes.
         if any(result.new > 0 for result in results):
             moved = sum(result.outcome not in _BROKEN for result in results)
             self._scheduler.shone(moved, lit, self._now() - begun)
@@ -396,7 +398,7 @@ class Calibrating:
         person: Person,
         token: int,
     ) -> tuple[CycleResult, ...]:
-        """Calibrate heliostats at one place at once."""
+        """Calibrate heliostats together at one place."""
         begun, field = self._now(), self._plant.field
 
         def tell(stage: str) -> None:
@@ -443,21 +445,21 @@ class Calibrating:
         return np.asarray(self._now() - self._visited > FRESH)
 
     def _interrupted(self, token: int) -> bool:
-        """Return whether an emergency, or a person who took command, may have ended a visit."""
+        """Return whether an emergency, or an operator who took command, may have ended a visit."""
         grant = self._plant.authority.grant
         return self._plant.sentinel.on or grant is None or grant.token != token
 
     def _note_place(self, place: str, problem: str, token: int) -> None:
-        """Note whether a visit failed through no fault of a heliostat, empty if it did not."""
+        """Note why a visit failed through no fault of a heliostat, empty if it did not."""
         if not problem:
             self._places.done(place)
         elif not self._interrupted(token):
             self._places.failed(place, problem, self._plant.now())
 
     def _pressing(self) -> npt.NDArray[np.bool_]:
-        """Return a mask of the heliostats in doubt or changed by a flight, (N,): they go alone."""
+        """Return a mask of heliostats in doubt or changed by a flight, (N,), which go alone."""
         first = frozenset(self._first())
-        # A flight is new knowledge of those that were given up.
+        # A flight brings new knowledge about heliostats that were given up.
         self._scheduler.attempts.renew(first - self._flown)
         self._flown = first
         changed = np.isin(self._plant.field.names, list(first))
@@ -482,7 +484,7 @@ class Calibrating:
         return self._witness(fresh), False
 
     def _witness(self, ready: npt.NDArray[np.bool_]) -> str:
-        """Return a heliostat (N,) whose photographs show where the sun stands, if any must."""
+        """Return a heliostat (N,) whose photographs show the sun direction, if one is needed."""
         plant = self._plant
         if not plant.witnesses.awaits_photographs:
             return ""
@@ -531,15 +533,15 @@ class Calibrating:
         if self._joint is not None:
             self._joint.concluded(result)
         self._book.conclude(entry)
-        # The schedule plans visits to targets: a receiver visit that brings nothing is no failure,
-        # nor is one that the camera, a cloud or an order of others has ended, and a beam that is
-        # looked for in several joint visits has not failed yet.
+        # The schedule plans visits to targets. A receiver visit without a result is therefore no
+        # failure, nor is a visit ended by the camera, a cloud or another order; and a beam that is
+        # searched for in several joint visits has not failed yet.
         looked = joint and self._joint is not None and self._joint.again(result)
         blameless |= refused or result.verdict is Verdict.CLOUD
         blameless |= result.outcome is CalibrationOutcome.TAKEN_OUT
         if good or not (lit or looked or blameless):
             self._scheduler.done(entry)
-        # A joint visit that was refused as a whole is one event, and not one of each heliostat.
+        # A joint visit that was refused as a whole is one event, not one event per heliostat.
         if not refused:
             self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")
         self._keeping.keep(entry, begun, sigma)
@@ -549,6 +551,6 @@ class Calibrating:
 
 
 def _outcome(error: RefusedError) -> CalibrationOutcome:
-    """Return the outcome of a visit that ended so."""
+    """Return the outcome of a visit that ended with an error."""
     taken = isinstance(error, TakenOutError)
     return CalibrationOutcome.TAKEN_OUT if taken else CalibrationOutcome.REFUSED

@@ -15,13 +15,13 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, SightingView
 from heliotrope.plant.visits.expected_errors import expected_covariances, expected_errors
 
-#: Numbers of points of the quality over time, and of results, that are held.
+#: Maximum number of points of the quality over time, and of results, that are held.
 _POINTS, RESULTS = 4000, 2000
-#: Number of points of the quality that earlier results give.
+#: Number of points of the quality that are derived from earlier results.
 _RECALLED = 60
-#: Number of heliostats whose priors give the error of an uncalibrated one.
+#: Number of heliostats whose priors determine the error of an uncalibrated heliostat.
 _SAMPLE = 100
-#: Outcomes without a calibration that are no failures.
+#: Outcomes without a calibration that are not failures.
 _NO_FAILURE = (CalibrationOutcome.UNCHANGED, CalibrationOutcome.TAKEN_OUT)
 
 
@@ -62,7 +62,7 @@ class CalibrationBook:
         self.results: deque[CalibrationEntry] = deque(maxlen=RESULTS)
         self.quality: deque[QualityPoint] = deque(maxlen=_POINTS)
         self.failed = 0
-        # What is believed already is predicted at once: one by one it takes 20 times as long.
+        # Existing beliefs are predicted together, because one by one it takes 20 times as long.
         self._believe(*plant.beliefs)
         plant.beliefs.subscribe(self._believe, held=False)
 
@@ -86,19 +86,19 @@ class CalibrationBook:
         self._predict(records)
 
     def conclude(self, entry: CalibrationEntry) -> None:
-        """Take the result of a visit."""
+        """Accept the result of a visit."""
         row = self._plant.field.place(entry.heliostat)
         self.sightings[row] = entry.sightings
         if np.isfinite(entry.measured):
-            # The normal is off by half as much as the beam.
+            # The error of the normal is half that of the beam.
             self.measured[row] = 0.5 * entry.measured
         self.failed += not (entry.good or entry.outcome in _NO_FAILURE)
         self.results.append(entry)
 
     def recall(self, entries: Sequence[CalibrationEntry]) -> None:
-        """Take the results of earlier programs, oldest first, and their quality over time.
+        """Accept the results of earlier programs, oldest first, and their quality over time.
 
-        The quality is left out where the results do not cover every calibrated heliostat.
+        The quality is left out if the results do not cover every calibrated heliostat.
         """
         self.results.extend(entries)
         predicted: dict[str, float] = {}
@@ -123,7 +123,7 @@ class CalibrationBook:
         rows = np.array([self._plant.field.place(r.heliostat) for r in records], dtype=np.intp)
         names = [record.heliostat for record in records]
         self.spread[rows] = expected_covariances(self._plant, names, self._aims(rows))
-        # The normal is off by half as much as the beam.
+        # The error of the normal is half that of the beam.
         self.error[rows] = 0.5 * np.sqrt(np.trace(self.spread[rows], axis1=-2, axis2=-1))
 
     def error_on(self, target: Target, rows: npt.NDArray[np.intp]) -> FloatArray:
@@ -146,7 +146,7 @@ class CalibrationBook:
         return np.array([given[name] for name in names], dtype=np.float64).reshape(-1, 3)
 
     def installed(self) -> float:
-        """Return the tracking error that the priors allow an uncalibrated heliostat, rad."""
+        """Return the tracking error that the priors predict for an uncalibrated heliostat, rad."""
         field = self._plant.field
         rows = np.unique(np.linspace(0, len(field) - 1, _SAMPLE).astype(np.intp))
         light = self._plant.sun_vector()

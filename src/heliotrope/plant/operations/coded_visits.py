@@ -20,21 +20,23 @@ from heliotrope.safety import Alarm, alarms
 from heliotrope.store.records import PlannedVisit
 
 Mask = npt.NDArray[np.bool_]
-#: Returns the next of the ready heliostats (N,) for a target; with True others go there with it.
+#: Function that returns the next of the ready heliostats (N,) for a target; with True, others go
+#: there with it.
 Next = Callable[[str, Mask, bool], PlannedVisit | None]
 
-#: Share of the largest expected error that a heliostat may have which automatic control sends: the
-#: sun moves on until the visit begins.
+#: Fraction of the largest expected error up to which automatic control sends a heliostat, because
+#: the sun moves until the visit begins.
 _JOINT_SURE = 0.95
 #: Longest wait of a target for a joint first visit while the field is raised, s.
 _PATIENCE = 60.0
-#: Heliostats that are judged at a time, some 10 ms.
+#: Number of heliostats judged at a time, which takes some 10 ms.
 _PART = 500
-#: Verdicts that say that something is wrong with a mirror or with what is believed of it.
+#: Verdicts that indicate a fault of a heliostat or of what is believed about it.
 _WRONG = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE)
-#: Share of the largest expected error that a heliostat may have which automatic control measures.
+#: Fraction of the largest expected error up to which automatic control measures a heliostat on a
+#: receiver.
 _RECEIVER_SURE = 0.75
-#: Receiver visits that came to nothing: mostly the light is to blame, and not a mirror.
+#: Receiver visits without a result, mostly because of the light and not of a heliostat.
 RECEIVER = RetryLaw(
     "visits on this receiver",
     5,
@@ -45,8 +47,8 @@ RECEIVER = RetryLaw(
     rest=3600.0,
     alarm=alarms.VISITS_FAIL,
 )
-#: Receiver visits that a heliostat was refused for, or that an error broke off, while they measured
-#: others.
+#: Receiver visits in which a heliostat was refused, or an error ended its measurement, while others
+#: were measured.
 MIRROR = RetryLaw(
     "receiver visit",
     3,
@@ -55,17 +57,17 @@ MIRROR = RetryLaw(
     rest=16.0 * 3600.0,
 )
 _BROKEN = (CalibrationOutcome.REFUSED, CalibrationOutcome.ERROR)
-#: Verdicts after which a heliostat is looked at on a target.
+#: Verdicts after which a heliostat is examined on a target.
 _ODD = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE, Verdict.JOINED, Verdict.FAINT)
 
 
 class Requests:
-    """Heliostats that persons want measured together, in the order in which they were asked.
+    """Heliostats that operators want measured together, in the order of the requests.
 
     Parameters
     ----------
     place
-        Returns the row of a heliostat.
+        Function that returns the row of a heliostat.
     """
 
     def __init__(self, place: Callable[[str], int]) -> None:
@@ -78,16 +80,16 @@ class Requests:
         return tuple(name for names, _ in self._asked for name in names)
 
     def ask(self, heliostats: Sequence[str], surface: str) -> None:
-        """Measure heliostats together on a surface or, for "", on the next free one."""
+        """Request a common measurement on a surface or, if "", on the next free one."""
         self._asked.append((tuple(dict.fromkeys(heliostats)), surface))
 
     def withdraw(self, heliostats: Collection[str]) -> None:
-        """Forget that persons wanted these heliostats measured."""
+        """Drop operators' requests for these heliostats."""
         left = [(tuple(n for n in names if n not in heliostats), s) for names, s in self._asked]
         self._asked = [(names, surface) for names, surface in left if names]
 
     def next(self, surface: str, ready: Mask) -> tuple[str, ...]:
-        """Return the next for a surface, once all of them are ready (N,); () if none are."""
+        """Return the next group for a surface, once all of it is ready (N,); () if none is."""
         for i, (names, where) in enumerate(self._asked):
             if where in ("", surface) and ready[[self._place(name) for name in names]].all():
                 del self._asked[i]
@@ -103,7 +105,7 @@ class JointVisits:
     plant, book
         The controller, and the predicted errors.
     cycle
-        Makes a joint visit.
+        Cycle that makes a joint visit.
     tell
         Called with each alarm.
 
@@ -112,7 +114,7 @@ class JointVisits:
     cycle
         As given.
     requests
-        Requests of persons.
+        Requests of operators.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class JointVisits:
         self._plant, self._book, self.cycle, self._tell = plant, book, cycle, tell
         self.requests = Requests(plant.field.place)
         self._disproved: set[str] = set()
-        #: Targets whose last visit was a joint one.
+        #: Targets whose last visit was a joint visit.
         self._last: set[str] = set()
         #: Since when a target has waited for a joint first visit.
         self._waited: dict[str, float] = {}
@@ -134,29 +136,29 @@ class JointVisits:
     async def chosen(self, target: str, ready: Mask, following: Next) -> tuple[str, ...]:
         """Return the ready heliostats (N,) that go to a target together; () if too few would.
 
-        Those that were never calibrated, or are known badly, come first; then those that are due.
-        While others wait for their first calibration, every second visit to a target is a joint
-        one at most.
+        Heliostats that were never calibrated, or are poorly known, come first; then those that are
+        due. While others wait for their first calibration, at most every second visit to a target
+        is a joint visit.
         """
         settings, able = self.cycle.settings, ready & ~self.alone(ready)
         first = ready & ~np.isfinite(self._book.calibrated_at)
         error = await self._error_on(target, able & ~first)
         limit = _JOINT_SURE * settings.known
-        # Those that are known too badly on this target keep a code of their own, as new ones do.
+        # Heliostats that are too poorly known on this target keep their own code, as new ones do.
         new = able & (first | (error > limit))
         if settings.first and int(new.sum()) >= settings.least:
-            # The targets share those that are left.
+            # The targets share the remaining heliostats.
             share = -(-int(new.sum()) // len(self._plant.design.targets))
             most = min(settings.first, max(settings.least, share))
             names = await self._several(target, new, following, most)
-            # What makes the target too bright waits for the next visit.
+            # Heliostats that would make the target too bright wait for the next visit.
             names = self.cycle.having_place(names, target) if names else ()
             if len(names) >= settings.least:
                 return names
         if first.any() and target in self._last:
             self._last.discard(target)
             return ()
-        # One that has no place in the visit would count as failed.
+        # A heliostat without a place in the visit would count as failed.
         known = able & (error <= limit)
         if int(known.sum()) < settings.least:
             return ()
@@ -166,8 +168,8 @@ class JointVisits:
     async def _error_on(self, target: str, heliostats: Mask) -> FloatArray:
         """Return the expected errors of beams on a target, as a joint visit judges them, rad, (N,).
 
-        What counts is the error where the visit is: sightings on one target leave more open on the
-        receiver.
+        The error at the place of the visit counts, because sightings on one target leave a larger
+        error on the receiver.
         """
         again, place = 2.0 * self.cycle.settings.visit**2, self._plant.design.target(target)
         found, rows = np.full(len(heliostats), np.nan), np.flatnonzero(heliostats)
@@ -183,7 +185,7 @@ class JointVisits:
         """Return up to ``most`` of the ready heliostats (N,), in the order of their gain."""
         names: list[str] = []
         left = ready.copy()
-        # Two targets that chose in turn would leave too few to both.
+        # If two targets chose alternately, too few would be left for both.
         async with self._choosing:
             while len(names) < most:
                 planned = following(target, left, bool(names))
@@ -195,7 +197,7 @@ class JointVisits:
         return tuple(names)
 
     def alone(self, ready: Mask) -> Mask:
-        """Return a mask of the ready heliostats (N,) that no joint visit proved: they go alone."""
+        """Return a mask of the ready heliostats (N,) that no joint visit proved, which go alone."""
         found = np.zeros_like(ready)
         found[[self._plant.field.place(name) for name in self.cycle.attempts.given_up]] = True
         return found & ready
@@ -203,7 +205,7 @@ class JointVisits:
     def awaited(self, target: str, ready: Mask) -> bool:
         """Return whether a target waits for others: the field is raised, and few are ready.
 
-        It waits for `_PATIENCE` at most, once, for a joint first visit that is worth its way.
+        It waits for at most `_PATIENCE`, once, for a joint first visit that is worthwhile.
         """
         settings, now = self.cycle.settings, self._plant.now()
         full = settings.first * len(self._plant.design.targets)
@@ -222,14 +224,14 @@ class JointVisits:
         self._last.add(target)
 
     def again(self, result: CycleResult) -> bool:
-        """Return whether a result is no failure: another joint visit searches for its beam."""
+        """Return whether a result is no failure because another joint visit will search again."""
         return result.verdict is not None and self.cycle.searching(result.heliostat)
 
     def concluded(self, result: CycleResult) -> None:
         """Note the result of a visit: what it proves or disproves about a heliostat."""
         self.cycle.note(result)
         name, kind = result.heliostat, alarms.BEAM_DISPROVED
-        # Nothing says where the beam of a mirror without a calibration ought to be.
+        # Nothing predicts where the beam of an uncalibrated heliostat should be.
         known = np.isfinite(self._book.calibrated_at[self._plant.field.place(name)])
         if result.verdict in _WRONG and known:
             self._disproved.add(name)
@@ -247,7 +249,7 @@ class ReceiverVisits:
     plant, book
         The controller, and the predicted errors.
     cycle
-        Makes a receiver visit.
+        Cycle that makes a receiver visit.
     tell
         Called with each alarm.
 
@@ -256,9 +258,9 @@ class ReceiverVisits:
     cycle
         As given.
     requests
-        Requests of persons.
+        Requests of operators.
     attempts
-        Visits that came to nothing, by receiver.
+        Visits without a result, by receiver.
     mirrors
         Visits from which a heliostat was left out, by heliostat.
     """
@@ -274,7 +276,7 @@ class ReceiverVisits:
         self._settings, self.requests = cycle.settings, Requests(plant.field.place)
         self._face = cycle.face(self.surface)
         self.attempts, self.mirrors = Attempts(RECEIVER, tell), Attempts(MIRROR)
-        #: When each heliostat was measured last, monotonic s.
+        #: When each heliostat was last measured, monotonic s.
         self._at = np.full(len(plant.field), -np.inf)
 
     @property
@@ -294,13 +296,13 @@ class ReceiverVisits:
     def chosen(self, ready: Mask) -> tuple[str, ...]:
         """Return the ready heliostats (N,) that are measured next; () if there are too few.
 
-        Those that persons asked for come first, then those whose errors may be largest.
+        Heliostats requested by operators come first, then those whose errors may be largest.
         """
         field, settings, now = self._plant.field, self._settings, self._plant.now()
         lit = ready & self._shining()
         if names := self.requests.next(self.surface, lit):
             return names
-        # The book has errors of the normal; a beam is off by twice as much.
+        # The book contains errors of the normal; beam errors are twice as large.
         due = lit & (2.0 * self._book.error <= _RECEIVER_SURE * settings.known)
         due &= now - self._at >= settings.every
         due[[field.place(name) for name in self.mirrors.waiting(now)]] = False
@@ -311,14 +313,14 @@ class ReceiverVisits:
         return tuple(field.names[row] for row in first)
 
     def retries(self, now: float) -> tuple[Retry, ...]:
-        """Return the visits that are tried again, or were given up."""
+        """Return the visits that are being retried or were given up."""
         return *self.attempts.shown(now), *self.mirrors.shown(now)
 
     def concluded(self, results: Sequence[CycleResult]) -> tuple[str, ...]:
         """Note a visit's results; return the heliostats to measure on a target.
 
-        Where less than half of the beams are proven, the light is to blame and not the mirrors.
-        One that was refused too often while others were measured goes to a target, too.
+        If less than half of the beams are proven, the light is to blame and not the heliostats. A
+        heliostat that was refused too often while others were measured also goes to a target.
         """
         results = [r for r in results if r.outcome is not CalibrationOutcome.TAKEN_OUT]
         now, seen = self._plant.now(), [r.heliostat for r in results if r.verdict is None]

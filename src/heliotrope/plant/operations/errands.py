@@ -17,19 +17,19 @@ from heliotrope.plant.orders.tickets import Ticket
 
 @dataclass(frozen=True)
 class Step:
-    """How far an operation is with a heliostat: in words, and its stage; None: it still waits."""
+    """Progress of an operation for a heliostat: in words, and its stage; None: still waiting."""
 
     text: str
     stage: Stage | None = None
 
 
-#: Returns how far an operation is with some heliostats, by name.
+#: Function that returns the progress of an operation for some heliostats, by name.
 Progress = Callable[[Sequence[str]], Mapping[str, Step]]
 
 
 @dataclass(frozen=True)
 class _Errand:
-    """An operation under way: where it stands, its longest time, and what ends with it."""
+    """An operation in progress: its ticket, its longest time, and what ends with it."""
 
     ticket: Ticket
     progress: Progress
@@ -38,12 +38,12 @@ class _Errand:
 
 
 class Errands:
-    """The operations under way.
+    """The operations in progress.
 
     Parameters
     ----------
     clock
-        Of the plant.
+        Clock of the plant.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -78,13 +78,13 @@ class Errands:
         return ticket
 
     def look(self) -> None:
-        """Note how far all operations are."""
+        """Note the progress of all operations."""
         for errand in self._open:
             self._look_at(errand)
         self._open = [errand for errand in self._open if not errand.ticket.finished]
 
     def end(self, why: str) -> None:
-        """End all operations that are still under way."""
+        """End all operations that are still in progress."""
         for errand in self._open:
             left = errand.ticket.waiting(errand.ticket.heliostats)
             errand.ticket.step(dict.fromkeys(left, why), Stage.FAILED)

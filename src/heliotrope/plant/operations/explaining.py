@@ -12,7 +12,7 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.views import Button, Explanation, LastOrder
 from heliotrope.store.records import Kind
 
-#: Reason, what follows by itself, what a person can do, and the command that does it.
+#: Reason, what follows by itself, what an operator can do, and the command that does it.
 _Case = tuple[str, str, str, Button]
 
 
@@ -24,11 +24,11 @@ def explain(
     Parameters
     ----------
     plant, automatic, logbook
-        The plant at work.
+        The running plant.
     name
         Heliostat.
     on
-        Receiver or target that it aims at, "" for none.
+        Receiver or target at which it aims, "" for none.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def _case(
     *,
     tracks: bool,
 ) -> _Case:
-    """Return the first reason that holds, of those that go before all others."""
+    """Return the first applicable reason among those that take precedence over all others."""
     name = shown.name
     if held := plant.lockouts.text(Kind.HELIOSTAT, name):
         return (

@@ -37,7 +37,7 @@ from heliotrope.plant.visits.fitting import (
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import FlightEntry
 
-#: Largest share of a flight's mirrors whose fit may be wrong.
+#: Largest fraction of a flight's heliostats whose fit may be wrong.
 _MOST_WRONG = 0.5
 #: A photograph may be this much later than the plant's time, s.
 _LATE = 300.0
@@ -45,7 +45,7 @@ _LINES = 10
 
 
 class _Way(Enum):
-    """How a heliostat of a flight stands to it."""
+    """How the fit of a heliostat from a flight is handled."""
 
     IN_USE = "in use"
     AT_STOW = "at stow"
@@ -55,9 +55,9 @@ class _Way(Enum):
 
 @dataclass(frozen=True)
 class _Waiting:
-    """A heliostat with the fit that a flight brought, and the version that it was judged beside.
+    """A heliostat with the fit from a flight, and the version with which the fit was compared.
 
-    ``astray``: the flight sees it far from where its parameters say.
+    ``astray``: the flight observed it far from where its parameters predict.
     """
 
     way: _Way
@@ -67,12 +67,12 @@ class _Waiting:
 
 
 class FlightIntake:
-    """Takes flights into the beliefs of a plant.
+    """Imports flights into the beliefs of a plant.
 
     Parameters
     ----------
     plant, log, keeping
-        The controller, the logbook for events, and the memory.
+        The controller, the logbook for events, and the store of results.
     settings
         Model and limits of fits.
     """
@@ -88,7 +88,7 @@ class FlightIntake:
     # -- taking ----------------------------------------------------------------------------
 
     async def take(self, person: Person, document: FlightDocument, text: str) -> FlightView:
-        """Take a flight; the fits are made in a thread.
+        """Import a flight; the fits are made in a thread.
 
         Parameters
         ----------
@@ -102,9 +102,9 @@ class FlightIntake:
         RefusedError
             If the role is too low, the flight is known, or it contradicts the field.
         InputError, UnknownNameError
-            If it is not of this plant.
+            If the flight is not of this plant.
         StoreError
-            If it cannot be kept.
+            If it cannot be stored.
         """
         flight = self._checked(person, document)
         self._busy = flight.name
@@ -119,7 +119,7 @@ class FlightIntake:
         return self._conclude(taken, flights, fits, text)
 
     def take_now(self, person: Person, document: FlightDocument, text: str) -> FlightView:
-        """Take a flight within the caller's thread, as `take` does."""
+        """Import a flight within the caller's thread, as `take` does."""
         flight = self._checked(person, document)
         taken = TakenFlight(
             flight, np.zeros(len(flight.sightings), np.int64), self._utc(), person.name
@@ -128,7 +128,7 @@ class FlightIntake:
         return self._conclude(taken, flights, self._fitted(flights, flight), text)
 
     def _checked(self, person: Person, document: FlightDocument) -> Flight:
-        """Return a flight that this plant can take."""
+        """Return a flight that this plant can import."""
         person.must_be(Role.ENGINEER, "flight")
         flight, beliefs = Flight.of(document), self._plant.beliefs
         for each in beliefs.flights:
@@ -164,7 +164,7 @@ class FlightIntake:
     def _conclude(
         self, taken: TakenFlight, flights: Flights, fits: Mapping[str, JudgedFit], text: str
     ) -> FlightView:
-        """Believe a flight that does not contradict the field; sort its heliostats."""
+        """Adopt a flight that does not contradict the field; sort its heliostats."""
         flight, wrong = taken.flight, [n for n, f in fits.items() if f.outcome in WRONG]
         if len(wrong) > _MOST_WRONG * len(fits):
             first = f"{wrong[0]}: {fits[wrong[0]].problem}"
@@ -200,7 +200,7 @@ class FlightIntake:
             return _Waiting(_Way.UNCHANGED, fit, version)
         change = change_of(beliefs.present(fit.name), fit.mechanism, fit.sightings)
         large = change > self._settings.large
-        # A visit fits each heliostat with a model of its own, which may be a larger one.
+        # A visit fits each heliostat with its own model, which may be a larger one.
         other = record is None or set(record.names) != set(fit.fitted.names)
         way = _Way.AT_TARGET if large or other else _Way.AT_STOW
         return _Waiting(way, fit, version, large and record is not None)
@@ -208,7 +208,7 @@ class FlightIntake:
     # -- afterwards ------------------------------------------------------------------------
 
     def recall(self) -> None:
-        """Fit the flights from before a restart again: what waited then, waits again."""
+        """Fit the flights from before a restart again; what was waiting then waits again."""
         beliefs, fits = self._plant.beliefs, dict[str, JudgedFit]()
         known, beliefs.flights = tuple(beliefs.flights), Flights()
         for taken in known:
@@ -223,7 +223,8 @@ class FlightIntake:
             last = max(f.at for f in known if name in f.flight.heliostats)
             if record is not None and record.at >= last:
                 done.add(name)
-        # Only what still waits is followed: a field of many flights would take minutes to start.
+        # Only what still waits is followed, because a field with many flights would take minutes to
+        # start.
         left = {name: fit for name, fit in fits.items() if name not in done}
         fits |= follow_flights(beliefs, beliefs.flights, self._settings, left)
         for name, fit in fits.items():
@@ -232,7 +233,7 @@ class FlightIntake:
         self.look()
 
     def look(self) -> None:
-        """Take the waiting fits of heliostats that are where their parameters may be written."""
+        """Adopt the waiting fits of heliostats whose parameters may now be written."""
         field, beliefs = self._plant.field, self._plant.beliefs
         resting = field.among(TAKES_POSE, self._plant.now())
         for name, waiting in list(self._waiting.items()):
@@ -240,7 +241,7 @@ class FlightIntake:
                 continue
             record = beliefs.record(name)
             if record is not None and record.version > waiting.version:
-                # A visit has fitted the flight's rows together with its photographs.
+                # A visit has fitted the flight's records together with its photographs.
                 self._waiting[name] = replace(waiting, way=_Way.IN_USE)
             elif waiting.way is _Way.AT_STOW and resting[field.place(name)]:
                 self._waiting[name] = replace(waiting, way=_Way.IN_USE)
@@ -266,7 +267,7 @@ class FlightIntake:
         return frozenset(n for n, w in self._waiting.items() if w.way is _Way.AT_TARGET)
 
     def views(self) -> tuple[FlightView, ...]:
-        """Return the flights, the last taken first."""
+        """Return the flights, the last imported first."""
         flights = self._plant.beliefs.flights
         return tuple(self._view(k, each) for k, each in enumerate(flights))[::-1]
 

@@ -32,11 +32,12 @@ from heliotrope.safety.proof import FLUX_AGE
 SCALE, SHAPE = 0.10, 0.05
 #: Standard deviation of a measurement: of its value, and of the nominal flux.
 READ, FLOOR = 0.02, 0.005
-#: Distance, in standard deviations, above which the alarm is raised, and below which it is over.
+#: Distance, in standard deviations, above which the alarm is raised, and below which it is cleared.
 RAISE, CLEAR = 4.0, 3.0
-#: Time for which the distance must be above or below, s: mirrors on their way have been reported.
+#: Time for which the distance must be above or below, s; by then moving heliostats have been
+#: reported.
 HOLD = 120.0
-#: Time between comparisons, s.
+#: Interval between comparisons, s.
 EVERY = 10.0
 
 
@@ -53,7 +54,7 @@ def distance(view: PredictedView, measured: FloatArray, mean: float, area: float
     mean
         Mean flux on the receiver at nominal power, W/m².
     area
-        Of the receiver, m².
+        Area of the receiver, m².
 
     Returns
     -------
@@ -73,7 +74,7 @@ def distance(view: PredictedView, measured: FloatArray, mean: float, area: float
 
 
 class FluxCheck:
-    """Compares the flux on a plant's receiver, and raises an alarm where it is not the predicted.
+    """Compares the flux on a plant's receiver with the prediction; alarms if they differ.
 
     It compares if the plant has one receiver, its nominal power is known, and the irradiance is
     measured.
@@ -91,19 +92,20 @@ class FluxCheck:
             self._receiver = plant.design.receivers[0]
             self._area = float(surface_of(self._receiver).cells.area.sum())
             self._mean = self._receiver.nominal_power / self._area
-        #: The camera's last map, fractions, and when it came; a plant without one has none.
+        #: The camera's last map, as fractions, and when it arrived; a plant without a camera has
+        #: none.
         self._seen: tuple[FloatArray | None, float] | None = None
         self._apart_since = self._agrees_since = math.inf
 
     def see(self, fractions: FloatArray | None) -> None:
-        """Take what a camera has just seen: fractions of the nominal mean flux, (H, W) or ().
+        """Accept what a camera has just measured: fractions of the nominal mean flux, (H, W) or ().
 
-        None: it has not seen all of the light, so that there is nothing to compare.
+        None: the camera has not seen all of the light, so there is nothing to compare.
         """
         self._seen = fractions, self._plant.now()
 
     def measured(self, name: str) -> FloatArray | None:
-        """Return the measured flux on a receiver, W/m², (H, W) or (); None if there is none now."""
+        """Return the measured flux on a receiver, W/m², (H, W) or (); None if there is none."""
         if self._receiver is None or self._receiver.name != name:
             return None
         now = self._plant.now()

@@ -35,7 +35,7 @@ STOPPED = "unknown, because the plant stopped before the result arrived"
 
 
 class AuditError(HeliotropeError):
-    """A record that could not be written."""
+    """A record could not be written."""
 
 
 @dataclass(frozen=True)
@@ -96,16 +96,16 @@ class Forgetful:
     """An audit that stores nothing, for plants that are only inspected."""
 
     def begin(self, record: Record) -> None:
-        """Take a record."""
+        """Accept a record."""
 
     def finish(self, identity: str, result: str, at: str) -> None:
-        """Take a result."""
+        """Accept a result."""
 
     def confirm(self) -> None:
-        """Do nothing: nothing can go wrong."""
+        """Do nothing, because nothing can fail."""
 
     def close(self) -> None:
-        """Do nothing: nothing is open."""
+        """Do nothing, because nothing is open."""
 
 
 class JsonLines:
@@ -151,11 +151,11 @@ class JsonLines:
             raise
         self._open = {record.identity for record in records if not record.result}
         self._known = {record.identity for record in records}
-        #: Number of lines torn by a loss of power. If the last is unfinished, the next line must
-        #: not continue it.
+        #: Number of lines torn by a power failure. If the last line is incomplete, the next one
+        #: must not continue it.
         self.torn = torn
         self._torn = not _ends_with_newline(self._file)
-        #: Digest of the last line; None: to be read from the file.
+        #: Digest of the last line; None: it must be read from the file.
         self._digest: str | None = None
         for identity in sorted(self._open):
             self.finish(identity, STOPPED, started.isoformat())
@@ -223,13 +223,14 @@ class JsonLines:
         if self._digest is None:
             self._digest = _last_digest(self.path.read_bytes())
         digest = digest_of(self._digest, [fields])
-        # It may be written although its sync fails: then the file says which one is the last.
+        # The line may have been written although its sync failed; then the file shows which line is
+        # last.
         self._digest = None
         fields = {**fields, "digest": digest}
         line = json.dumps(fields, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
         data = (b"\n" if self._torn else b"") + line.encode() + b"\n"
         try:
-            # One write: with O_APPEND it is appended as a whole.
+            # A single write, so that O_APPEND appends it as a whole.
             written = os.write(self._file, data)
             os.fsync(self._file)
         except OSError as error:
@@ -252,7 +253,7 @@ def read(path: str | Path) -> tuple[list[Record], int]:
     Raises
     ------
     FormatError
-        Two beginnings or two results of one identity, or a result without a beginning.
+        If an identity has two beginnings or two results, or a result without a beginning.
     """
     records: dict[str, Record] = {}
     torn = 0
@@ -301,7 +302,7 @@ def _repeats(known: Record, event: str, fields: dict[str, Any]) -> bool:
 
 
 def _fields(line: bytes) -> dict[str, Any] | None:
-    """Return the fields of a line, None if it was torn by a loss of power."""
+    """Return the fields of a line, None if it was torn by a power failure."""
     try:
         found = json.loads(line)
     except ValueError:
@@ -310,13 +311,13 @@ def _fields(line: bytes) -> dict[str, Any] | None:
 
 
 def _before(data: bytes) -> str:
-    """Return the digest before the first line that has one: of all lines without."""
+    """Return the digest that precedes the first line with one; it covers all lines without."""
     older = data.rstrip(b"\n")
     return hashlib.sha256(older).hexdigest() if older else GENESIS
 
 
 def _last_digest(data: bytes) -> str:
-    """Return the digest of the last whole line that has one, whether or not the chain fits."""
+    """Return the digest of the last complete line with one, whether or not the chain fits."""
     for line in reversed(data.split(b"\n")):
         fields = _fields(line)
         if fields is not None and isinstance(fields.get("digest"), str):
@@ -330,7 +331,8 @@ def verify(path: str | Path, known: Iterable[Head] = ()) -> Head:
     Raises
     ------
     FormatError
-        If a line does not fit, or a head is not in the chain; the text names the first.
+        If a line does not fit, or a head is not in the chain; the text names the first such line or
+        head.
     """
     data, place = Path(path).read_bytes(), 0
     digests: list[str] = []

@@ -257,7 +257,7 @@ class Authority:
 
     @property
     def silent_for(self) -> float:
-        """Time since any authority was last renewed, or since the plant began, s.
+        """Time since any authority was last renewed, or since the plant's start, s.
 
         It is 0 while a mandate is open, because the plant then commands by itself.
         """
@@ -436,7 +436,7 @@ class Authority:
         return 0 if mandate is None or mandate.ended else self.token
 
     def _drawn(self) -> int:
-        """Return a new token of the wire."""
+        """Return a new wire token."""
         token = 0
         while token in (0, self._last_token):
             token = int.from_bytes(self._entropy(4), "little")
@@ -444,7 +444,7 @@ class Authority:
         return token
 
     def _give(self, person: Person) -> Grant:
-        """Give the authority; whose visits alone go on keeps the token that they go on with."""
+        """Grant the authority; a person who is the only one with open visits keeps their token."""
         now, token = self._clock.monotonic(), self._own
         if not token or any(each.person != person for each in self._mandates.values()):
             token, self.changed_at = self._drawn(), now
@@ -453,7 +453,7 @@ class Authority:
         return self._grant
 
     def _give_up(self) -> None:
-        """End the grant. Open mandates go on under a token of the plant's own."""
+        """End the grant. Open mandates continue under a token of the plant itself."""
         self._grant, self.changed_at = None, self._clock.monotonic()
         self._own = self._drawn() if self._mandates else 0
 

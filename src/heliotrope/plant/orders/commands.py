@@ -29,15 +29,16 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.orders.unacknowledged import Unacknowledged
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
 
-#: Work of the disk, and its reverse.
+#: Disk work, and the disk work that reverts it.
 Storing = tuple[Work, Callable[..., object]]
-#: A new point so near the last one, and both so far off all receivers, bring no light there, m.
+#: A new point within this distance of the last one brings no light to a receiver if both are this
+#: far off all receivers, m.
 _BESIDE = 3.0
 
 
 @dataclass(frozen=True)
 class NewPoints:
-    """Points that are given to heliostats; each is assigned when it is sent.
+    """New points for heliostats; each point is assigned when it is sent.
 
     Attributes
     ----------
@@ -46,17 +47,18 @@ class NewPoints:
     names, wanted
         Heliostats (K,), and their points, ENU, m, (K, 3).
     token
-        The holder's, or a mandate's.
+        Token of the authority holder or of a mandate.
     store
-        Called with some heliostats and their points: returns work of the disk that must be done
-        before they are sent, and its reverse.
+        Called with some heliostats and their points. It returns disk work that must be done before
+        the points are sent, and disk work that reverts it.
     note
-        Called with those that are being assigned, and their points.
+        Called with the heliostats whose points are being assigned, and the points.
     check
         Called with the heliostats whose turn it is; raises `RefusedError` if their points may no
         longer be assigned.
     free
-        Returns the heliostats that need no turn; None: those that bring no light to a receiver.
+        Returns the heliostats that need not wait for a turn; None: the heliostats that bring no
+        light to a receiver.
     """
 
     name: str
@@ -74,28 +76,28 @@ class NewPoints:
         return self.points[np.array([row[name] for name in names], dtype=np.intp)]
 
     def grouped(self, names: Iterable[str]) -> dict[tuple[float, ...], list[str]]:
-        """Return the heliostats of each point, which share one command."""
+        """Return the heliostats for each point, which share one command."""
         some = tuple(names)
         return grouped(some, self.of(some))
 
 
 class Commands:
-    """Gives the commands of the wire that need the command authority.
+    """Issues the wire commands that need the command authority.
 
     Parameters
     ----------
     orders, joining
-        The plant's.
+        Parts of the plant.
     guards
-        What stops heliostats; see `GUARDS`.
+        What blocks heliostats; see `GUARDS`.
     unacknowledged
-        Points that were assigned, and whether they were taken.
+        Assigned points, and whether they were acknowledged.
     proofs
-        Where beams may go.
+        Proofs of where beams may go.
     design
-        Knows the targets and receivers.
+        The plant, with its targets and receivers.
     required
-        Parameters that local controllers should store, their standby points among them.
+        Parameters that local controllers should store, including their standby points.
     taken
         What visits have taken.
     """
@@ -125,7 +127,7 @@ class Commands:
         heliostats: Sequence[str],
         values: Sequence[float],
     ) -> Ticket:
-        """Give a command without points; see `PlantController.command`."""
+        """Issue a command without points; see `PlantController.command`."""
         row = wire.ROW_OF.get(wire.NUMBER_OF.get(name, -1))
         if row is None or row[2] != wire.AUTHORITY or name in wire.POINTS:
             known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY]
@@ -167,7 +169,8 @@ class Commands:
             waiting, refused = self.examine(name, numbers, others, token)
             ticket.block({**refused, **out})
             if name not in wire.SETTINGS:
-                # One that was given before it may have joined the queue after its acceptance.
+                # A heliostat commanded earlier may have joined the queue after this command was
+                # accepted.
                 self._joining.drop(f"superseded by {name}", frozenset(waiting))
         if waiting and name == "LOCK":
             self._note_lock(waiting, token)
@@ -189,16 +192,16 @@ class Commands:
         store: tuple[Work, Work] | None = None,
         blocked: Mapping[str, str] = MappingProxyType({}),
     ) -> Ticket:
-        """Return the ticket of a command that may be given, with its record on the way.
+        """Return the ticket of a command that may be issued; its record is on the way to the disk.
 
-        It ends at once for those that are ``blocked``. A person's command takes the others out of
-        the visits that they are in. Where a visit verifies new parameters, no person sends the beam
-        to an aim: only the visit sees whether it gets there.
+        The ticket ends at once for ``blocked`` heliostats. An operator's command removes the others
+        from their visits. While a visit verifies new parameters, no operator may send the beam to
+        an aim, because only the visit can tell whether the beam arrives there.
 
         Raises
         ------
         RefusedError
-            If it may not.
+            If the command may not be issued.
         """
         for heliostat in heliostats:
             self._field.place(heliostat)
@@ -228,12 +231,12 @@ class Commands:
         return ticket
 
     def _lock_record(self, heliostats: tuple[str, ...], token: int) -> tuple[Work, Work]:
-        """Return work that stores whose lock it is, before it is taken; and its reverse."""
+        """Return disk work that records the owner of a lock before locking, and its reversal."""
         visit = self._authority.mandate_of(token) is not None
         return self._proofs.points.holding(self._locks.record(heliostats, visit=visit))
 
     def _note_lock(self, heliostats: tuple[str, ...], token: int) -> None:
-        """Note whose lock it is: a visit's, which the plant opens in the end, or a person's."""
+        """Note the owner of a lock: a visit, for which the plant unlocks later, or a person."""
         if self._authority.mandate_of(token) is None:
             self._locks.forget(heliostats)
         else:
@@ -259,7 +262,7 @@ class Commands:
     def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
         """Declare the step counts of the axes of one heliostat that is locked or has a fault.
 
-        Nothing moves; its local controller stores the counts. It needs an engineer, and the
+        Nothing moves; its local controller stores the counts. This requires an engineer, and the
         heliostat's key in its cluster.
 
         Parameters
@@ -269,14 +272,14 @@ class Commands:
         heliostat
             Name.
         counts
-            Of the primary and the secondary axis, steps.
+            Step counts of the primary and the secondary axis.
 
         Raises
         ------
         RefusedError
-            If it is not accepted; nothing is sent then.
+            If the command is not accepted; in that case nothing is sent.
         InputError
-            Counts that do not fit.
+            If counts are invalid.
         UnknownNameError
             If there is no such heliostat.
         """
@@ -298,7 +301,7 @@ class Commands:
     def point(
         self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> Ticket:
-        """Give AIM or STANDBY with a point (3,) for each heliostat; see `PlantController.aim`."""
+        """Send AIM or STANDBY with a point (3,) for each heliostat; see `PlantController.aim`."""
         names, _, targets, out = self._pointed(name, points)
         self.prove_points(name, names, targets)
         visit = self._authority.mandate_of(token) is not None
@@ -331,8 +334,8 @@ class Commands:
     def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Move beams a little on their receiver, for a measurement; their aims stay assigned.
 
-        The beams go back to their aims by themselves; see `movements`. No turn is needed, since
-        they bring no light to the receiver.
+        The plant returns the beams to their aims by itself; see `movements`. They need not wait for
+        a turn, because they bring no additional light to the receiver.
 
         Parameters
         ----------
@@ -344,7 +347,7 @@ class Commands:
         Raises
         ------
         RefusedError
-            If it is not accepted, or one of the beams may not go there.
+            If the command is not accepted, or one of the beams may not go there.
         """
         names, rows, targets, out = self._pointed("AIM", points)
         tracking, aims = self._field.among((states.TRACKING,), self._now())[rows], self._aims(rows)
@@ -356,7 +359,7 @@ class Commands:
 
         def check(some: tuple[str, ...]) -> None:
             rows, on = self._places(some), np.ones(len(some), dtype=np.bool_)
-            # One may have been aimed elsewhere while the record was written.
+            # A heliostat may have been aimed elsewhere while the record was written.
             self._movements.check(some, rows, self._aims(rows), new.of(some), on)
 
         def note(some: tuple[str, ...], places: FloatArray) -> None:
@@ -373,11 +376,11 @@ class Commands:
 
     @property
     def aimed(self) -> frozenset[str]:
-        """The heliostats with a new aim that waits for the disk or for its turn."""
+        """The heliostats whose new aim waits for the disk or for its turn."""
         return self._joining.waiting("AIM") | self._orders.unstored("AIM")
 
     def holding(self, held: Held) -> tuple[Work, Work]:
-        """Return work that stores what a visit takes, and its reverse; see `Points.holding`."""
+        """Return work that stores what a visit takes, and its reversal; see `Points.holding`."""
         return self._proofs.points.holding(held)
 
     def _places(self, names: Sequence[str]) -> npt.NDArray[np.intp]:
@@ -389,7 +392,7 @@ class Commands:
     def _pointed(
         self, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> tuple[tuple[str, ...], npt.NDArray[np.intp], FloatArray, dict[str, str]]:
-        """Return heliostats, rows (K,), points (K, 3), and reasons of those out of service."""
+        """Return heliostats, rows (K,), points (K, 3), and why others are out of service."""
         goals = points_of(name, points) if name == "AIM" else None
         able, out = self._guards.passed(Asked(name, tuple(points), goals), OUT_OF_SERVICE)
         points = {n: points[n] for n in able}
@@ -399,7 +402,7 @@ class Commands:
     def storing(
         self, name: str, names: tuple[str, ...], places: FloatArray, held: Held = NOTHING
     ) -> Storing:
-        """Return work that stores points (K, 3) and what visits hold then, and its reverse."""
+        """Return work that stores points (K, 3) and what visits then hold, and its reversal."""
         return self._proofs.points.storing(name, self._places(names), places, held)
 
     def _lent(self, names: tuple[str, ...], places: FloatArray) -> Held:
@@ -409,15 +412,15 @@ class Commands:
     def give_points(
         self, new: NewPoints, accept: Callable[[tuple[Work, Work] | None], Ticket]
     ) -> Ticket:
-        """Give points that are proven; each is stored and assigned when it is sent.
+        """Issue proven points; each point is stored, and assigned when it is sent.
 
         Parameters
         ----------
         new
             The points.
         accept
-            Returns their ticket; it is given work that stores those that need no turn, with the
-            record of the ticket.
+            Returns their ticket. It is passed work that stores, with the record of the ticket, the
+            points that need not wait for a turn.
         """
         waiting = self._joins(new)
         early = tuple(n for n in new.names if n not in waiting)
@@ -470,16 +473,16 @@ class Commands:
         self._orders.when_stored(ticket, names, store, stored)
 
     def _assign(self, new: NewPoints, ticket: Ticket, names: tuple[str, ...]) -> None:
-        """Assign the points of some heliostats, which are sent now."""
+        """Assign the points of some heliostats, which are being sent now."""
         places = new.of(names)
         new.note(names, places)
         self._proofs.points.assign(new.name, self._places(names), places)
         self._unacknowledged.sent(ticket, names)
 
     def _joins(self, new: NewPoints) -> frozenset[str]:
-        """Return the heliostats that track, and need a turn to join their new aims.
+        """Return the tracking heliostats that must wait for a turn to join their new aims.
 
-        Those that bring no light to a receiver need none: see `_stays`.
+        Heliostats that bring no light to a receiver need not wait: see `_stays`.
         """
         if new.name != "AIM":
             return frozenset()
@@ -492,12 +495,12 @@ class Commands:
         )
 
     def prove_points(self, name: str, names: tuple[str, ...], places: FloatArray) -> None:
-        """Prove that heliostats (K,) may be given points (K, 3) now.
+        """Prove that heliostats (K,) may be assigned points (K, 3) now.
 
         Raises
         ------
         BeamError
-            If one of them may not.
+            If a heliostat may not.
         """
         rows = self._places(names)
         tracking = self._field.among(states.ON_AIM, self._now())[rows]
@@ -510,8 +513,8 @@ class Commands:
     def _stays(self, rows: npt.NDArray[np.intp], places: FloatArray) -> npt.NDArray[np.bool_]:
         """Return a mask of the heliostats that new points (K, 3) keep off receivers, (K,).
 
-        Aim and new point lie on the same target, or near each other and off every receiver: so
-        moves a beam that is sent beside a target, because it misses.
+        The aim and the new point lie on the same target, or near each other and off every receiver.
+        The second case is that of a beam that misses its target and is therefore sent beside it.
         """
         aims = self._proofs.points.aims[rows]
         stays = np.linalg.norm(places - aims, axis=-1) <= _BESIDE

@@ -16,30 +16,31 @@ from heliotrope.plant.orders.joining import JoiningJob, JoinQueue
 from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.refusals import BEAM_REFUSED
 
-#: Returns which of some heliostats may be sent a command with values, and why the others may not.
+#: Function that returns which of some heliostats may be sent a command with values, and why the
+#: others may not.
 Examine = Callable[
     [str, tuple[float, ...], tuple[str, ...]], tuple[tuple[str, ...], dict[str, str]]
 ]
 
 
 class JoinDispatcher(Part):
-    """The sending of heliostats whose turn has come, if the path of their beams is clear now.
+    """Sends heliostats whose turn has come, if the paths of their beams are clear now.
 
-    The sun has moved since the aim was accepted, and the heliostat may point anywhere. So the sweep
-    from its present direction to its aim is proven at the moment it begins.
+    The sun has moved since the aim was accepted, and the heliostat may point anywhere. The sweep
+    from its present direction to its aim is therefore proven at the moment it begins.
 
     Parameters
     ----------
     queue, orders, proofs
-        Of the plant.
+        Parts of the plant.
     life
         Life of a command whose turn has come, s.
     held
-        Returns whether no new motion may begin.
+        Function that returns whether new motions are blocked.
     guards
-        What stops heliostats when their turn comes.
+        What blocks heliostats when their turn comes.
     examine
-        Examines a slice of those that leave stow.
+        Function that examines a slice of the heliostats that leave stow.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class JoinDispatcher(Part):
         self._guards, self._examine = guards, examine
 
     def on_beat(self, now: float) -> None:
-        """Send the heliostats whose turn it is, unless no new motion may begin."""
+        """Send the heliostats whose turn it is, unless new motions are blocked."""
         for job, part in self._queue.admit(now, self._orders.authority.lost, held=self._held()):
             clear = self._clear(job, part)
             if job.assign is None or not clear:
@@ -71,7 +72,7 @@ class JoinDispatcher(Part):
         self._orders.command(job.ticket, job.name, values, heliostats, token, self._life, again)
 
     def _wait_again(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
-        """Queue heliostats again whose cluster refused an earlier token."""
+        """Queue heliostats again whose cluster refused an outdated token."""
         self._queue.put(replace(job, waiting=deque(heliostats)))
 
     def _clear(self, job: JoiningJob, part: tuple[str, ...]) -> tuple[str, ...]:
@@ -80,7 +81,7 @@ class JoinDispatcher(Part):
             if job.name in messages.SLICED:
                 blocked = self._examine(job.name, job.values, part)[1]
             else:
-                # AIM brings a new aim; every other command leads to those that they have.
+                # AIM brings a new aim; every other command leads to the present aims.
                 points = np.tile(job.values, (len(part), 1)) if job.name == "AIM" else None
                 blocked = self._proofs.joining(job.name, job.values, part, self._now())
                 blocked |= self._guards.reasons(Asked(job.name, part, points), BEAM_REFUSED)

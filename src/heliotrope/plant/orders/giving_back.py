@@ -30,16 +30,16 @@ _PLANT = ("plant", "anybody")
 
 
 class GivingBack(Part):
-    """Sends beams back to their aims, unlocks heliostats, and lets them step as before a visit.
+    """Sends beams back to their aims, unlocks heliostats, and restores their steps after a visit.
 
     Parameters
     ----------
     field, authority, orders, guards, commands
-        The plant's.
+        Parts of the plant.
     taken
         What visits have taken.
     stow
-        Sends heliostats to stow.
+        Function that sends heliostats to stow.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class GivingBack(Part):
         self._stow = stow
 
     def on_beat(self, now: float) -> None:
-        """Give back the heliostats that are due, as far as motions are accepted now."""
+        """Restore what is due, as far as motions are accepted now."""
         self._unlock(now)
         self._bring_back(now)
         self._step(now)
@@ -70,7 +70,7 @@ class GivingBack(Part):
             self._locks.sent(what, self._ordered(what, tuple(names)))
 
     def _ordered(self, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Give an order to heliostats that were left locked; return those that need no other."""
+        """Order heliostats that were left locked; return those that need no other order."""
         if what == "STOW":
             held = self._guards.reasons(Asked(what, names), NOT_NOW)
             free = tuple(name for name in names if name not in held)
@@ -94,9 +94,9 @@ class GivingBack(Part):
         note: str,
         store: tuple[Work, Work] | None = None,
     ) -> tuple[str, ...]:
-        """Give an order to heliostats and return them, without those that are blocked.
+        """Issue an order to heliostats and return them, without the blocked ones.
 
-        Its ticket names these; they are due again later.
+        The ticket names the blocked heliostats; they are due again later.
         """
         token = self._authority.token
         able = tuple(name for name in names if name not in blocked)
@@ -133,7 +133,7 @@ class GivingBack(Part):
 
         def check(some: tuple[str, ...]) -> None:
             aimed, moved = self._commands.aimed, self._movements.names
-            # While the record was written.
+            # Changes may have come while the record was written.
             if elsewhere := [n for n in some if n in aimed or n not in moved]:
                 raise BeamError("AIM", dict.fromkeys(elsewhere, "its aim has changed since"))
 
@@ -167,7 +167,7 @@ class GivingBack(Part):
     # -- steps -----------------------------------------------------------------------------
 
     def _step(self, now: float) -> None:
-        """Order heliostats to step finely for a visit, or roughly again."""
+        """Order heliostats to use fine steps for a visit, or coarse steps again."""
         token = self._authority.token
         for rough, due in self._stepping.due(now, token).items():
             self._stepping.tried(due, now)

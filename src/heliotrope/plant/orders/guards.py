@@ -1,9 +1,9 @@
-"""Guards: why heliostats may not be given a command, as one table.
+"""Guards: one table of the reasons why heliostats may not be sent a command.
 
-Each entry names the refusal, the commands that it blocks, and the check that returns the reason per
-heliostat. The table is evaluated when a command is accepted, when its record is written, and when
-its turn comes; of several reasons, the first in the table is reported. Whether the beams may go
-there is proven after that: see `PathProofs`.
+Each entry names the refusal, the commands that it blocks, and the check that returns the reason for
+each heliostat. The table is evaluated when a command is accepted, when its record is written, and
+when its turn comes. If there are several reasons, the first in the table is reported. Whether the
+beams may go to their points is proven afterwards; see `PathProofs`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,16 +32,17 @@ from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE, Ref
 
 @dataclass(frozen=True)
 class Asked:
-    """A command that is to be given.
+    """A command that is to be issued.
 
     Attributes
     ----------
     name, heliostats
         The command, and K heliostats.
     points
-        Where it sends their beams, ENU, m, (K, 3); None: to their aims, if to a surface at all.
+        Points to which it sends their beams, ENU, m, (K, 3); None: to their aims, if to a surface
+        at all.
     token
-        The holder's or a mandate's; None: the plant's own command.
+        Token of the authority holder or of a mandate; None: the plant itself issues the command.
     """
 
     name: str
@@ -52,7 +53,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Guards:
-    """The parts of the plant whose state stops commands, and the evaluation of the table."""
+    """The parts of the plant whose state blocks commands, and the evaluation of the table."""
 
     field: FieldState
     authority: Authority
@@ -68,7 +69,7 @@ class Guards:
     aims: FloatArray
 
     def reasons(self, asked: Asked, *kinds: Refusal) -> dict[str, str]:
-        """Return the heliostats that guards with some refusals, or any, stop, and the reasons."""
+        """Return the heliostats that guards block, with given refusals or any, and the reasons."""
         found: dict[str, str] = {}
         for guard in GUARDS:
             if guard.refusal in (kinds or (guard.refusal,)) and asked.name in guard.commands:
@@ -79,12 +80,12 @@ class Guards:
         return {name: found[name] for name in asked.heliostats if name in found}
 
     def passed(self, asked: Asked, *kinds: Refusal) -> tuple[tuple[str, ...], dict[str, str]]:
-        """Return the heliostats that guards let pass, and those that they stop with the reasons.
+        """Return the heliostats that the guards pass, and the blocked ones with their reasons.
 
         Raises
         ------
         RefusedError
-            If they stop all; `BeamError` unless the refusal of all is the first of ``kinds``.
+            If all are blocked; `BeamError` unless all are blocked by the first of ``kinds``.
         """
         wrong = self.reasons(asked, *kinds)
         if wrong and len(wrong) == len(asked.heliostats):
@@ -92,14 +93,14 @@ class Guards:
         return tuple(name for name in asked.heliostats if name not in wrong), wrong
 
     def refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
-        """Refuse a command where no new motion may begin now.
+        """Refuse a command if no new motion may begin now.
 
         Raises
         ------
         BeamError
-            If it may begin in some of their clusters.
+            If motion may begin in some of their clusters.
         RefusedError
-            If it may begin in none.
+            If motion may begin in none of their clusters.
         """
         asked = Asked(name, tuple(dict.fromkeys(heliostats)))
         if held := self.reasons(asked, NOT_NOW):
@@ -120,7 +121,7 @@ class Guards:
         return np.asarray(self.aims[rows])
 
 
-#: Gives the reason for each heliostat of a command (K), None where there is none; () for all.
+#: Returns the reason for each heliostat of a command (K), None if there is none; () for all.
 Check = Callable[[Guards, Asked], Iterable[str | None]]
 
 
@@ -131,11 +132,11 @@ class Guard:
     Attributes
     ----------
     refusal
-        Of the whole command, where it stops all heliostats.
+        Refusal of the whole command, if it blocks all heliostats.
     commands
-        Those that it stops.
+        Commands that it blocks.
     check
-        The reason for each heliostat.
+        Returns the reason for each heliostat.
     """
 
     refusal: Refusal
@@ -148,7 +149,7 @@ def _each(reason: Callable[[Guards, str], str | None]) -> Check:
 
 
 def _cluster(reason: Callable[[Guards, str], str | None]) -> Check:
-    """Ask once for each cluster."""
+    """Evaluate a reason once per cluster."""
 
     def check(plant: Guards, asked: Asked) -> Iterable[str | None]:
         field = plant.field
@@ -160,7 +161,7 @@ def _cluster(reason: Callable[[Guards, str], str | None]) -> Check:
 
 
 def _alarm(condition: str = "", among: tuple[int, ...] = tuple(range(len(states.STATES)))) -> Check:
-    """Stop heliostats in some states that a row of the safety table, or any, keeps away."""
+    """Block heliostats in some states that a row of the safety table, or any row, keeps away."""
 
     def check(plant: Guards, asked: Asked) -> Iterable[str | None]:
         found = plant.sentinel.table.blocked(condition)
@@ -172,7 +173,7 @@ def _alarm(condition: str = "", among: tuple[int, ...] = tuple(range(len(states.
 
 
 def _unacknowledged(plant: Guards, asked: Asked) -> Iterable[str | None]:
-    """Stop heliostats that have not acknowledged their aims, unless they get new ones before."""
+    """Block heliostats that have not acknowledged their aims, unless they get new aims first."""
     return (
         plant.given.untaken("AIM", name) if asked.points is None else None
         for name in asked.heliostats
@@ -180,46 +181,46 @@ def _unacknowledged(plant: Guards, asked: Asked) -> Iterable[str | None]:
 
 
 def _doubted(plant: Guards, asked: Asked) -> Iterable[str | None]:
-    """Stop heliostats in doubt on their way to a receiver; a photograph on a target ends it."""
+    """Block doubtful heliostats from a receiver; a photograph on a target resolves the doubt."""
     points = plant.destined(asked)
     assert points is not None
     return plant.doubtful.reasons(asked.heliostats, points)
 
 
 def _visited(plant: Guards, asked: Asked) -> Iterable[str | None]:
-    """Stop what would disturb a measurement, unless the visit orders it, or the plant."""
+    """Block commands that would disturb a measurement, unless the visit or the plant sends them."""
     visited = {} if asked.token is None else plant.authority.visited()
     for visit in map(visited.get, asked.heliostats):
         other = visit is not None and visit.token != asked.token
         yield refusals.IN_VISIT.text.format(where=visit.where) if visit and other else None
 
 
-#: Commands that need the command authority; DEFOCUS and STOW do not, and nothing stops them.
+#: Commands that need the command authority; DEFOCUS and STOW need none, and nothing blocks them.
 _ORDERS = messages.ORDERS | {"PARAMETERS"}
 #: Commands that send beams to their aims.
 TO_AIMS = messages.JOINING | {"AIM"}
 
-#: All guards; the first that stops a heliostat gives its reason.
+#: All guards; the first that blocks a heliostat supplies the reason.
 GUARDS: tuple[Guard, ...] = (
-    # ZERO and PARAMETERS are not harmless: the next STOW would go where stow is by then.
+    # ZERO and PARAMETERS are not harmless, because they may change where the next STOW leads.
     Guard(
         OUT_OF_SERVICE,
         _ORDERS - messages.HARMLESS,
         lambda plant, asked: plant.lockouts.reasons(asked.heliostats, plant.destined(asked)),
     ),
-    # The plant itself gives STOW after a visit, and does not while an emergency holds.
+    # The plant itself issues STOW after a visit, but not while an emergency is active.
     Guard(
         NOT_NOW,
         (_ORDERS | messages.SAFE) - messages.STOPS,
         _cluster(lambda plant, name: plant.sentinel.refusal((name,))),
     ),
-    # The sun is needed to follow it, and to stand at standby; work at the mirrors is not.
+    # The sun is needed to track it and to stand at standby, but not for work on the heliostats.
     Guard(
         NOT_NOW,
         messages.JOINING | messages.TO_STANDBY,
         _cluster(lambda plant, _: plant.sentinel.night),
     ),
-    # The path from stow is free for the sun that is computed; another may lead it through volumes.
+    # The path from stow is clear for the computed sun; under another sun it may cross volumes.
     Guard(
         NOT_NOW, frozenset({"APPROACH"}), _cluster(lambda plant, _: plant.witnesses.contradiction)
     ),
@@ -237,9 +238,9 @@ GUARDS: tuple[Guard, ...] = (
         _each(lambda plant, name: plant.given.unknown("STANDBY", name)),
     ),
     Guard(BEAM_REFUSED, messages.TO_STANDBY, _alarm(UNPROVEN)),
-    # Beams that went astray, and are off, would go astray again.
+    # Beams that went astray and are now off would go astray again.
     Guard(BEAM_REFUSED, messages.TO_STANDBY, _alarm("pointing_disagrees", states.AWAY)),
-    # A heliostat that is being sent off is not stopped.
+    # A heliostat that is being ordered off is not stopped.
     Guard(BEAM_REFUSED, messages.RELEASES, _alarm("beam_unsent")),
     Guard(BEAM_REFUSED, messages.RELEASES, _alarm("keep_out_predicted")),
     Guard(BEAM_REFUSED, messages.SETTINGS, _visited),

@@ -14,35 +14,35 @@ from heliotrope.links.messages import Stage
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import JoinLimiter
 
-#: Heliostats of a slice: their proof takes 30 ms.
+#: Heliostats in a slice; proving their paths takes 30 ms.
 SLICE = 500
 #: Returns which of some heliostats may go now; the ticket ends for the others.
 Clear = Callable[[tuple[str, ...]], tuple[str, ...]]
-#: Assigns the points of some heliostats, as far as they may still go, then sends these.
+#: Assigns the points of the heliostats that may still go, then sends these heliostats.
 Assign = Callable[[tuple[str, ...], Clear, Callable[[tuple[str, ...]], None]], None]
 #: Returns which of some heliostats may no longer be commanded under a token.
 Lost = Callable[[int, Iterable[str]], frozenset[str]]
 
 
 def in_slices(name: str, heliostats: Sequence[str]) -> bool:
-    """Whether a command to some heliostats is examined and sent in slices."""
+    """Return whether a command to some heliostats is examined and sent in slices."""
     return name in messages.SLICED and len(heliostats) > SLICE
 
 
 @dataclass
 class JoiningJob:
-    """A command whose heliostats go one after the other, and those of them that still wait.
+    """A command whose heliostats go one after the other, and the heliostats still waiting.
 
     Attributes
     ----------
     ticket, name, values, token
-        Of the command; the token is the holder's or a mandate's.
+        Parts of the command; the token is that of the authority holder or of a mandate.
     waiting
         Heliostats still to be sent.
     until
-        Time at which they are given up, monotonic s.
+        Time at which the command is abandoned for them, monotonic s.
     assign
-        Assigns the point of heliostats whose turn has come, and sends them; None: the command
+        Assigns the points of heliostats whose turn has come, and sends them; None: the command
         assigns none.
     """
 
@@ -58,12 +58,12 @@ class JoiningJob:
 class JoinQueue:
     """The waiting heliostats: first come, first served, as fast as a `JoinLimiter` admits.
 
-    Of those that leave stow, a slice goes at each look.
+    Of the heliostats that leave stow, one slice goes at each check.
 
     Parameters
     ----------
     rate, burst
-        Heliostats that may join in a second, and at once after a rest.
+        Heliostats that may join per second, and at once after a pause.
     patience
         Longest time that a heliostat waits for its turn, s.
 
@@ -82,7 +82,7 @@ class JoinQueue:
         return sum(len(job.waiting) for job in self._jobs if job.name not in messages.SLICED)
 
     def waiting(self, name: str) -> frozenset[str]:
-        """Return the heliostats that wait with a command."""
+        """Return the heliostats that wait for their turn with a command."""
         return frozenset(n for job in self._jobs if job.name == name for n in job.waiting)
 
     def put(self, job: JoiningJob) -> None:
@@ -92,9 +92,10 @@ class JoinQueue:
     def admit(
         self, now: float, lost: Lost, *, held: bool = False
     ) -> list[tuple[JoiningJob, tuple[str, ...]]]:
-        """Return the heliostats that may go now, none while ``held``; drop jobs that are over.
+        """Return the heliostats that may go now, none while ``held``; drop jobs that have ended.
 
-        ``lost`` returns those that may no longer be commanded under the token of their job.
+        ``lost`` returns the heliostats that may no longer be commanded under the token of their
+        job.
         """
         for job in self._jobs:
             if gone := lost(job.token, job.waiting):
@@ -120,7 +121,7 @@ class JoinQueue:
         return admitted
 
     def drop(self, text: str, heliostats: frozenset[str] | None = None, name: str = "") -> None:
-        """Give up waiting heliostats: all, some, or those of one command; ``text`` says why."""
+        """Drop waiting heliostats: all, some, or those of one command; ``text`` says why."""
         for job in self._jobs:
             if name in ("", job.name):
                 self._fail(job, text, heliostats)

@@ -24,7 +24,7 @@ from heliotrope.store.records import AuditEntry, StoreError
 
 T = TypeVar("T")
 
-#: Longest wait for the commit of a record or of points, s. Those of a whole field (10,000 points)
+#: Longest wait for the commit of a record or of points, s. The points of a whole field (10,000)
 #: take 0.1 s.
 PATIENCE = 30.0
 #: A store that has confirmed nothing for this time cannot be relied on, s.
@@ -39,12 +39,12 @@ class KeptAudit:
     Parameters
     ----------
     keeper
-        Open; it stays open when the audit is closed.
+        Open keeper of the store; it stays open when the audit is closed.
     clock
-        The machine's clock: its monotonic time bounds the silence of the store. (The clock of a
+        The computer's clock; its monotonic time limits the silence of the store. (The clock of a
         simulated plant may run faster than the disk.)
     started
-        UTC, written to records that are ended now because the plant had stopped.
+        UTC, written to records that are completed now because the plant had stopped.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class KeptAudit:
     Raises
     ------
     AuditError
-        If those records could not be ended.
+        If those records could not be completed.
     """
 
     def __init__(self, keeper: Keeper, clock: Clock, started: datetime) -> None:
@@ -72,7 +72,7 @@ class KeptAudit:
         AuditError
             If it could not be written and synced.
         InputError
-            An identity that another record has.
+            If another record has the same identity.
         """
         entry = AuditEntry(**asdict(record))
         self._do(lambda c: audit.begin(c, entry))
@@ -85,7 +85,7 @@ class KeptAudit:
         AuditError
             If it could not be written and synced.
         InputError
-            A record that was not begun, or has another result.
+            If the record was not begun, or has another result.
         """
         self._do(lambda c: audit.finish(c, identity, result, at))
 
@@ -109,7 +109,7 @@ class KeptAudit:
             )
 
     def _hear(self, now: float) -> None:
-        """Note when the store last answered, and probe it again."""
+        """Note when the store last responded, and probe it again."""
         asked = self._asked
         if asked is not None and asked.done():
             if asked.exception() is None:
@@ -123,7 +123,7 @@ class KeptAudit:
                 raise AuditError(f"audit: {error}") from None
 
     def close(self) -> None:
-        """Do nothing: everything is in the store."""
+        """Do nothing, because everything is in the store."""
 
     def _do(self, work: Callable[[Connection], T]) -> T:
         try:
@@ -138,7 +138,7 @@ class KeptPoints:
     Parameters
     ----------
     keeper
-        Open; it stays open.
+        Open keeper of the store; it stays open.
     """
 
     def __init__(self, keeper: Keeper) -> None:
@@ -181,7 +181,7 @@ class KeptPoints:
 
 
 def _room(keeper: Keeper) -> str | None:
-    """Return the reason why the disk has no room, None if it has room."""
+    """Return the reason why the disk is full, None if it has space."""
     file = keeper.database.file
     if file is None:
         return None

@@ -21,23 +21,23 @@ from heliotrope.plant.field.assigned import Held, Places
 from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.tickets import Ticket
 
-#: Longest distance of a beam from its aim, rad: below that at which `pointing_disagrees` trips.
+#: Largest angle of a beam from its aim, rad; below the limit of `pointing_disagrees`.
 MOST = 3e-3
-#: Time without a movement after which a beam goes back, s.
+#: Time without a movement after which a beam is returned, s.
 LIFE = 90.0
-#: Time after which a beam that did not go back is sent back again, s: it doubles from one attempt
-#: to the next, up to the longest.
+#: Time after which a beam that did not return is sent back again, s; it doubles with each attempt,
+#: up to the longest.
 _AGAIN, _LONGEST = 3.0, 300.0
 
-#: Returns the heliostats that nobody looks after any more under a token.
+#: Returns the heliostats for which no one is responsible any longer under a token.
 Left = Callable[[int, Iterable[str]], frozenset[str]]
 
 
 @dataclass(frozen=True)
 class _Moved:
-    """A beam beside its aim: the aim, and until when which token keeps it there.
+    """A beam away from its aim: the aim, and the token that keeps it away and until when.
 
-    ``small``: it is on the receiver where its aim is, too; ``pause``: before the next attempt, s.
+    ``small``: the beam is on the same receiver as its aim; ``pause``: before the next attempt, s.
     """
 
     aim: FloatArray
@@ -48,14 +48,14 @@ class _Moved:
 
 
 class Movements:
-    """The beams that are moved, by heliostat.
+    """The moved beams, by heliostat.
 
     Parameters
     ----------
     receivers
-        Of the plant; beams move on planar ones.
+        Receivers of the plant; beams move on planar ones.
     armature
-        Of all heliostats, as they are believed now.
+        Present believed armatures of all heliostats.
     """
 
     def __init__(self, receivers: Sequence[Receiver], armature: Armature) -> None:
@@ -96,7 +96,7 @@ class Movements:
         Raises
         ------
         BeamError
-            If one of them may not.
+            If a heliostat may not.
         """
         base = np.stack([self.aim(name, aim) for name, aim in zip(names, aims, strict=True)])
         on = np.zeros(len(names), dtype=np.bool_)
@@ -125,9 +125,9 @@ class Movements:
             self._moved[name] = _Moved(aim, token, now + LIFE, small=True)
 
     def lend(self, names: Sequence[str], aims: FloatArray, wanted: FloatArray, token: int) -> None:
-        """Note aims that a visit gives (K, 3), and the present ones (K, 3) to which beams go back.
+        """Note the aims that a visit assigns, and the present aims for the beams' return, (K, 3).
 
-        A heliostat that gets its own aim back, or had none, goes nowhere later.
+        A heliostat that is assigned its own aim, or that had none, does not return later.
         """
         for name, aim in self.record(names, aims, wanted)["LENT"].items():
             if aim is not None:
@@ -136,12 +136,12 @@ class Movements:
                 self._moved.pop(name, None)
 
     def recall(self, held: Places) -> None:
-        """Send beams back to the aims from which visits of an earlier program moved them."""
+        """Return beams to the aims from which visits of an earlier program moved them."""
         for name, aim in held.items():
             self._moved[name] = _Moved(np.array(aim), 0, -np.inf, small=False)
 
     def record(self, names: Sequence[str], aims: FloatArray, wanted: FloatArray) -> Held:
-        """Return the record to store before a visit gives aims ``wanted``; see `lend`."""
+        """Return the record to store before a visit assigns aims ``wanted``; see `lend`."""
         found: dict[str, tuple[float, ...] | None] = {}
         for name, present, point in zip(names, aims, wanted, strict=True):
             aim = np.array(self.aim(name, present))
@@ -150,33 +150,33 @@ class Movements:
         return {"LENT": found}
 
     def small(self, names: Sequence[str]) -> frozenset[str]:
-        """Return the heliostats that were moved a little: on the way back they need no turn."""
+        """Return the heliostats that were moved a little, and need no turn on the way back."""
         return frozenset(name for name in names if self._moved[name].small)
 
     def forget(self, heliostats: Iterable[str]) -> None:
-        """Forget beams that have another aim now."""
+        """Forget beams that have been assigned another aim."""
         for name in heliostats:
             self._moved.pop(name, None)
 
     @contextmanager
     def ending(self, heliostats: Collection[str]) -> Iterator[None]:
-        """Return the beams of heliostats at the end of a block, however it ends."""
+        """Send the beams of heliostats back at the end of a block, however it ends."""
         try:
             yield
         finally:
             self.end(heliostats)
 
     def end(self, heliostats: Collection[str]) -> None:
-        """Return beams at the next check."""
+        """Send beams back at the next check."""
         for name in heliostats:
             if name in self._moved:
                 self._moved[name] = replace(self._moved[name], until=-np.inf)
 
     def due(self, now: float, token: int, left: Left) -> dict[str, FloatArray]:
-        """Return the aims of beams that are to go back now, by heliostat.
+        """Return the aims of beams that must go back now, by heliostat.
 
-        Without a command authority (``token`` 0) there are none. ``left`` returns those that no
-        visit holds any more under the token that moved them.
+        Without a command authority (``token`` 0) there are none. ``left`` returns the heliostats
+        that no visit holds any longer under the token that moved them.
         """
         for ticket in [ticket for ticket in self._sent if ticket.finished]:
             self._sent.remove(ticket)
@@ -191,7 +191,7 @@ class Movements:
         }
 
     def sent(self, ticket: Ticket, now: float) -> None:
-        """Note the order that brings beams back; those that do not obey are sent back again."""
+        """Note the order that returns beams; beams that do not obey are sent back again."""
         self._sent.append(ticket)
         for name in ticket.heliostats:
             if (moved := self._moved.get(name)) is not None:
@@ -199,7 +199,7 @@ class Movements:
                 self._moved[name] = replace(moved, until=now + moved.pause, pause=pause)
 
     def wait(self, heliostats: Iterable[str], token: int, now: float) -> None:
-        """Try again later to return beams that cannot go back now."""
+        """Try again later to return beams that cannot return now."""
         for name in heliostats:
             if (moved := self._moved.get(name)) is not None:
                 self._moved[name] = replace(moved, token=token, until=now + _AGAIN)

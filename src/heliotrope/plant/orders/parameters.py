@@ -31,13 +31,13 @@ from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Alarm, alarms
 
-#: States in which a local controller takes items that change the pose: it stands still there.
+#: States in which a local controller stands still and so accepts items that change the pose.
 TAKES_POSE = POSE
 #: Pause before another attempt, s.
 AGAIN = 30.0
 
 
-#: Suns for which a change of parameters is measured: azimuth and elevation, rad.
+#: Sun directions for which the effect of new parameters is evaluated: azimuth and elevation, rad.
 _SUNS = tuple(
     (math.radians(azimuth), math.radians(elevation))
     for azimuth in range(0, 360, 60)
@@ -46,11 +46,11 @@ _SUNS = tuple(
 
 
 def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
-    """Return the largest turn of a beam from its aim by new parameters, rad.
+    """Return the largest angle by which new parameters turn a beam from its aim, rad.
 
-    The mirror is taken to be as the present parameters say, and its local controller to aim by the
-    new ones, for suns all around. Infinite if the new ones reach none of the poses, or an aim that
-    the present ones reach is out of reach.
+    The heliostat is assumed to be as the present parameters say, and its local controller to aim by
+    the new ones, for sun directions all around. Infinite if the new parameters reach none of the
+    poses, or do not reach an aim that the present ones reach.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
 
 
 def stored_items(answer: Answer) -> dict[str, bytes]:
-    """Return the items in an answer to ``stored``; none if the cluster could not read them.
+    """Return the items in a reply to ``stored``; none if the cluster could not read them.
 
     Raises
     ------
     ProtocolError
-        Names, sizes and block that do not fit together.
+        If names, sizes and block are inconsistent.
     """
     names, sizes = answer.data.get("names"), answer.data.get("sizes")
     if "error" in answer.data:
@@ -107,20 +107,21 @@ def stored_items(answer: Answer) -> dict[str, bytes]:
 
 
 class ParameterSync(Part):
-    """Comparison of the stored parameters with the wanted ones, and the push of those that differ.
+    """Compares the stored parameters with the wanted ones, and writes those that differ.
 
     Parameters
     ----------
     field, wanted, orders, clusters
-        Of the plant.
+        Parts of the plant.
     tell
         Called with each alarm.
     proofs
-        Proves that a beam is free where parameters are written, and at stow.
+        Proves that a beam is clear where parameters are written, and at stow.
     blocked
-        Returns why nothing may be written to a heliostat, None if it may.
+        Function that returns why nothing may be written to a heliostat, None if it may.
     token
-        Returns the token under which differences are written, 0 if none may be written now.
+        Function that returns the token under which differences are written, 0 if none may be
+        written now.
     """
 
     def __init__(
@@ -137,9 +138,9 @@ class ParameterSync(Part):
         self._field, self._wanted, self._orders = field, wanted, orders
         self._clusters, self._tell, self._proofs = clusters, tell, proofs
         self._blocked, self._token = blocked, token
-        #: Heliostats to be compared, each with its time, monotonic s.
+        #: Heliostats to be compared, and when, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
-        #: Those not compared since their cluster connected, or their board started.
+        #: Heliostats not compared since their cluster connected or their board started.
         self._strange = set(self._due)
         self._tickets: dict[str, Ticket] = {}
         self._tried: dict[str, float] = {}
@@ -155,7 +156,7 @@ class ParameterSync(Part):
         self.greet(self._field.members[cluster])
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Compare the heliostats whose boards have started anew."""
+        """Compare the heliostats whose boards have restarted."""
         del cluster, status, now
         self.greet(self._field.restarted)
 
@@ -169,9 +170,9 @@ class ParameterSync(Part):
                 self.compare(name)
 
     def greet(self, heliostats: Sequence[str]) -> None:
-        """Compare heliostats before they may move, since any boards may answer there.
+        """Compare heliostats before they may move, because any boards may respond there.
 
-        Their cluster has connected, or their boards have started anew.
+        Their cluster has connected, or their boards have restarted.
         """
         for name in heliostats:
             self.compare(name)
@@ -180,7 +181,7 @@ class ParameterSync(Part):
     def differing(self, heliostat: str) -> str | None:
         """Return how the parameters of a heliostat differ or may differ, None if they agree.
 
-        They may while they have not been compared since its cluster connected, or its board
+        They may differ if they have not been compared since its cluster connected, or its board
         started.
         """
         ticket = self._tickets.get(heliostat)
@@ -191,7 +192,7 @@ class ParameterSync(Part):
         return refusals.NOT_COMPARED.text if heliostat in self._strange else None
 
     def compared(self, heliostat: str) -> str:
-        """Return in words how the last comparison of a heliostat ended; nothing is sent."""
+        """Return the result of a heliostat's last comparison in words; nothing is sent."""
         if heliostat not in self._wanted.items:
             return "not compared, because this plant does not write parameters"
         return self.differing(heliostat) or "the same"
@@ -202,8 +203,9 @@ class ParameterSync(Part):
         Raises
         ------
         RefusedError
-            If they change its pose where it does not stand still, or where its beam is not free; or
-            a stow position from which its beam would light a receiver, a target or a volume.
+            If the items change its pose while it is not standing still or its beam is not clear, or
+            if they set a stow position from which its beam would reach a receiver, a target or a
+            volume.
         """
         if reason := self._proofs.resting(heliostat, items):
             raise refusals.STOW_UNPROVEN.error(heliostat=heliostat, reason=reason)
@@ -225,7 +227,7 @@ class ParameterSync(Part):
         token: int,
         before: Callable[[], None] = lambda: None,
     ) -> None:
-        """Send items of an accepted ticket once it is recorded; call ``before`` just before.
+        """Send items of an accepted ticket once it is recorded; call ``before`` just before that.
 
         The heliostat is compared when the ticket has ended.
         """
@@ -247,7 +249,7 @@ class ParameterSync(Part):
         Raises
         ------
         RefusedError
-            If no answer comes within ``timeout`` s, or nothing is stored.
+            If no reply comes within ``timeout`` s, or nothing is stored.
         """
         home = self._clusters.home(heliostat).name
         answer = await self._clusters.answer(home, "stored", timeout, heliostat)
@@ -271,7 +273,7 @@ class ParameterSync(Part):
                 self.compare(name)
         live = self._field.live(now)
         for name, due in self._due.items():
-            # One that is being written is compared when its ticket has ended.
+            # A heliostat that is being written to is compared when its ticket has ended.
             if now >= due and live[self._field.index[name]] and name not in self._tickets:
                 self._due[name] = now + AGAIN
                 self._ask(name)

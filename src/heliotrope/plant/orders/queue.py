@@ -23,7 +23,7 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act
 
-#: Reports on a message are ignored this long after it was sent, once its ticket has ended, s.
+#: Reports on a message are ignored this long after it was sent, if its ticket has ended, s.
 FORGOTTEN = 60.0
 #: Pause between repetitions of DEFOCUS and STOW to heliostats that have not acknowledged, s.
 REPEAT = 1.0
@@ -31,14 +31,14 @@ REPEAT = 1.0
 GRACE = 3.0
 #: A command whose record is not on the disk within this time is not sent, s.
 RECORDING = 2.0
-#: Owed records that are written together, and the time after which the rest must wait: commands
-#: that are given meanwhile wait behind them, s.
+#: Number of owed records that are written together, and the time after which the rest must wait, s,
+#: because new commands wait behind them.
 _BATCH, _TURN = 256, 0.5
-#: Clusters hear of a new token within this time, s.
+#: Clusters receive a new token within this time, s.
 _HEARD = 3.0
 #: Commands that move nothing by themselves: an emergency does not overtake them.
 _STILL = messages.POINTS | {"PARAMETERS"}
-#: Time allowed at the end of the plant for the records that are owed, s.
+#: Time allowed at the end of the plant's run for the owed records, s.
 _LAST = 10.0
 
 
@@ -46,7 +46,7 @@ _LAST = 10.0
 class _Under:
     """One message under way.
 
-    It was given with the token ``given`` and left with ``token``; ``again`` sends it again.
+    It was issued with the token ``given`` and sent with ``token``; ``again`` sends it again.
     """
 
     ticket: Ticket
@@ -60,13 +60,13 @@ class _Under:
 
 @dataclass
 class _Recording:
-    """Records that must be on the disk before heliostats of a ticket are sent their command."""
+    """Records that must be on disk before heliostats of a ticket are sent their command."""
 
     ticket: Ticket
     heliostats: tuple[str, ...]
-    #: Writes the record of the ticket; None: it is on the disk already.
+    #: Writes the record of the ticket; None: it is already on disk.
     begin: Work | None
-    #: Stores what the command assigns, after its record, and takes that back.
+    #: Stores what the command assigns, after its record; the second reverts that.
     store: tuple[Work, Work] | None
     until: float
     send: Callable[[bool], None] | None = None
@@ -86,28 +86,28 @@ class _Recording:
 class PlantOrders(Part):
     """Accepted commands: their records, their messages and their tickets.
 
-    Nothing here waits for a disk. A command waits in the plant until its record is on the disk
-    (`when_recorded`); DEFOCUS and STOW do not, and overtake the commands that wait.
+    This part never waits for a disk. A command waits in the plant until its record is on disk
+    (`when_recorded`); DEFOCUS and STOW do not wait, and overtake waiting commands.
 
     Parameters
     ----------
     clock
         Clock of the plant.
     authority
-        Tokens of the commands; a command accepted from anybody takes heliostats out of visits.
+        Tokens of the commands; any accepted command removes heliostats from visits.
     audit
         Store of the records.
     disk
-        Does the work of the audit.
+        Runs the work of the audit.
     clusters
-        Their links carry the messages.
+        The clusters, whose links carry the messages.
     prefix
-        Prefix of identities; no two runs of a plant may have the same one.
+        Prefix of identities, unique to each run of a plant.
     settings
         The plant's ``lifetime``, ``patience`` and ``stow_rate``.
     sent
-        Called with name, values and heliostats of each command that is sent, DEFOCUS and STOW
-        among them, the time, and whether it is a repetition.
+        Called with name, values and heliostats of each command that is sent, including DEFOCUS and
+        STOW, with the time, and with whether it is a repetition.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class PlantOrders(Part):
     latest
         Ticket of the last command; None before the first.
     last
-        Record and ticket of the last command to each heliostat, by name, since the start.
+        Record and ticket of the last command to each heliostat since start-up, by name.
     """
 
     def __init__(
@@ -143,9 +143,9 @@ class PlantOrders(Part):
         self.latest: Ticket | None = None
         self.last: dict[str, tuple[Record, Ticket]] = {}
         self._under: dict[str, _Under] = {}
-        #: What clusters refused because their token was not the present one.
+        #: Messages that clusters refused because the token was outdated.
         self._again: list[tuple[_Under, tuple[str, ...]]] = []
-        #: Identities of commands that wait for their turn on the line to their cluster.
+        #: Identities of commands that are queued for the link to their cluster.
         self._unsent: set[str] = set()
         self._recording: dict[str, _Recording] = {}
         self._owed: deque[Work] = deque()
@@ -177,21 +177,22 @@ class PlantOrders(Part):
         fault: bool = False,
         store: tuple[Work, Work] | None = None,
     ) -> Ticket:
-        """Accept a command and give its record to the disk; see `when_recorded`.
+        """Accept a command and hand its record to the disk; see `when_recorded`.
 
         Parameters
         ----------
         record
-            The giver's name and role, and the command's name.
+            Name and role of whoever issues it, and the command's name.
         values, heliostats, note
             For the record and the ticket.
         late
-            Whether the record may be written later: DEFOCUS and STOW wait for nothing.
+            Whether the record may be written later, as for DEFOCUS and STOW, which wait for
+            nothing.
         fault
-            Whether the heliostats have caused the order; see `Mandate.take_out`.
+            Whether the heliostats caused the order; see `Mandate.take_out`.
         store
-            Work of the disk that stores what the command assigns, in one piece with its record, and
-            work that takes it back if the command is not sent in the end.
+            Disk work that stores what the command assigns, in the same write as its record, and
+            disk work that reverts it if the command is not sent in the end.
 
         Raises
         ------
@@ -216,7 +217,7 @@ class PlantOrders(Part):
         return ticket
 
     def _record(self, ticket: Ticket, entry: Record, store: tuple[Work, Work] | None) -> None:
-        """Give the record of a ticket to the disk."""
+        """Hand the record of a ticket to the disk."""
         begin, until = partial(self._audit.begin, entry), self.clock.monotonic() + RECORDING
         recording = _Recording(ticket, ticket.heliostats, begin, store, until)
         try:
@@ -233,7 +234,7 @@ class PlantOrders(Part):
         store: tuple[Work, Work],
         send: Callable[[bool], None],
     ) -> None:
-        """Call ``send`` once the points that a recorded command assigns are on the disk.
+        """Call ``send`` once the points that a recorded command assigns are on disk.
 
         See `when_recorded`; ``store`` is as in `accept`.
         """
@@ -255,7 +256,7 @@ class PlantOrders(Part):
         recording.waited = True
 
     def _recorded(self, key: str, recording: _Recording, error: Exception | None) -> None:
-        """Send a command whose record is on the disk, or end it because that failed."""
+        """Send a command whose record is on disk, or end it because that failed."""
         ticket, heliostats = recording.ticket, recording.heliostats
         self._give_up_late(recording, self.clock.monotonic())
         del self._recording[key]
@@ -275,7 +276,7 @@ class PlantOrders(Part):
         elif ticket.identity in self._open and recording.begin is not None:
             text = f"not sent, because its record could not be written: {error}"
             ticket.advance(heliostats, Stage.REFUSED, text)
-            # It was accepted, so it gets a record as soon as the disk takes one.
+            # It was accepted, so its record is written as soon as the disk allows.
             self._owed.append(recording.begin)
 
     def _send_recorded(self, recording: _Recording, send: Callable[[bool], None]) -> None:
@@ -297,11 +298,11 @@ class PlantOrders(Part):
             recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
 
     def when_recorded(self, ticket: Ticket, send: Callable[[bool], None]) -> None:
-        """Call ``send`` once the ticket's record is on the disk; never, if that takes too long.
+        """Call ``send`` once the ticket's record is on disk; never, if that takes too long.
 
-        ``send`` is called with whether the command had to wait: what was proven at its acceptance
-        must then be proven again, and heliostats that have ended meanwhile (`Ticket.waiting`) are
-        left out. It may raise `RefusedError`, which ends the ticket.
+        The argument of ``send`` is whether the command had to wait. If so, whatever was proven when
+        it was accepted must be proven again, and heliostats that have ended in the meantime
+        (`Ticket.waiting`) are left out. It may raise `RefusedError`, which ends the ticket.
         """
         recording = self._recording.get(ticket.identity)
         if recording is not None:
@@ -310,14 +311,14 @@ class PlantOrders(Part):
             send(False)
 
     def unstored(self, name: str) -> frozenset[str]:
-        """Return the heliostats whose command of a name waits for the disk."""
+        """Return the heliostats whose command of a given name waits for the disk."""
         waiting = (r for r in self._recording.values() if r.ticket.name == name)
         return frozenset(each for r in waiting for each in r.heliostats)
 
     def _overtake(self, heliostats: frozenset[str], what: str) -> None:
-        """Give up commands that wait for their records or for the line to their cluster.
+        """Abandon commands that wait for their records or for the link to their cluster.
 
-        None may follow DEFOCUS, STOW or LOCK.
+        No such command may follow DEFOCUS, STOW or LOCK.
         """
         for recording in self._recording.values():
             ticket = recording.ticket
@@ -337,11 +338,11 @@ class PlantOrders(Part):
         self._owe_result(ticket.identity, "done")
 
     def owe(self, work: Work) -> None:
-        """Give work to the disk after the records that are owed; it may be done again."""
+        """Hand work to the disk, to be done after the owed records; it may be repeated."""
         self._owed.append(work)
 
     def pay(self) -> None:
-        """Give the oldest owed records to the disk, unless earlier ones are on their way."""
+        """Hand the oldest owed records to the disk, unless earlier ones are still being written."""
         if self._paying:
             return
         batch, done = tuple(islice(self._owed, _BATCH)), [0]
@@ -353,7 +354,7 @@ class PlantOrders(Part):
                 try:
                     each()
                 except (AuditError, AssignedError):
-                    done[0] -= 1  # it is tried again; what is refused for its content is not
+                    done[0] -= 1  # it is retried, but not if it was refused because of its content
                     raise
                 if self.clock.monotonic() >= until:
                     break
@@ -390,18 +391,18 @@ class PlantOrders(Part):
     ) -> None:
         """Send a command to some heliostats of a ticket.
 
-        It is sent again where a cluster refuses it because the command authority has just changed.
+        It is sent again if a cluster refuses it because the command authority has just changed.
 
         Parameters
         ----------
         ticket, name, values, heliostats
             The ticket, and the command.
         token
-            The holder's, or a mandate's.
+            Token of the authority holder or of a mandate.
         lifetime
-            Replaces the usual one, s.
+            Replaces the default lifetime, s.
         again
-            Sends it to some heliostats again; None: as before, at once.
+            Function that sends it to some heliostats again; None: at once, as before.
         """
         heliostats = tuple(heliostats)
 
@@ -422,7 +423,7 @@ class PlantOrders(Part):
                 identity: str = identity, end: ClusterEnd = end, part: tuple[str, ...] = part
             ) -> Command | None:
                 self._unsent.discard(identity)
-                left = ticket.waiting(part)  # without those that DEFOCUS or STOW has overtaken
+                left = ticket.waiting(part)  # without those overtaken by DEFOCUS or STOW
                 named = () if len(left) == len(end.members) else left
                 own = self._own(identity, token) if left else 0
                 return Command(identity, name, values, named, own, life) if own else None
@@ -432,16 +433,16 @@ class PlantOrders(Part):
     def emergency(
         self, ticket: Ticket, act: Act, heliostats: Sequence[str], *, again: bool = False
     ) -> None:
-        """Send DEFOCUS or STOW before everything else that has not been sent.
+        """Send DEFOCUS or STOW before everything that has not been sent yet.
 
-        A repetition (``again``) gives no more time to acknowledge.
+        A repetition (``again``) does not extend the deadline for acknowledgement.
         """
         if not again:
             for other, names in self._stowing.take(heliostats).items():
                 if other is not ticket:
                     other.advance(names, Stage.FAILED, f"superseded by {ticket.name}")
             self._supersede(ticket, frozenset(heliostats))
-        # Further portions of a STOW must not put off the repetition of the first.
+        # Further portions of a STOW must not delay the repetition of the first.
         self._sent_at.setdefault(ticket.identity, self.clock.monotonic())
         self._sent(act.name, (), tuple(heliostats), self.clock.monotonic(), again)
         for end, part in self._clusters.parts(heliostats):
@@ -452,8 +453,8 @@ class PlantOrders(Part):
     def stow_in_turn(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
         """Send STOW to heliostats in portions.
 
-        Orders that they were given before are repeated until it is their turn. An order by
-        `emergency` meanwhile goes at once and takes the place of this one.
+        Their earlier orders are repeated until it is their turn. If `emergency` sends an order in
+        the meantime, that order goes at once and replaces this one.
         """
         if not self._stowing.staggers(heliostats):
             self.emergency(ticket, Act.STOW, heliostats)
@@ -465,7 +466,7 @@ class PlantOrders(Part):
         self._stow(self._stowing.due(now))
 
     def to_stow(self, heliostat: str) -> bool:
-        """Whether a heliostat waits for its turn to go to stow: no motion is for it."""
+        """Whether a heliostat waits for its turn to go to stow, and so must not be moved."""
         return heliostat in self._stowing
 
     def _stow(self, parts: Mapping[Ticket, Sequence[str]]) -> None:
@@ -473,13 +474,13 @@ class PlantOrders(Part):
             self.emergency(ticket, Act.STOW, ticket.waiting(names))
 
     def repeat(self, ticket: Ticket, act: Act, heliostats: Sequence[str]) -> None:
-        """Send DEFOCUS or STOW again to those heliostats whose clusters are connected."""
+        """Send DEFOCUS or STOW again to the heliostats whose clusters are connected."""
         left = self._clusters.connected(heliostats)
         if left:
             self.emergency(ticket, act, left, again=True)
 
     def _supersede(self, ticket: Ticket, heliostats: frozenset[str]) -> None:
-        """End older repeated orders to the same heliostats, but no STOW by a DEFOCUS."""
+        """End older repeated orders to the same heliostats, but no STOW because of a DEFOCUS."""
         for identity in self._sent_at:
             other = self._open.get(identity)
             if other is not None and other is not ticket and Act[other.name] <= Act[ticket.name]:
@@ -525,7 +526,7 @@ class PlantOrders(Part):
         self._under[identity].given, self._under[identity].again = token, again
 
     def _own(self, identity: str, token: int) -> int:
-        """Return the token with which a message leaves now; 0: it may not leave any more."""
+        """Return the token with which a message is sent now; 0: it may no longer be sent."""
         own = self.authority.present(token)
         if own and identity in self._under:
             self._under[identity].token, self._under[identity].ticket.sent = own, True
@@ -545,7 +546,7 @@ class PlantOrders(Part):
     # Reports of clusters.
 
     def take(self, cluster: str, progress: Progress) -> tuple[Ticket, tuple[str, ...]] | None:
-        """Take a cluster's report; return its ticket and heliostats, None if neither is known."""
+        """Handle a cluster's report; return its ticket and heliostats, None if not known."""
         under = self._under.get(progress.identity)
         if under is None or under.cluster != cluster:
             return None
@@ -562,11 +563,11 @@ class PlantOrders(Part):
         return under.ticket, part
 
     def _crossed(self, under: _Under, stage: Stage) -> bool:
-        """Whether a message and a change of the command authority may have crossed each other.
+        """Whether a message and a change of the command authority may have crossed.
 
-        Its cluster may then have refused its token, and nothing else is wrong with it. What failed
-        may have been done, so a person's command is sent again only where it was refused. One of an
-        earlier holder is never sent again.
+        Its cluster may then have refused its token although nothing else is wrong with it. A
+        command that failed may have been carried out, so an operator's command is sent again only
+        if it was refused. A command of an earlier authority holder is never sent again.
         """
         mandated = self.authority.mandate_of(under.given) is not None
         if stage is not Stage.REFUSED and not (mandated and stage is Stage.FAILED):
@@ -578,7 +579,7 @@ class PlantOrders(Part):
         return young or under.token != own
 
     def on_beat(self, now: float) -> None:
-        """End commands that were not answered in time; record the results of ended tickets."""
+        """End commands without a reply in time; record the results of ended tickets."""
         for recording in self._recording.values():
             self._give_up_late(recording, now)
         self._stow(self._stowing.due(now))
@@ -616,7 +617,7 @@ class PlantOrders(Part):
                 self.repeat(ticket, Act[ticket.name], left)
 
     async def end(self, now: float) -> None:
-        """Record the state of every open ticket, at the end of the plant."""
+        """Record the state of every open ticket at the end of the plant's run."""
         until = now + _LAST
         for recording in self._recording.values():
             text = "not sent, because the plant was shut down"
@@ -632,7 +633,7 @@ class PlantOrders(Part):
         await self._until(self._settled, until)
 
     def _settled(self) -> bool:
-        """Whether the owed records are written or cannot be; the next batch is on its way."""
+        """Whether the owed records are written or cannot be; starts the next batch."""
         if self.owing:
             self.pay()
         return not (self._paying or self.owing)
@@ -650,12 +651,12 @@ class PlantOrders(Part):
 
 
 def whole(values: Sequence[float], codes: str, command: str) -> tuple[float, ...]:
-    """Return a command's numbers as the wire carries them.
+    """Return a command's numbers in the form in which the wire carries them.
 
     Raises
     ------
     InputError
-        Too many or too few numbers, or one out of range.
+        If there are too many or too few numbers, or one is out of range.
     """
     if len(values) != len(codes):
         raise InputError(

@@ -18,7 +18,7 @@ from heliotrope.plant.field.assigned import Held
 from heliotrope.plant.field.ledger import STEPPING, Ledger
 from heliotrope.plant.field.state import FieldState, Mask
 
-#: Time after which an order that was not obeyed, or could not be given, is given again, s.
+#: Time after which an order that was not obeyed, or could not be sent, is repeated, s.
 _AGAIN = 3.0
 
 
@@ -28,31 +28,34 @@ class Stepping:
     Parameters
     ----------
     field, ledger
-        State of the field, and what was ordered.
+        State of the field, and the orders sent.
     rests
-        Heliostats whose drivers rest by the plant file. One that takes microsteps when it is first
-        heard was left so by an earlier run of the plant, and is ordered to step roughly.
+        Heliostats whose drivers rest according to the plant file. If one of them uses microsteps at
+        its first report, an earlier run of the plant left it so, and it is ordered to use coarse
+        steps.
     held
-        Other heliostats that a visit of an earlier program has ordered to take fine steps.
+        Other heliostats that a visit of an earlier program ordered to use fine steps.
     """
 
     def __init__(
         self, field: FieldState, ledger: Ledger, rests: Iterable[str], held: Iterable[str] = ()
     ) -> None:
         self._field, self._ledger, self._rests = field, ledger, frozenset(rests)
-        #: Visits that need fine steps, by heliostat; heliostats that step roughly without one.
+        #: Visits that need fine steps, by heliostat; heliostats that use coarse steps without a
+        #: visit.
         self._needed = Counter[str]()
         self._rough = {*self._rests, *held}
-        #: Heliostats that may not step as they must.
+        #: Heliostats that may not be stepping as required.
         self._open = set(self._rough)
-        #: When each was last due, monotonic s.
+        #: When an order was last attempted for each, monotonic s.
         self._tried: dict[str, float] = {}
 
     @contextmanager
     def fine(self, heliostats: Iterable[str]) -> Iterator[None]:
         """Order fine steps for the duration of a block; blocks may overlap.
 
-        The orders go out meanwhile; `coarse` says which heliostats do not follow them yet.
+        The orders are sent during the block; `coarse` lists the heliostats that do not follow them
+        yet.
         """
         names = frozenset(heliostats)
         self._needed.update(names)
@@ -63,7 +66,7 @@ class Stepping:
             self._needed.subtract(names)
 
     def ordered(self, heliostats: Iterable[str], rough: bool) -> None:
-        """Note how a person wants heliostats to step when no visit needs them."""
+        """Note how an operator wants heliostats to step when no visit needs them."""
         if rough:
             self._rough.update(heliostats)
             self._open.update(heliostats)
@@ -72,23 +75,23 @@ class Stepping:
 
     @property
     def lent(self) -> frozenset[str]:
-        """The heliostats that step roughly again after a visit, though not by the plant file."""
+        """Heliostats that return to coarse steps after a visit, though not by the plant file."""
         return frozenset(self._open & self._rough - self._rests)
 
     def record(self, heliostats: Iterable[str]) -> Held:
-        """Return the record to store before heliostats are ordered to take fine steps."""
+        """Return the record to store before heliostats are ordered to use fine steps."""
         return {"ROUGH": {n: (0.0, 0.0, 0.0) for n in heliostats if n in self.lent}}
 
     def coarse(self, heliostats: Iterable[str], now: float) -> tuple[str, ...]:
-        """Return the heliostats that are not known to take fine steps."""
+        """Return the heliostats that are not known to use fine steps."""
         known, rough = self._reported(now)
         unsure = rough | ~known
         return tuple(name for name in heliostats if unsure[self._field.index[name]])
 
     def due(self, now: float, token: int) -> dict[bool, tuple[str, ...]]:
-        """Return the heliostats that must be ordered to step roughly (True), or finely (False).
+        """Return the heliostats to be ordered to use coarse steps (True) or fine steps (False).
 
-        None are without a command authority (``token`` 0).
+        There are none without a command authority (``token`` 0).
         """
         found: dict[bool, list[str]] = {True: [], False: []}
         known, steps = self._reported(now)
@@ -106,10 +109,10 @@ class Stepping:
         return {rough: tuple(names) for rough, names in found.items() if names}
 
     def tried(self, heliostats: Collection[str], now: float) -> None:
-        """Note that heliostats have been ordered to step as they must, or could not be."""
+        """Note that heliostats have been ordered to step as required, or could not be ordered."""
         self._tried.update(dict.fromkeys(heliostats, now))
 
     def _reported(self, now: float) -> tuple[Mask, Mask]:
-        """Return masks of heliostats that reported since the last order, and that step roughly."""
+        """Return masks of heliostats that reported since the last order, and that step coarsely."""
         known = self._field.live(now) & self._ledger.reported(STEPPING)
         return known, np.asarray(self._field.rows["flags"] & meanings.ROUGH != 0)

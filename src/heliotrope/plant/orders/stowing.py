@@ -9,17 +9,17 @@ from collections.abc import Collection, Iterable
 
 from heliotrope.plant.orders.tickets import Ticket
 
-#: Why such a heliostat is not moved meanwhile.
+#: Why a heliostat in the queue is not moved in the meantime.
 WAITS = "it is waiting its turn to go to stow"
 
 
 class StowQueue:
-    """Heliostats that wait for their STOW, in their order.
+    """Heliostats that wait for their STOW, in order.
 
     Parameters
     ----------
     rate
-        Heliostats a second, and at once after a rest; 0: nobody waits.
+        Heliostats per second, and at once after a pause; 0: no heliostat waits.
     """
 
     def __init__(self, rate: float) -> None:
@@ -34,13 +34,14 @@ class StowQueue:
         return heliostat in self._waiting
 
     def staggers(self, heliostats: Collection[str]) -> bool:
-        """Return whether an order to some heliostats is one of many."""
+        """Return whether an order to some heliostats must be staggered."""
         return 0.0 < self.rate < len(heliostats)
 
     def put(self, ticket: Ticket, heliostats: Iterable[str]) -> dict[Ticket, list[str]]:
-        """Add heliostats; return those of earlier orders that wait for this one now.
+        """Add heliostats; return the heliostats of earlier orders that this order replaces.
 
-        One that waits already keeps its place: whoever repeats an order delays nobody.
+        A heliostat that is already waiting keeps its place, so repeating an order delays no
+        heliostat.
         """
         replaced: dict[Ticket, list[str]] = {}
         for name in heliostats:
@@ -51,7 +52,7 @@ class StowQueue:
         return replaced
 
     def due(self, now: float) -> dict[Ticket, list[str]]:
-        """Take out the heliostats whose turn it is at a time, monotonic s."""
+        """Remove the heliostats whose turn it is at a time, monotonic s, and return them."""
         if not self._waiting:
             return {}
         self._spare = min(self.rate, self._spare + self.rate * (now - self._at))
@@ -61,7 +62,7 @@ class StowQueue:
         return self.take(some)
 
     def take(self, heliostats: Iterable[str]) -> dict[Ticket, list[str]]:
-        """Take out some heliostats, whether or not it is their turn."""
+        """Remove some heliostats, whether or not it is their turn, and return them."""
         found: dict[Ticket, list[str]] = {}
         for name in heliostats if self._waiting else ():
             ticket = self._waiting.pop(name, None)

@@ -11,16 +11,16 @@ from heliotrope.plant.orders.stepping import Stepping
 
 
 class Taken(Part):
-    """Aims that visits have moved, heliostats that they have locked, fine steps that they need.
+    """Aims that visits moved, heliostats that they locked, and fine steps that they need.
 
     Parameters
     ----------
     movements, locks, stepping
-        The three kinds; what their records name is recalled by the owner.
+        The three kinds; the owner recalls what their records name.
     points
-        The records, beside assigned points (`assigned.HELD`).
+        The records, stored with the assigned points (`assigned.HELD`).
     owe
-        Gives work to the disk.
+        Function that hands work to the disk.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Taken(Part):
         self._points, self._owe = points, owe
 
     def on_second(self, now: float) -> None:
-        """Settle the points that are taken, and remove records that no visit holds."""
+        """Settle acknowledged points, and remove records of what no visit holds."""
         held = {
             "LOCKED": self.locks.names,
             "LENT": self.movements.names,

@@ -10,7 +10,7 @@ from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.messages import Stage
 from heliotrope.plant.refusals import by_reason
 
-#: Waiting in the plant, then the stages in order; from FINAL on a stage is final.
+#: Waiting in the plant, then the stages in order; stages from FINAL on are final.
 WAITING = 0
 RANK = {
     Stage.ACCEPTED: 1,
@@ -59,7 +59,7 @@ class Ticket:
         self._clock = clock
         self._row = {name: i for i, name in enumerate(self.heliostats)}
         self._stage = np.full(len(self.heliostats), WAITING, dtype=np.int8)
-        #: Time at which each heliostat is given up at its present stage, monotonic s.
+        #: Deadline of each heliostat at its present stage, monotonic s.
         self._until = np.full(len(self.heliostats), math.inf)
         self._patience = patience
         self._news = asyncio.Event()
@@ -73,7 +73,7 @@ class Ticket:
         return f"<Ticket {self.identity} {self.text}>"
 
     def advance(self, heliostats: Iterable[str], stage: Stage, text: str = "") -> None:
-        """Note a stage that heliostats have reached; stages never go back; a final one stays."""
+        """Note a stage that heliostats have reached; stages never go back; final stages stay."""
         rank = RANK[stage]
         rows = [self._row[name] for name in heliostats if name in self._row]
         if not rows:
@@ -90,7 +90,7 @@ class Ticket:
             self._news.set()
 
     def step(self, texts: Mapping[str, str], stage: Stage | None) -> None:
-        """Note what heliostats do or wait for, by name, and their stage; None: unchanged."""
+        """Note what heliostats do or wait for, by name, and their stage; None: stage unchanged."""
         self.steps.update(texts)
         if stage is None:
             return
@@ -122,7 +122,7 @@ class Ticket:
             self.advance([self.heliostats[i]], Stage.FAILED, text)
 
     def waiting(self, heliostats: Iterable[str]) -> tuple[str, ...]:
-        """Return those of some heliostats that have not ended."""
+        """Return which of some heliostats have not ended."""
         return tuple(name for name in heliostats if self._stage[self._row[name]] < FINAL)
 
     def unacknowledged(self) -> tuple[str, ...]:
@@ -155,7 +155,7 @@ class Ticket:
         """One line: the number at each stage, and the most frequent reasons."""
         parts = ", ".join(f"{n} {word}" for word, n in self.counted().items())
         left = self.waiting(self.steps)
-        # The results of those that are done are said once nothing else is to be said.
+        # Results of completed heliostats are listed only if there is nothing else to report.
         why = by_reason((self.refusals | {n: self.steps[n] for n in left}) or self.steps)
         return f"{self.name}: {parts}" + (f" ({why})" if why else "")
 
@@ -179,7 +179,7 @@ class Ticket:
         return bool((self._stage <= FINAL).all())
 
     async def written(self, timeout: float) -> bool:
-        """Wait until its record is on disk, or it has ended without one; return which.
+        """Wait until its record is on disk, or it has ended without a record; return which.
 
         ``timeout`` is in s, by the plant's clock; returns False when it expires.
         """
@@ -196,7 +196,7 @@ class Ticket:
 
 
 async def _within(clock: Clock, until: float, event: asyncio.Event) -> bool:
-    """Wait for an event until an instant; False if the instant came first."""
+    """Wait for an event until a given time; False if the time came first."""
     if clock.monotonic() >= until:
         return False
     try:

@@ -15,51 +15,51 @@ from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.refusals import AIM_NOT_TAKEN, STANDBY_NOT_TAKEN
 
-#: Why a point of an earlier program may not have been taken.
+#: Why a point of an earlier program may not have been accepted.
 _BEFORE_START = (
     "the plant's program ended before it was acknowledged, or the plant's store was "
     "restored from a backup"
 )
 
 
-#: The refusal of a command that needs a point which was not taken.
+#: The refusal of a command that needs a point that was not accepted.
 _NOT_TAKEN = {"AIM": AIM_NOT_TAKEN, "STANDBY": STANDBY_NOT_TAKEN}
 
 
 class Unacknowledged(Part):
-    """The last ticket of each heliostat's points that may not have been taken.
+    """The last ticket of each heliostat's points that may not have been accepted.
 
     Parameters
     ----------
     field, points
-        The plant's.
+        Parts of the plant.
     """
 
     def __init__(self, field: FieldState, points: Points) -> None:
         self._field, self._points = field, points
-        #: By kind and heliostat; None where the ticket ended with an earlier program.
+        #: By kind and heliostat; None if the ticket ended with an earlier program.
         self._tickets: dict[str, dict[str, Ticket | None]] = {}
-        #: The last ticket that was taken, by kind and heliostat.
+        #: The last ticket that was accepted, by kind and heliostat.
         self._took: dict[str, dict[str, Ticket]] = {kind: {} for kind in KINDS}
         for kind in KINDS:
             open_ = np.isfinite(points.earlier[kind]).any(axis=(0, 2))
             self._tickets[kind] = {field.names[row]: None for row in np.flatnonzero(open_)}
 
     def sent(self, ticket: Ticket, heliostats: Sequence[str]) -> None:
-        """Note new points that are sent now."""
+        """Note new points that are being sent."""
         self._tickets[ticket.name].update(dict.fromkeys(heliostats, ticket))
 
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Note points that were taken, unless others were sent since."""
+        """Note accepted points, unless others have been sent since."""
         del now
         if stage is not Stage.DONE or ticket.name not in KINDS:
             return
         last, took = self._tickets[ticket.name], self._took[ticket.name]
         for name in heliostats:
             if name not in last and took.get(name, ticket) is not ticket:
-                last[name] = None  # it came after the one that was given later
+                last[name] = None  # it arrived after the point that was sent later
         names = [n for n in dict.fromkeys(heliostats) if last.get(n) is ticket]
         names = [n for n in names if ticket.stage(n) is not Stage.REFUSED]
         for name in names:

@@ -1,4 +1,4 @@
-"""The best visit at a moment: all heliostats screened by bounds, the best judged exactly.
+"""The best visit at a given moment: all heliostats screened by bounds, the best judged exactly.
 
 Screening considers only angles, as if each mirror rotated about its foot. The candidates are then
 judged in the order of their bounds, including shading and blocking by neighbours.
@@ -21,14 +21,15 @@ from heliotrope.geometry import FloatArray, angle_between, tangent_axes
 from heliotrope.plant.schedule.knowledge import FieldKnowledge, VisitYield
 from heliotrope.plant.schedule.settings import Settings, Weather
 
-#: Heliostats judged exactly at a time; most chunks of a decision once a visit is found, and before.
+#: Number of heliostats judged exactly at a time; maximum number of chunks in a decision once a
+#: visit is found, and before.
 CHUNK, CHUNKS, MOST_CHUNKS = 64, 2, 6
-#: A heliostat that cannot be seen now, or whose visit would gain nothing, is judged again after
-#: this time, s: the sun moves by a degree in four minutes.
+#: A heliostat that cannot be observed now, or whose visit would gain nothing, is judged again after
+#: this time, s; the sun moves by a degree in four minutes.
 AGAIN = 300.0
-#: Most places at which a search looks for a beam.
+#: Maximum number of places in which a search looks for a beam.
 LOOKS = 25
-#: Slack of the screening, since a pivot is not at the foot of its heliostat, rad.
+#: Slack of the screening, because a pivot is not at the foot of its heliostat, rad.
 SLACK = float(np.radians(4.0))
 
 Mask = npt.NDArray[np.bool_]
@@ -85,7 +86,7 @@ class Sight:
     size
         Width and height of the mirrors, m, (N, 2).
     cameras
-        Cameras that look at the target.
+        Cameras that observe the target.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class Sight:
         )
 
     def seen(self, square: FloatArray, rows: npt.NDArray[np.intp] | slice) -> FloatArray:
-        """Return the chance that a beam is wholly on the target at the first look, (K,).
+        """Return the chance that a beam is completely on the target in the first photograph, (K,).
 
         Parameters
         ----------
@@ -119,7 +120,7 @@ class Sight:
         return chance_on_target(self.target, self._position[rows], self._size[rows], square)
 
     def glare(self, sun: FloatArray) -> float:
-        """Return the smallest angle between the sun and a camera's line to the target, rad."""
+        """Return the smallest angle between the sun and a camera's line of sight, rad."""
         lines = [self.target.center - eye for eye in self._eyes]
         return min(
             (float(angle_between(line / np.linalg.norm(line), sun)) for line in lines),
@@ -130,14 +131,14 @@ class Sight:
 def hidden(
     offsets: FloatArray, normal: FloatArray, size: FloatArray, path: FloatArray
 ) -> FloatArray:
-    """Return the share of mirrors that neighbours hide towards a direction, (K,).
+    """Return the fraction of mirrors that neighbours hide in a direction, (K,).
 
     Parameters
     ----------
     offsets
         From each mirror to its neighbours, m, (K, J, 3).
     normal
-        Normals of the mirrors, and of their neighbours, which are taken as parallel, (K, 3).
+        Normals of the mirrors, and of their neighbours, which are assumed parallel, (K, 3).
     size
         Width and height of the mirrors, m, (K, 2).
     path
@@ -182,7 +183,7 @@ class Moment:
 
 
 class Judge:
-    """The search for the best visit of a moment.
+    """The search for the best visit at a given moment.
 
     Parameters
     ----------
@@ -198,7 +199,8 @@ class Judge:
     sights
         Lines of sight, by target.
     more
-        Whether the last decision found no visit but did not judge every candidate: ask again.
+        Whether the last decision found no visit without judging every candidate, so that another
+        decision may find one.
     """
 
     def __init__(
@@ -218,7 +220,7 @@ class Judge:
         self._again = {name: np.full(len(known), -np.inf) for name in self.sights}
 
     def of(self, known: FieldKnowledge) -> "Judge":
-        """Return a copy that judges by other knowledge."""
+        """Return a copy that judges from other knowledge."""
         other = copy(self)
         other._known = known  # noqa: SLF001 - its own kind
         again = {name: until.copy() for name, until in self._again.items()}
@@ -241,11 +243,11 @@ class Judge:
         now, sun
             POSIX s, and the unit vector to the sun, (3,).
         ready
-            Which heliostats may be sent, (N,).
+            Mask of the heliostats that may be sent, (N,).
         targets
             Free targets.
         counts
-            Counts of the drives, (N, 2), if known.
+            Step counts of the drives, (N, 2), if known.
         weather
             Weather, as far as it is measured.
         """
@@ -314,17 +316,17 @@ class Judge:
         return np.concatenate(rows), np.concatenate(places), np.concatenate(bounds)
 
     def _worth(self, gain: FloatArray, drive: npt.ArrayLike, seen: FloatArray) -> FloatArray:
-        """Return the gain for each second, rad²/s."""
+        """Return the gain per second, rad²/s."""
         return np.asarray(gain * self._chance(seen) / self._time(drive, seen))
 
     def _chance(self, seen: FloatArray) -> FloatArray:
-        """Return the chance that a visit sees the beam."""
+        """Return the probability that a visit sees the beam."""
         return seen if self._settings.look is None else np.ones_like(seen)
 
     def _time(self, drive: npt.ArrayLike, seen: FloatArray) -> FloatArray:
-        """Return the expected time of a visit, there and back, s."""
+        """Return the expected time of a visit, including travel both ways, s."""
         settings = self._settings
-        # The first look is one of the photographs.
+        # The first search position is already one of the photographs.
         looks = np.minimum(1.0 / np.maximum(seen, 1e-9), LOOKS) - 1.0
         search = 0.0 if settings.look is None else settings.look * looks
         return np.asarray(settings.visit + 2.0 * np.asarray(drive) + search)
@@ -349,7 +351,7 @@ class Judge:
             seen = sight.seen(square, mine)
             value = self._worth(look.gain, look.drive, seen)
             if overdue:
-                # Prefer the target that tells more.
+                # Prefer the target that yields more information.
                 value = moment.age[mine] + look.gain / np.maximum(square, 1e-30)
             else:
                 free &= look.gain > settings.worth * square

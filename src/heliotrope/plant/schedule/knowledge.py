@@ -42,16 +42,16 @@ Rows = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class VisitYield:
-    """The expected yield of a visit of each of K heliostats to a target, at one sun.
+    """The expected yield of a visit of each of K heliostats to a target, at one sun position.
 
     Attributes
     ----------
     able
-        Within stops and limits, (K,).
+        Whether the heliostat is within stops and limits, (K,).
     normal
         Mirror normals, (K, 3).
     drive
-        Time to get there, s, (K,); 0 where speeds or counts are unknown.
+        Time to get there, s, (K,); 0 if speeds or counts are unknown.
     slope
         Whitened derivative of all photographs of the visit together, (K, 2, P).
     gain
@@ -78,7 +78,7 @@ class Knowledge:
     aim
         Aim point in operation, ENU, m, (3,).
     site, year
-        Place and calendar year of the suns that count.
+        Location and calendar year of the sun positions used.
     model
         Parameters: a name of the table, or names.
     priors
@@ -116,7 +116,7 @@ class Knowledge:
         suns = suns_of_year(site, year, days=6)
         self._form = error_form(self.mechanism[sample], aim, suns, self.names)
         self._like = _nearest(heliostats.position, heliostats.position[sample])
-        # Drift adds to the variances alone: of the form the diagonal is enough.
+        # Drift adds only to the variances, so the diagonal of the form is enough.
         self._weight = np.diagonal(self._form, axis1=-2, axis2=-1)
         self._growths: tuple[Growth, ...] = (default_growth(self.mechanism),)
         self._grows = np.zeros(count, dtype=np.intp)
@@ -142,7 +142,7 @@ class Knowledge:
         return np.asarray(np.minimum(self._known + added, self.first))
 
     def faded(self, rows: Rows, now: float) -> FloatArray:
-        """Return the covariance of heliostats at a time, (K, P, P); never beyond the prior."""
+        """Return the covariance of heliostats at a time, (K, P, P), never above the prior."""
         added = self._added(rows, now)
         grown = self.covariance[rows] + added[:, :, None] * np.eye(len(self.names))
         more = np.einsum("np,np->n", self._weight[self._like[rows]], added)
@@ -192,7 +192,7 @@ class Knowledge:
         shots, sigma
             Photographs of a visit, and the standard deviation of the beam in each, rad.
         counts
-            Present counts of the drives, (K, 2), if known.
+            Present step counts of the drives, (K, 2), if known.
         """
         some = self.mechanism[rows]
         aimed = aim_at(some, sun, target, limits, counts)
@@ -206,14 +206,15 @@ class Knowledge:
             )
         covariance = self.faded(rows, now)
         seen = np.einsum("kip,kpq,kiq->k", slope, covariance, slope)
-        # The photographs of a visit see nearly the same sun: more of them only reduce the noise.
+        # The photographs of a visit are taken at nearly the same sun position, so more of them only
+        # reduce the noise.
         slope = np.sqrt(shots) * slope
         gain = _gain.variance_gain(covariance, slope, self._form[self._like[rows]])
         drive = _drive_time(some.drives.table, aimed, counts)
         return VisitYield(able, aimed.normal, drive, slope, gain, sigma**2 * (seen + 2.0))
 
     def fleet(self, labels: Sequence[str], now: float, sigma: float) -> Fleet:
-        """Return all heliostats at a time for a plan, with covariances for the information."""
+        """Return all heliostats at a time for a plan, with covariances instead of information."""
         form = self._form[self._like]
         known = self.faded(np.arange(len(self.since)), now)
         return Fleet(self.mechanism, self.names, known, form, self._aim, sigma, tuple(labels))
@@ -225,7 +226,7 @@ class Knowledge:
         self._set(rows, now)
 
     def learn(self, row: int, record: HeliostatCalibration) -> None:
-        """Take a new calibration; parameters that it does not have keep their prior."""
+        """Accept a new calibration; parameters that it lacks keep their prior."""
         covariance = self._prior[row].copy()
         shared = [name for name in self.names if name in record.names]
         mine = [self.names.index(name) for name in shared]
@@ -237,7 +238,7 @@ class Knowledge:
         self._set(np.array([row], dtype=np.intp), record.at)
 
     def doubt(self, row: int, factor: float) -> None:
-        """Multiply the variances by a factor: the beam was found elsewhere."""
+        """Multiply the variances by a factor, because the beam was found elsewhere."""
         self.covariance[row] *= factor
         self._set(np.array([row], dtype=np.intp), float(self.since[row]))
 
@@ -268,14 +269,14 @@ class FieldKnowledge:
     row
         Row of each heliostat, by name.
     position, size
-        Feet, and width and height of the mirrors, m, (N, 3) and (N, 2).
+        Feet of the heliostats, and width and height of the mirrors, m, (N, 3) and (N, 2).
     near
         Rows of the nearest neighbours, (N, K).
 
     Raises
     ------
     InputError
-        Names that are not those of the design.
+        If the names are not those of the design.
     """
 
     def __init__(
@@ -370,7 +371,7 @@ class FieldKnowledge:
         self._groups[self.group[row]].assume(int(self._place[row]), slope, now)
 
     def learn(self, row: int, record: HeliostatCalibration) -> None:
-        """Take a new calibration of a heliostat."""
+        """Accept a new calibration of a heliostat."""
         self._groups[self.group[row]].learn(int(self._place[row]), record)
 
     def grow_as(self, row: int, growth: Growth) -> None:
@@ -396,7 +397,7 @@ def _nearest(places: FloatArray, samples: FloatArray) -> Rows:
 
 
 def _drive_time(table: FloatArray, aimed: Aimed, counts: FloatArray | None) -> FloatArray:
-    """Return the time that the slower axis needs to get there, s, (K,)."""
+    """Return the time that the slower axis needs to reach the pose, s, (K,)."""
     if counts is None:
         return np.zeros(len(table))
     speed = table[..., SLOTS["speed"]]

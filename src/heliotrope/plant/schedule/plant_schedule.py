@@ -22,11 +22,11 @@ from heliotrope.plant.schedule.settings import Settings, Weather
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import PlannedVisit
 
-#: Age at which a plan is replaced, s, and how far it looks ahead.
+#: Age at which a plan is replaced, s, and length of the plan.
 REPLAN, HORIZON = 120.0, timedelta(hours=16)
 #: Steps added to a new plan at each request.
 STEPS = 2
-#: A planned visit this late is no longer shown, s.
+#: A planned visit this late is no longer displayed, s.
 _LATE = 60.0
 
 
@@ -72,7 +72,7 @@ class PlantSchedule:
         self._draft: list[PlannedVisit] = []
         self._coming: Iterator[Assignment | None] | None = None
         self._made = -np.inf
-        #: Heliostats that go to a target, by target.
+        #: Heliostats on their way to a target, by target.
         self._sent: dict[str, list[str]] = {}
         self.attempts = scheduler.attempts
         plant.beliefs.subscribe(scheduler.learn)
@@ -83,10 +83,10 @@ class PlantSchedule:
     ) -> PlannedVisit | None:
         """Return the next of the ready heliostats (N,) for a free target, None if none is due.
 
-        With ``beside`` it goes there together with those returned before.
+        With ``beside``, the heliostat goes there together with those returned before.
         """
         for gone in list(self.scheduler.running.values()):
-            # The target is free, so the visit there has ended without a result.
+            # The target is free, so the previous visit there has ended without a result.
             if gone.target == target and not beside:
                 self.scheduler.cancel(gone.heliostat)
         assignment = self.scheduler.next(
@@ -105,13 +105,13 @@ class PlantSchedule:
 
     @property
     def weather(self) -> Weather:
-        """Weather, as far as sensors measure it."""
+        """Present weather, as far as sensors measure it."""
         seen = self._plant.sentinel.table.shown(self._plant.now())
         return Weather(seen.get(DNI_READING, np.nan), seen.get("wind_gust", np.nan))
 
     @property
     def reason(self) -> str:
-        """Why the last choice was made, or why there was none; "" before the first."""
+        """The reason for the last choice, or for making none; "" before the first."""
         return self.scheduler.reason
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[PlannedVisit]:
@@ -136,7 +136,7 @@ class PlantSchedule:
         return self.scheduler.prospect(self._plant.clock.utc(), able, targets)
 
     def done(self, entry: CalibrationEntry) -> None:
-        """Take the result of a visit."""
+        """Accept the result of a visit."""
         good, missed, sent = entry.good, entry.measured, self._sent.get(entry.target, [])
         together = len(sent) > 1 and entry.heliostat in sent
         self.scheduler.done(
@@ -157,7 +157,7 @@ class PlantSchedule:
 
 
 def _planned(assignment: Assignment) -> PlannedVisit:
-    # Pages show errors of the normal, half of those of the beam.
+    # The pages show errors of the normal, which are half of the beam errors.
     return PlannedVisit(
         assignment.heliostat,
         assignment.target,

@@ -31,11 +31,11 @@ from heliotrope.plant.schedule.settings import Settings
 from heliotrope.store.records import FieldPoint, Outlook
 from heliotrope.sun import Site
 
-#: Least and longest interval of the predicted curve, s.
+#: Shortest and longest interval of the predicted curve, s.
 _SHORT, _LONG = 120.0, 600.0
-#: A visit takes at most this many times as long as the schedule expects, or the inverse.
+#: A visit is assumed to take at most this many times the expected time, and at least the inverse.
 _MOST_PACE = 4.0
-#: Joint visits, and receiver visits, from which their true times count.
+#: Number of joint or receiver visits from which their actual times are used.
 _KNOWN = 3
 
 
@@ -46,11 +46,11 @@ class JointVisitTime:
     Attributes
     ----------
     mirrors
-        How many were sent.
+        Number of heliostats sent.
     worst
-        Largest beam error that was expected of them on the target, rad RMS (2-D).
+        Largest expected beam error among them on the target, rad RMS (2-D).
     seconds
-        Its time.
+        Its duration.
     """
 
     mirrors: int
@@ -65,9 +65,9 @@ class ReceiverVisitTime:
     Attributes
     ----------
     mirrors, lit
-        How many took part, and how many shone on the receiver.
+        Number of heliostats that took part, and number whose beams were on the receiver.
     seconds
-        Its time.
+        Its duration.
     """
 
     mirrors: int
@@ -88,20 +88,21 @@ def terms_of(
     Parameters
     ----------
     settings
-        Of the schedule.
+        Settings of the schedule.
     joint
-        Of the joint visits; None: there are none.
+        Terms of the joint visits; None: there are none.
     pace
-        Time of a visit alone that gives parameters, as a share of the expected time; NaN: unknown.
+        Time per single visit that yields parameters, as a fraction of the expected time; NaN:
+        unknown.
     joint_visits
-        Joint visits: once there are some, their times take the place of the expected ones.
+        Completed joint visits; once there are enough, their times replace the expected times.
     receiver
-        Of the receiver visits; None: there are none.
+        Terms of the receiver visits; None: there are none.
     receiver_visits
-        Receiver visits: their times count as those of joint visits do.
+        Completed receiver visits; their times are used in the same way.
     """
     share = _share(pace)
-    # Without a search, a beam that misses costs a whole visit.
+    # Without a search, a beam that misses the target costs a whole visit.
     look = settings.visit if settings.look is None else settings.look
     return CommissionTerms(
         goal=settings.goal,
@@ -120,7 +121,7 @@ def terms_of(
 def _joint_terms(
     settings: Settings, joint: JointSettings, made: Sequence[JointVisitTime]
 ) -> JointTerms:
-    """Return the joint visits; after some of them, with their true times."""
+    """Return the terms of joint visits; with actual times once there are enough visits."""
     terms = JointTerms.of(joint, settings.sigma)
     if len(made) < _KNOWN:
         return terms
@@ -130,7 +131,7 @@ def _joint_terms(
 
 
 def _receiver_terms(terms: ReceiverTerms, made: Sequence[ReceiverVisitTime]) -> ReceiverTerms:
-    """Return the receiver visits; after some of them, with their true times."""
+    """Return the terms of receiver visits; with actual times once there are enough visits."""
     if len(made) < _KNOWN:
         return terms
     expected = sum(terms.span(one.mirrors, one.lit) for one in made)
@@ -143,23 +144,23 @@ def _share(pace: float) -> float:
 
 @dataclass(frozen=True)
 class FieldProspect:
-    """The knowledge of a field at one moment; nothing in it changes, so any process may use it.
+    """The knowledge about a field at one moment; it is immutable, so any process may use it.
 
     Attributes
     ----------
     at
         POSIX s.
     site, targets
-        Place and air, and the targets that may be used.
+        Location and atmosphere, and the targets that may be used.
     fleets
         Heliostats with the *covariance* of their parameters in place of the information, which is
         computed beside the plant.
     size
-        Larger side of the mirrors, m, (N,), in the order of the fleets as what follows.
+        Longer side of the mirrors, m, (N,); like the next two, in the order of the fleets.
     measured, held
-        Heliostats that are calibrated, and those that cannot be measured on this day, (N,).
+        Masks of the heliostats that are calibrated, and that cannot be measured on this day, (N,).
     terms
-        Of the visits.
+        Terms of the visits.
     """
 
     at: float
@@ -172,7 +173,7 @@ class FieldProspect:
     terms: CommissionTerms
 
     def now(self) -> FieldPoint:
-        """Return the errors of the field."""
+        """Return the present errors of the field."""
         field = ScaledField(self._informed(), self.terms.limits)
         found = error_percentiles(field.form, field.covariance, SHARES)
         return FieldPoint(self.at, *(0.5 * found).tolist())
@@ -193,14 +194,14 @@ class FieldProspect:
             )
         except InputError:
             return None
-        # Pages show errors of the normal, half of those of the beam.
+        # The pages show errors of the normal, which are half of the beam errors.
         curve = zip(plan.time.tolist(), (0.5 * plan.percentiles).tolist(), strict=True)
         points = tuple(FieldPoint(at, *shares) for at, shares in curve)
         able, goal = int((~self.held).sum()), 0.5 * self.terms.goal
         return Outlook(self.at, able, goal, plan.reached, points, _told(plan))
 
     def _interval(self) -> float:
-        """Return the time in which all are visited: a plan visits each once in an interval."""
+        """Return the time in which all heliostats are visited once, the interval of the plan."""
         joint, count = self.terms.joint, len(self.held)
         each = self.terms.alone
         if joint is not None:

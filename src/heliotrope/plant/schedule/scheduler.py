@@ -39,11 +39,11 @@ from heliotrope.plant.schedule.prospect import (
 from heliotrope.plant.schedule.settings import Settings, Weather
 from heliotrope.safety import alarms
 
-#: A beam this many times as far off as expected says that its heliostat has changed.
+#: A beam error this many times the expected error indicates that the heliostat has changed.
 SURPRISE = 3.0
-#: Visits from which their true pace counts in a prediction.
+#: Number of visits from which their actual pace is used in a prediction.
 ENOUGH = 10
-#: Visits to targets that failed, by heliostat; the wait is that of the settings. The rest lasts to
+#: Failed visits to targets, by heliostat; the wait is that of the settings. The rest lasts until
 #: the next day.
 VISITS = RetryLaw(
     "visit to a target",
@@ -54,9 +54,9 @@ VISITS = RetryLaw(
     rest=16.0 * 3600.0,
     alarm=alarms.CALIBRATION_GIVEN_UP,
 )
-#: Receiver visits to remember, some days of them.
+#: Number of receiver visits to remember, enough for some days.
 _RECEIVER_VISITS = 100
-#: Finished visits to remember.
+#: Number of finished visits to remember.
 REMEMBERED = 20_000
 #: Step of a plan while there is nothing to do, s.
 _STEP = 600.0
@@ -137,7 +137,7 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """Measured over predicted error: near 1 if the prediction is right."""
+        """Measured over predicted error, near 1 if the prediction is correct."""
         return self.measured / self.predicted
 
     @property
@@ -274,7 +274,7 @@ class Scheduler:
         begin, year = _unix(now), now.astimezone(UTC).year
         self._known = FieldKnowledge(design, self.settings, self.names, begin, year)
         self._judge = Judge(design, self.settings, self._known, self.names)
-        # The expected information of the assignments under way, by heliostat.
+        # The expected information from assignments in progress, by heliostat.
         self._slopes: dict[str, FloatArray] = {}
         self._learnt = np.zeros(len(self.names), dtype=np.int64)
         self.attempts = Attempts(replace(VISITS, wait=self.settings.retry))
@@ -290,7 +290,7 @@ class Scheduler:
         return self._known.ages(_unix(now_utc))
 
     def learn(self, record: HeliostatCalibration) -> None:
-        """Take a new calibration.
+        """Accept a new calibration.
 
         Raises
         ------
@@ -313,7 +313,7 @@ class Scheduler:
         self._known.grow_as(self._find(record.heliostat), record.growth)
 
     def observe(self, heliostat: str, error: float, now_utc: datetime) -> bool:
-        """Take a beam error observed in operation, rad; return whether it is a surprise.
+        """Accept a beam error observed in operation, rad; return whether it is a surprise.
 
         An error above `SURPRISE` times the expected error means that the heliostat has changed; its
         expected error is then set to the observed one.
@@ -409,7 +409,7 @@ class Scheduler:
     # -- results ---------------------------------------------------------------------------
 
     def done(self, visited: Visited) -> Finished | None:
-        """Take the result of a visit; return it with its assignment, None if it was not planned.
+        """Accept the result of a visit; return it with its assignment, None if it was not planned.
 
         Raises
         ------

@@ -59,7 +59,7 @@ from heliotrope.plant.visits.verification import Confirming, Verification
 from heliotrope.plant.visits.visit import Visit
 from heliotrope.plant.workers import Worker, at_once
 
-#: Step counts in doubt are confirmed by photographs that miss by no more than this, rad RMS: the
+#: Doubtful step counts are confirmed by photographs that miss by no more than this, rad RMS, the
 #: limit at which `pointing_disagrees` trips.
 PLACED = 3e-3
 
@@ -105,7 +105,7 @@ class CycleResult:
     verdict: Verdict | None = None
 
     def then(self, again: "CycleResult") -> "CycleResult":
-        """Return the result of a visit that also learnt from its verification: ``again``."""
+        """Return the result of a visit that also learnt from its verification, ``again``."""
         new, known = self.new + again.new, max(self.known, again.known)
         if again.record is None:
             return replace(self, known=known, new=new)
@@ -120,7 +120,7 @@ class CycleResult:
 
 
 def refused(mandate: Mandate, heliostat: str, text: str) -> CycleResult:
-    """Return the result of a heliostat that was refused, or taken out of its visit."""
+    """Return the result for a heliostat that was refused, or removed from its visit."""
     taken = heliostat in mandate.blameless
     outcome = CalibrationOutcome.TAKEN_OUT if taken else CalibrationOutcome.REFUSED
     return CycleResult(heliostat, outcome, text)
@@ -128,14 +128,14 @@ def refused(mandate: Mandate, heliostat: str, text: str) -> CycleResult:
 
 @dataclass(frozen=True)
 class Leaving:
-    """How a heliostat that tracks a receiver leaves it: for nothing but new parameters.
+    """How a heliostat that tracks a receiver leaves it, which it does only for new parameters.
 
     Attributes
     ----------
     worth
-        Least change of its beam for which it leaves, rad.
+        Smallest change of its beam for which it leaves, rad.
     leave
-        Brings it to standby.
+        Function that brings it to standby.
     """
 
     worth: float
@@ -253,12 +253,12 @@ class CalibrationCycle:
         return CycleResult(heliostat, CalibrationOutcome.UNCHANGED, text)
 
     def _missed(self, heliostat: str, taken: Photographs) -> float:
-        """Return the beam error of photographs by the present belief, rad RMS."""
+        """Return the beam error of photographs under the present belief, rad RMS."""
         seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
         return root_mean_square(beam_errors(self._plant.beliefs.present(heliostat), seen).beam)
 
     def _witness(self, heliostat: str, taken: Photographs) -> str | None:
-        """Check the sun by photographs; return the reason why not to learn from them."""
+        """Check the sun direction by photographs; return the reason not to learn from them."""
         if not taken.used:
             return None
         beliefs = self._plant.beliefs
@@ -270,7 +270,7 @@ class CalibrationCycle:
     def _plausible(
         self, heliostat: str, taken: Photographs
     ) -> tuple[list[Sightings], tuple[str, ...]]:
-        """Return the sightings that can have happened, and a line for each photograph rejected."""
+        """Return the plausible sightings, and a line for each rejected photograph."""
         made = [self._sighting(shot, counts) for shot, counts in taken.used]
         nominal = self._plant.beliefs.nominal(heliostat)
         reasons = judge(join(made), mechanism=nominal).reasons if made else {}
@@ -340,7 +340,7 @@ class CalibrationCycle:
         return result
 
     async def _again(self, visit: Visit, proof: Photographs, tell: Tell, least: int) -> CycleResult:
-        """Learn from a photograph that has confirmed a fit; what was taken stays as it is."""
+        """Learn from a photograph that confirmed a fit; what was adopted stays unchanged."""
         confirm = self.verification.problem
         try:
             return await self._learn(visit, proof, tell, confirm, least, None)
@@ -356,7 +356,7 @@ class CalibrationCycle:
         least: int,
         leaving: Leaving | None,
     ) -> CycleResult:
-        """Fit all sightings once; push, verify and take a better fit."""
+        """Fit all sightings once; send, verify and adopt a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
         new, rejected = self._plausible(name, taken)
         known = beliefs.known(name)
@@ -393,7 +393,8 @@ class CalibrationCycle:
                 fit, pushed = await self._try(visit, fit, new_sightings, taken, tell, confirming)
         alone = not old and fit.outcome is not CalibrationOutcome.UNCHANGED
         if fit.problem and (alone or fit.outcome is CalibrationOutcome.NOT_VERIFIED):
-            # No earlier sighting supports these, or a later photograph contradicts them: drop them.
+            # No earlier sighting supports them, or a later photograph contradicts them, so drop
+            # them.
             text = f"unchanged: {fit.problem}"
             count = 0 if known is None else len(known)
             return CycleResult(
@@ -417,10 +418,11 @@ class CalibrationCycle:
         )
 
     def _sure(self, fit: JudgedFit, new_sightings: Sightings) -> bool:
-        """Return whether a fit needs no photograph that confirms it."""
+        """Return whether a fit needs no confirming photograph."""
         beliefs, settings = self._plant.beliefs, self.settings
         last, present = beliefs.record(fit.name), beliefs.present(fit.name)
-        # Photographs that the calibration did not expect show a step of the mirror, or other light.
+        # Photographs that the calibration did not expect indicate a step of the mirror, or other
+        # light.
         sure = (
             last is not None and surprise_of(last, fit.nominal, new_sightings) <= settings.agreement
         )
@@ -429,7 +431,7 @@ class CalibrationCycle:
     async def _after_leaving(
         self, visit: Visit, fit: JudgedFit, new_sightings: Sightings, leaving: Leaving
     ) -> JudgedFit:
-        """Return a fit for whose parameters a heliostat has left a receiver, or why it has not."""
+        """Return a fit for whose parameters a heliostat left a receiver, or why it stayed."""
         if not self._sure(fit, new_sightings):
             text = "a photograph on a target must confirm the new parameters; calibrate it there"
             return replace(fit, outcome=CalibrationOutcome.NOT_VERIFIED, problem=text)
@@ -453,7 +455,7 @@ class CalibrationCycle:
         tell: Tell,
         confirming: Confirming,
     ) -> tuple[JudgedFit, tuple[str, ...]]:
-        """Push a fit and verify it; return it, with why it was withdrawn, and the items pushed."""
+        """Send a fit and verify it; return it, with why it was withdrawn, and the items sent."""
         name, plant = visit.heliostat, self._plant
         present, new = plant.beliefs.present(name), fit.mechanism
         sure = self._sure(fit, new_sightings)
@@ -468,7 +470,7 @@ class CalibrationCycle:
                 return fit, pushed
             await self._push(visit, present[0], "the new ones were not verified")
         except BaseException:
-            # The local controller gets the old parameters as soon as its state allows it.
+            # The local controller gets the old parameters as soon as its state allows.
             plant.want(name, present[0])
             visit.taken_off()
             raise
@@ -477,7 +479,7 @@ class CalibrationCycle:
         return replace(fit, outcome=CalibrationOutcome.NOT_VERIFIED, problem=said), ()
 
     def _take(self, visit: Visit, fit: JudgedFit, pushed: tuple[str, ...]) -> HeliostatCalibration:
-        """Make the record of a fit that is stored, and let the plant believe it."""
+        """Create the record of a stored fit, and make it the plant's belief."""
         record = fit.record(
             self._plant.beliefs,
             self._plant.clock.utc().timestamp(),

@@ -49,34 +49,35 @@ from heliotrope.plant.visits.target_light import (
 )
 from heliotrope.plant.visits.verification import Confirming
 
-#: Moves beams to points on the surface, ENU, m, by heliostat.
+#: Function that moves beams to points on the surface, ENU, m, by heliostat.
 Move = Callable[[Mapping[str, FloatArray]], Awaitable[None]]
 
-#: Time in which each heliostat of a visit reports its step counts: they are asked for each second.
+#: Time in which each heliostat of a visit reports its step counts, because they are requested each
+#: second.
 _COUNTED = 1.2
-#: Photographs that may wait to be read while the next is taken.
+#: Number of photographs that may wait for evaluation while the next is taken.
 _UNREAD = 2
-#: Share of the way from the usual light to that of a new photograph.
+#: Fraction of the difference by which the usual light follows that of a new photograph.
 _FOLLOW = 0.2
 
 
 @dataclass
 class Light:
-    """The light on a surface that is known before the photographs of a visit are taken.
+    """What is known about the light on a surface before the photographs of a visit are taken.
 
     Attributes
     ----------
     view
-        How the face lies in the camera's frames; None: unknown.
+        Position of the face in the camera's frames; None: unknown.
     empty
-        The light without beams; None: the surface is never without.
+        The light without beams; None: the surface is never without beams.
     usual, steady
-        Mean brightness of photographs, and its largest change as a share; None: it may be any.
+        Mean brightness of photographs, and its largest relative change; None: it may be any.
     other
-        Brightness of the last photograph if it was not as usual.
+        Brightness of the last photograph if it was unusual.
     lasting
-        Whether the last two were alike in another light, but not in the dark of a cloud: beams
-        have come or left, and theirs is the usual light from then on.
+        Whether the last two photographs agreed in another light that is not the dark of a cloud. In
+        that case beams have come or left, and this light is the usual one from then on.
     """
 
     view: FaceView | None = None
@@ -87,7 +88,7 @@ class Light:
     lasting: bool = False
 
     async def shown(self, picture: Exposed) -> bool:
-        """Return whether a photograph is as bright as usual; follow the sun."""
+        """Return whether a photograph is as bright as usual, and follow slow changes of the sun."""
         if self.usual is None:
             return True
         level = (await picture.light).brightness
@@ -106,20 +107,21 @@ class Light:
 
 @dataclass
 class _Taken:
-    """The photographs of a visit, and when the mirrors stood still for each.
+    """The photographs of a visit, and when the heliostats stood still for each.
 
     Attributes
     ----------
     needed
-        Photographs in a turn of the codes.
+        Number of photographs in a full cycle of the codes.
     pictures
-        Those of the present turn, each with its number; they are read while the beams move on.
+        Photographs of the present cycle, each with its number; they are evaluated while the beams
+        move on.
     still
         From when to when all stood at the aims of a photograph, and its number.
     count, first
-        Photographs in all; and the number with which the present turn began.
+        Total number of photographs; and the number with which the present cycle began.
     standing
-        How the field stood in the middle of the turn.
+        Poses of the field in the middle of the cycle.
     """
 
     needed: int
@@ -132,7 +134,7 @@ class _Taken:
     @classmethod
     @contextlib.contextmanager
     def of(cls, layout: Layout) -> "Iterator[_Taken]":
-        """Give a place for the photographs of a layout; those unread at the end are forgotten."""
+        """Yield a store for the photographs of a layout; at the end, drop unevaluated ones."""
         taken = cls(len(layout.moves))
         try:
             yield taken
@@ -149,7 +151,7 @@ class _Taken:
         return [(number, await one.light) for number, one in self.pictures]
 
     def forget(self) -> None:
-        """Forget the photographs, read or not: a whole turn begins with the next number."""
+        """Drop all photographs, evaluated or not; a full cycle begins with the next number."""
         self.first = self.number
         for _, one in self.pictures:
             one.light.cancel()
@@ -162,23 +164,23 @@ class CodedCycle(ABC):
     Parameters
     ----------
     plant
-        Running.
+        Running plant.
     camera
         Camera of the surfaces.
     cycle
-        Learns from sightings as from those of its own visits.
+        Cycle that learns from these sightings as from those of its own visits.
 
     Attributes
     ----------
     cycle
         As given.
     kind
-        Name of a visit, for people.
+        Name of a visit, for display.
     comes
-        Whether heliostats come to the surface, and return to their aims at the end; else they track
-        it, and their beams move a little.
+        Whether heliostats come to the surface, and return to their aims at the end; otherwise they
+        track it, and their beams move a little.
     settings
-        Numbers of the plant file.
+        Settings of the plant file.
     """
 
     kind: ClassVar[str]
@@ -204,7 +206,10 @@ class CodedCycle(ABC):
     def _stay(
         self, visit: CodedVisit, layout: Layout, light: Light, tell: Tell
     ) -> AbstractAsyncContextManager[Move]:
-        """Give what moves beams, once they are there and the light is known; bring them away."""
+        """Yield the function that moves beams, once they are there and the light is known.
+
+        At the end the beams are removed.
+        """
 
     @abstractmethod
     async def _exposed(self, face: Target, light: Light) -> Exposed:
@@ -233,8 +238,8 @@ class CodedCycle(ABC):
     ) -> tuple[CycleResult, ...]:
         """Calibrate heliostats together, and bring each back to where it was.
 
-        It works under a mandate of its own: whoever takes the command authority meanwhile, it goes
-        on. A heliostat that a person commands leaves the visit.
+        It works under its own mandate, and continues whoever takes the command authority in the
+        meantime. A heliostat that an operator commands leaves the visit.
 
         Parameters
         ----------
@@ -247,14 +252,14 @@ class CodedCycle(ABC):
 
         Returns
         -------
-            One for each heliostat, in the order given.
+            One result for each heliostat, in the given order.
 
         Raises
         ------
         RefusedError
             If the plant refuses every motion, too few heliostats are left, or the light changes.
         FetchError, InputError
-            No usable photograph comes.
+            If there is no usable photograph.
         UnknownNameError
             If there is no such heliostat or surface.
         """
@@ -280,7 +285,7 @@ class CodedCycle(ABC):
     async def photographed(
         self, visit: CodedVisit, layout: Layout, light: Light, tell: Tell
     ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
-        """Bring beams to their places, photograph them, bring them away, and tell them apart.
+        """Bring beams to their places, photograph them, remove them, and tell them apart.
 
         Returns
         -------
@@ -306,10 +311,10 @@ class CodedCycle(ABC):
         move: Move,
         tell: Tell,
     ) -> None:
-        """Take the photographs, until their number is at its limit for changes of the light.
+        """Take the photographs, up to the limit that allows for changes of the light.
 
-        When a beam leaves or the light has changed for good, a whole turn of the codes begins anew.
-        A photograph in other light than the usual is taken again.
+        When a beam leaves or the light has changed for good, a full cycle of the codes begins
+        again. A photograph in unusual light is repeated.
         """
         plant, settle, spoiled = self._plant, self.settings.settle, False
         while len(taken.pictures) < taken.needed:
@@ -332,7 +337,7 @@ class CodedCycle(ABC):
             while plant.now() < begin + settle:
                 await visit.look()
             picture = await noting(visit.look, self._next(visit, light, taken))
-            # They stand until each has reported its step counts, however fast the camera is.
+            # They stand still until each has reported its step counts, however fast the camera is.
             while plant.now() < begin + 0.5 * settle + _COUNTED:
                 await visit.look()
             stood = plant.now()
@@ -351,13 +356,13 @@ class CodedCycle(ABC):
                 taken.forget()
 
     def _check(self, visit: CodedVisit) -> None:
-        """Refuse to go on without a heliostat."""
+        """Refuse to continue without any heliostat."""
         if not visit.visits:
             why = next(iter(visit.lost.values()), "")
             raise RefusedError(f"{self.kind} to {visit.target.name}: nobody is left; {why}")
 
     async def _next(self, visit: CodedVisit, light: Light, taken: _Taken) -> Exposed:
-        """Take a photograph; few wait to be read, so that an unreadable one ends the visit soon."""
+        """Take a photograph; few await evaluation, so that an unusable one ends the visit soon."""
         if len(taken.pictures) >= _UNREAD:
             await asyncio.shield(taken.pictures[-_UNREAD][1].light)
         return await self._exposed(visit.target, light)
@@ -419,7 +424,7 @@ class CodedCycle(ABC):
         least: int | None = None,
         leaving: Leaving | None = None,
     ) -> CycleResult:
-        """Learn from a proven beam, see `CalibrationCycle.learn`; an error is a result, too."""
+        """Learn from a proven beam, see `CalibrationCycle.learn`; an error is also a result."""
         try:
             return await self.cycle.learn(
                 visit.visits[name], taken, confirming=confirming, least=least, leaving=leaving
@@ -436,7 +441,7 @@ async def of_each(
     result: Callable[[str], Awaitable[CycleResult]],
     beside: Awaitable[None] | None = None,
 ) -> dict[str, CycleResult]:
-    """Return the results of heliostats, by name; all are computed side by side."""
+    """Return the results of heliostats, by name; all are computed concurrently."""
     results: dict[str, CycleResult] = {}
 
     async def one(name: str) -> None:

@@ -18,11 +18,11 @@ from heliotrope.optics.beam import beam_sigma
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.resolution import LEAST_STEPS, beam_steps
 
-#: Slope error of a mirror's surface that is assumed for the width of its beam, rad.
+#: Slope error of a mirror's surface that is assumed when computing the width of its beam, rad.
 _SLOPE = 1e-3
-#: Share of the light that a mirror is assumed to reflect.
+#: Fraction of the light that a mirror is assumed to reflect.
 REFLECTED = 0.9
-#: Likely share of a mirror's size in its beam: between flat mirrors and well canted ones.
+#: Likely fraction of a mirror's size in its beam, between flat mirrors and well canted ones.
 _CURVED = 0.5
 
 
@@ -36,20 +36,20 @@ def moments_on(
 ) -> FloatArray:
     """Return the second moments of beams on a target, m², (..., 2, 2).
 
-    The image of the sun, widened by the mirror's slopes, and the mirror itself, seen along the
-    beam.
+    They combine the image of the sun, widened by the mirror's slope errors, and the mirror itself,
+    seen along the beam.
 
     Parameters
     ----------
     target
         The target.
     vertex, normal
-        Of the mirrors, ENU, m, and their unit normals, (..., 3).
+        Vertices of the mirrors, ENU, m, and their unit normals, (..., 3).
     width, height
-        Of the mirrors, m, (...).
+        Size of the mirrors, m, (...).
     flat
-        Share of its size that each beam has: 1 for a flat mirror, near 0 for one that is canted and
-        curved for this distance.
+        Fraction of the mirror's size that appears in each beam: 1 for a flat mirror, near 0 for a
+        mirror that is canted and curved for this distance.
     """
     path = np.asarray(target.center) - vertex
     slant = np.linalg.norm(path, axis=-1)
@@ -59,7 +59,7 @@ def moments_on(
     sun = beam_sigma(slant, slope=_SLOPE)[..., None, None]
     across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
     spread = sun**2 * across + np.swapaxes(sides, -1, -2) @ sides
-    # Along the beam onto the plane of the target.
+    # Project along the beam onto the plane of the target.
     along = ray[..., :, None] * target.normal / (ray @ target.normal)[..., None, None]
     onto = target.axes @ (np.eye(3) - along)
     return np.asarray(onto @ spread @ np.swapaxes(onto, -1, -2))
@@ -72,7 +72,7 @@ class Layout:
     Attributes
     ----------
     beams
-        Each beam as it is expected.
+        Expected beams.
     aims
         Aims without movement, ENU, m, (M, 3).
     moves
@@ -80,12 +80,12 @@ class Layout:
     codes
         Number of different codes.
     powers
-        Expected of each beam, in any one unit, (M,): one that differs is joined with other light.
-        None: the expected powers are not compared.
+        Expected power of each beam, in any common unit, (M,); a beam with another power is joined
+        with other light. None: the expected powers are not compared.
     first
-        Whether new parameters are verified by one more series of photographs.
+        Whether new parameters are verified by a further series of photographs.
     left_out
-        Why other heliostats take no part, by name.
+        Why other heliostats do not take part, by name.
     """
 
     target: Target
@@ -114,20 +114,20 @@ class Layout:
 
 @dataclass(frozen=True)
 class SentBeam:
-    """The knowledge of a beam before it is sent.
+    """What is known about a beam before it is sent.
 
     Attributes
     ----------
     slant
         Slant range, m.
     moments, likely
-        Its widest and its likely second moments, m², (2, 2).
+        Its largest and its likely second moments, m², (2, 2).
     variance
-        Of its place along each axis, m².
+        Variance of its position along each axis, m².
     power
-        Of its light, in suns m².
+        Power of its light, in suns m².
     step
-        Steps in which it follows its aim, m right and up, (2,); see `beam_steps`.
+        Size of the steps in which it follows its aim, m right and up, (2,); see `beam_steps`.
     """
 
     slant: float
@@ -138,7 +138,7 @@ class SentBeam:
     step: FloatArray
 
     def movement(self, angle: float, axes: slice = slice(None)) -> float:
-        """Return the size of a movement along some axes, m: more where its steps are coarse."""
+        """Return the size of a movement along some axes, m; larger if the steps are coarse."""
         return max(angle * self.slant, LEAST_STEPS * float(self.step[axes].max()))
 
 
@@ -149,18 +149,18 @@ def beams_of(
     settings: CodedSettings,
     aims: Mapping[str, FloatArray] | None = None,
 ) -> tuple[dict[str, SentBeam], dict[str, str]]:
-    """Return the known beams, and the reasons against the others on a surface, by heliostat.
+    """Return the known beams, and why others cannot be on a surface, by heliostat.
 
     Parameters
     ----------
     plant, target
-        Knows mirrors and the sun; and the target, or the face of a receiver.
+        Plant with its heliostats and the sun; and the target, or the face of a receiver.
     errors
-        Expected error of each beam, rad RMS (2-D); NaN where it does not reach the target.
+        Expected error of each beam, rad RMS (2-D); NaN if it does not reach the target.
     settings
-        Of the visit: the movements may not need to be larger than they allow.
+        Settings of the visit; the movements must not need to be larger than they allow.
     aims
-        Aims of the heliostats, ENU, m, each (3,); None: the middle.
+        Aims of the heliostats, ENU, m, each (3,); None: the centre.
     """
     field, at = plant.field, aims or dict.fromkeys(errors, np.asarray(target.center))
     paths = {n: at[n] - plant.beams.armature.origin_1[field.place(n)] for n in errors}
@@ -214,13 +214,13 @@ def coded(
     Parameters
     ----------
     target, known
-        The target, and the knowledge of the M beams, by name.
+        The target, and what is known about the M beams, by name.
     places, code
-        m right of and above the centre; numbers of the codes.
+        Places in m right of and above the centre; and numbers of the codes.
     movement
-        Either way, rad; more for a beam that follows its aim in coarse steps.
+        Amplitude in both directions, rad; larger for a beam that follows its aim in coarse steps.
     along
-        The only axis of the movements; None: both.
+        The only axis of the movements; None: both axes.
     """
     count = int(code.max(initial=0)) + 1
     axes = slice(None) if along is None else slice(along, along + 1)

@@ -23,19 +23,19 @@ from heliotrope.plant.orders.authority import Mandate, Person, RefusedError
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.visit import BroughtHome, Order, Visit, carried_out
 
-#: Gives heliostats points, by name, for a person with a token.
+#: Function that sends heliostats to points, by name, for a person with a token.
 Pointing = Callable[[Person, int, Mapping[str, FloatArray]], Ticket]
 
-#: Longest time of an order, and of the way to standby, s.
+#: Longest time for an order, and for the way to standby, s.
 _ORDER, _HOME = 60.0, 120.0
-#: A goal that has just moved on with the sun leaves an axis this far from it at most, rad.
+#: A goal that has just moved with the sun leaves an axis at most this far from it, rad.
 _STEP = 1e-3
-#: When all but this share are at their aims, the others get as long again and this time, s.
+#: When all but this fraction are at their aims, the others get as long again plus this time, s.
 _FEW, _LATE = 0.1, 10.0
-#: Time between looks at the field, s.
+#: Interval between checks of the field, s.
 _LOOK = 0.25
-#: States in which a beam may be on the target, and those that an order of others has led to, which
-#: a visit does not undo.
+#: States in which a beam may be on the target, and states that other orders have led to, which a
+#: visit does not undo.
 _ON = (states.IDLE, *states.ON_AIM)
 _OFF = (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.APPROACHING)
 
@@ -46,16 +46,16 @@ class CodedVisit(BroughtHome):
     Parameters
     ----------
     plant, mandate
-        As for `Visit`.
+        As in `Visit`.
     heliostats, target
         Names, and the target.
 
     Attributes
     ----------
     visits
-        Those that take part, by name.
+        Visits of the participants, by name.
     lost
-        Why others do not, by name.
+        Why others do not take part, by name.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class CodedVisit(BroughtHome):
 
     @property
     def astray(self) -> bool:
-        """Whether one that takes part no longer has yet to be brought home; see `leave`."""
+        """Whether a former participant has yet to be brought home; see `leave`."""
         return not self._away <= set(self.visits)
 
     def drop(self, why: Mapping[str, str]) -> None:
@@ -89,7 +89,7 @@ class CodedVisit(BroughtHome):
                 self.lost[name] = text
 
     def missing(self, wanted: int) -> dict[str, str]:
-        """Return the participants that are not live or not in a state, and the reasons."""
+        """Return the participants that are not live or not in a given state, and the reasons."""
         found = {}
         for name, visit in self.visits.items():
             try:
@@ -116,9 +116,9 @@ class CodedVisit(BroughtHome):
                     self.drop({name: said})
             except RefusedError as error:
                 self.drop({name: str(error)})
-        # One that tracks the receiver while its new aim waits for its turn points beside its aim,
-        # and after some seconds is taken for one that disobeys. The turns may all be taken while
-        # the field is raised, so all wait at standby.
+        # A heliostat that tracks the receiver while its new aim waits for its turn points away from
+        # its aim, and after some seconds is considered disobedient. All turns may be taken while
+        # the field is raised, so all heliostats wait at standby.
         self._away |= set(self.visits)
         tracking = self.missing(states.IDLE)
         await self._obeyed("IDLE", self._command("IDLE"), tracking, limit)
@@ -131,11 +131,11 @@ class CodedVisit(BroughtHome):
         await self._obeyed("TRACK", self._command("TRACK"), self.missing(states.TRACKING), limit)
 
     async def aim(self, points: Mapping[str, FloatArray], limit: float = _ORDER) -> None:
-        """Give aims to those that take part; those that may not have theirs drop out."""
+        """Send aims to the participants; those that may not have their aims drop out."""
         await self._pointed(self.plant.aim, points, limit)
 
     async def move(self, points: Mapping[str, FloatArray], limit: float) -> None:
-        """Move beams a little beside their aims; those that may not be moved drop out."""
+        """Move beams a little away from their aims; those that may not be moved drop out."""
         await self._pointed(self.plant.commands.move, points, limit)
 
     async def _pointed(
@@ -148,21 +148,21 @@ class CodedVisit(BroughtHome):
         )
 
     def _command(self, name: str) -> Order:
-        """Return a function that gives a command to some heliostats."""
+        """Return a function that sends a command to some heliostats."""
         person, token, plant = self.mandate.person, self.mandate.token, self.plant
         return lambda some: plant.command(person, token, name, some)
 
     async def _obeyed(
         self, what: str, order: Order, heliostats: Iterable[str], limit: float
     ) -> None:
-        """Give an order; those that do not carry it out drop out, see `carried_out`."""
+        """Issue an order; heliostats that do not carry it out drop out, see `carried_out`."""
         failed = await carried_out(self.plant, order, heliostats, limit, self.look)
         self.drop({name: f"{what} {name}: {why}" for name, why in failed.items()})
 
     async def _arrived(self, limit: float) -> None:
         """Wait until all stay at their aims in two reports; those that do not arrive drop out.
 
-        When most are there, the others get as long again, and some seconds.
+        Once most have arrived, the others get as long again plus some seconds.
         """
         begin = self.plant.now()
         until, seen = begin + limit, dict.fromkeys(self.visits, (begin, 0))
@@ -186,7 +186,7 @@ class CodedVisit(BroughtHome):
     async def look(self) -> None:
         """Wait a little, and note new step counts.
 
-        Those drop out that another order has taken out of the visit.
+        Heliostats that another order has removed from the visit drop out.
         """
         await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
         self.drop({n: f"{n}: {text}" for n, text in self.mandate.refused(self.visits).items()})
@@ -194,27 +194,27 @@ class CodedVisit(BroughtHome):
             visit.note()
 
     async def leave(self) -> bool:
-        """Bring those home that take part no longer; return whether there were any."""
+        """Bring former participants home; return whether there were any."""
         gone = tuple(name for name in sorted(self._away) if name not in self.visits)
         if gone:
             await self._standby(gone)
         return bool(gone)
 
     async def home(self) -> None:
-        """Bring all to standby; those that do not go are taken off the target (DEFOCUS).
+        """Bring all to standby; those that do not go are moved off the target (DEFOCUS).
 
         Raises
         ------
         RefusedError
-            If the plant refuses every motion; the beams are taken off the target then.
+            If the plant refuses every motion; the beams are then moved off the target.
         """
         if self._away:
             await self._standby(tuple(sorted(self._away)))
 
     async def _standby(self, names: tuple[str, ...]) -> None:
-        """Bring heliostats to standby; those that an order has taken off the target stay there.
+        """Bring heliostats to standby; those that an order has moved off the target stay there.
 
-        Those that another order has taken out of the visit are left to that.
+        Those that another order has removed from the visit are left to that order.
         """
         taken = self.mandate.taken
         self._away -= taken.keys()
@@ -240,15 +240,15 @@ class CodedVisit(BroughtHome):
 
 
 class Returned:
-    """Heliostats that go back at the end of an ``async with`` to the aims that they tracked before.
+    """Heliostats that return to their previous aims at the end of an ``async with``.
 
-    Those that are not at standby then, and those that another order has taken out of the visit,
-    stay where they are. A cancelled visit leaves all at standby.
+    Heliostats that are not at standby then, and those that another order has removed from the
+    visit, stay where they are. A cancelled visit leaves all at standby.
 
     Parameters
     ----------
     plant, mandate, heliostats, target
-        As for `CodedVisit`.
+        As in `CodedVisit`.
     """
 
     def __init__(
@@ -264,11 +264,11 @@ class Returned:
         }
 
     async def __aenter__(self) -> Self:
-        """Note where they are."""
+        """Note their present aims."""
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Send them back; what ended the visit is raised rather than what hinders that."""
+        """Send them back; an error that ended the visit takes precedence over a later one."""
         if kind is None:
             await self._back()
         elif issubclass(kind, Exception):

@@ -11,9 +11,9 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.visits.visit import Visit
 
-#: Step counts that differ from those of the ordered movements by this share of them do not follow.
+#: Step counts that differ from those of the ordered movements by this fraction do not follow them.
 _FOLLOWS = 0.5
-#: Rows of step counts that a sighting needs.
+#: Number of step-count reports that a sighting needs.
 _LEAST_ROWS = 3
 
 
@@ -21,18 +21,18 @@ _LEAST_ROWS = 3
 class CountsHeard:
     """Step counts that one heliostat reported while it stood still for photographs.
 
-    The local controller reports counts while it stands still for a photograph. They differ from
-    those that the aim of the photograph asks for by what its tracking lags; the median of
-    the differences belongs to all of them.
+    The local controller reports counts while it stands still for a photograph. They differ from the
+    counts that the aim of the photograph requires by the lag of its tracking; the median of the
+    differences applies to all of them.
 
     Attributes
     ----------
     name
-        Of the heliostat.
+        Name of the heliostat.
     armature, drives
-        Its row of their tables, (1, …).
+        Its row of the tables, (1, …).
     counts
-        As reported, (R, 2).
+        Reported step counts, (R, 2).
     aims
         Its aim at each report, ENU, m, (R, 3).
     base
@@ -63,11 +63,11 @@ class CountsHeard:
         Parameters
         ----------
         visit
-            Of the heliostat.
+            Visit of the heliostat.
         base
             Its aim without movement, ENU, m, (3,).
         still
-            From when to when it stood at an aim, monotonic s, and that aim, (3,).
+            Periods in which it stood still at an aim, monotonic s, and that aim, (3,).
         middle
             Time of the counts in question.
         """
@@ -90,7 +90,7 @@ class CountsHeard:
         )
 
     def at_rest(self) -> FloatArray | str:
-        """Return the step counts at the aim without movement, (2,), or why they are not known."""
+        """Return the step counts at the aim without movement, (2,), or why they are unknown."""
         count = len(self.counts)
         if count < _LEAST_ROWS:
             return f"its step counts were heard {count} times at its aims; {_LEAST_ROWS} needed"
@@ -98,7 +98,7 @@ class CountsHeard:
         ordered = self._counts(np.array([*self.aims, self.base]), heard)
         rest = self._counts(np.tile(self.base, (count + 1, 1)), heard)
         off = self.counts - ordered[:-1]
-        # Medians: a drive with play overshoots for a moment when it turns back.
+        # Medians, because a drive with backlash overshoots for a moment when it reverses.
         lag = np.median(off, axis=0)
         loose = float(np.median(np.abs(off - lag).max(axis=-1)))
         if not loose <= _FOLLOWS * float(np.median(np.abs((ordered - rest)[:-1]).max(axis=-1))):
@@ -106,7 +106,7 @@ class CountsHeard:
         return np.asarray(rest[-1] + lag)
 
     def _counts(self, aims: FloatArray, heard: FloatArray) -> FloatArray:
-        """Return the step counts for aims (R + 1, 3), those nearest to counts (R + 1, 2)."""
+        """Return the step counts for aims (R + 1, 3) that are nearest to counts (R + 1, 2)."""
         rows = np.zeros(len(aims), dtype=np.intp)
         drives = Drive(self.drives[rows])
         found = track(Armature(self.armature[rows]), self.suns, aims, drives=drives, current=heard)

@@ -16,9 +16,9 @@ def expected_errors(
     aims: FloatArray,
     model: Mapping[str, tuple[str, ...]] | None = None,
 ) -> FloatArray:
-    """Return the expected errors of K beams at their aims now, rad RMS (2-D), (K,).
+    """Return the expected errors of K beams at their present aims, rad RMS (2-D), (K,).
 
-    Arguments and NaN as of `expected_covariances`.
+    Arguments and NaN are as in `expected_covariances`.
     """
     spread = expected_covariances(plant, heliostats, aims, model)
     return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1)))
@@ -30,19 +30,19 @@ def expected_covariances(
     aims: FloatArray,
     model: Mapping[str, tuple[str, ...]] | None = None,
 ) -> FloatArray:
-    """Return the covariances of the errors of K beams at their aims now, rad², (K, 2, 2).
+    """Return the covariances of the errors of K beams at their present aims, rad², (K, 2, 2).
 
-    To the right of and above the aim as seen from the mirror. NaN for a beam that cannot reach its
-    aim, and for a heliostat that was never calibrated and has no ``model``.
+    The axes are to the right of and above the aim, as seen from the mirror. NaN for a beam that
+    cannot reach its aim, and for a heliostat that was never calibrated and has no ``model``.
 
     Parameters
     ----------
     plant
-        Knows mirrors, calibrations and the sun.
+        Plant with its heliostats, their calibrations and the sun.
     heliostats, aims
         Names, and points in ENU, m, (K, 3).
     model
-        Names of the parameters whose priors count before the first calibration, by heliostat.
+        Names of the parameters whose priors apply before the first calibration, by heliostat.
     """
     design, beliefs = plant.design, plant.beliefs
     found = np.full((len(heliostats), 2, 2), np.nan)

@@ -32,10 +32,10 @@ from heliotrope.plant.field.beliefs import Beliefs
 from heliotrope.plant.field.flights import Flights
 from heliotrope.plant.visits.settings import CycleSettings
 
-#: Largest error of the last day's photographs that a fit that follows the drift may leave, in sigma
-#: of a photograph: two axes, and the motion of the mirror within hours.
+#: Largest error of the last day's photographs that a fit with drift may leave, in sigma of a
+#: photograph: two axes, and the motion of the mirror within hours.
 EXPLAINED = 2.0
-#: A new fit may miss by more than the present one by this share of a sigma, added in squares.
+#: A new fit may miss by more than the present one by this fraction of a sigma, added in quadrature.
 ROOM = 0.25
 #: Outcomes of fits whose sightings contradict each other or the installation.
 WRONG = frozenset(
@@ -49,29 +49,30 @@ WRONG = frozenset(
 
 @dataclass(frozen=True)
 class JudgedFit:
-    """A fit of one heliostat beside the present belief.
+    """A fit of one heliostat, compared with the present belief.
 
     Attributes
     ----------
     model
         Name of the model.
     fitted
-        Of batch shape (1,).
+        Fit of batch shape (1,).
     nominal
-        The mechanism that it starts from, batch shape (1,).
+        The mechanism from which it starts, batch shape (1,).
     sightings
         The sightings, photographs first, without the errors that flights share.
     before, after
         Beam errors under the present and the fitted mechanism, weighted by the sightings, rad RMS.
-        A fit that follows the drift need not explain the past: the last day's photographs count.
+        A fit that follows the drift need not explain the past; only the last day's photographs
+        count.
     outcome, problem
         Why the fit is rejected, empty if it is not.
     name
-        Of the heliostat.
+        Name of the heliostat.
     flown
-        Numbers of its rows of flights in the store, the last of ``sightings``.
+        Store numbers of its flight records, which are the last of ``sightings``.
     revealed
-        What it reveals of the shared errors of the flights; None without rows of flights.
+        What it reveals about the shared errors of the flights; None without flight records.
     """
 
     model: str
@@ -101,7 +102,7 @@ class JudgedFit:
         provenance: Provenance = Provenance.CAMERA,
         campaign: str = "",
     ) -> HeliostatCalibration:
-        """Return the record of this fit, whose photographs the beliefs know already; see there."""
+        """Return the record of this fit, whose photographs the beliefs already hold; see there."""
         known, last = beliefs.known(self.name), beliefs.record(self.name)
         photographs = np.zeros(0, np.int64) if known is None else known.identities
         return HeliostatCalibration.from_fit(
@@ -122,16 +123,16 @@ class JudgedFit:
 
 @dataclass(frozen=True)
 class Believed:
-    """What is believed of one heliostat when it is fitted: a copy, which nothing changes.
+    """What is believed about one heliostat when it is fitted: an immutable copy.
 
     Attributes
     ----------
     name
-        Of the heliostat.
+        Name of the heliostat.
     nominal, present
-        The mechanism of the design, and the one that is believed now, batch shape (1,).
+        The mechanism of the design, and the mechanism believed now, batch shape (1,).
     hyper
-        Of its group; None: not learned yet.
+        Hyperparameters of its group; None: not learnt yet.
     flights
         Flights of a drone.
     """
@@ -144,7 +145,7 @@ class Believed:
 
     @classmethod
     def of(cls, beliefs: Beliefs, name: str) -> "Believed":
-        """Return the present belief about a heliostat, with the flights that saw it."""
+        """Return the present belief about a heliostat, with the flights that observed it."""
         flights = beliefs.flights if name in beliefs.flights else Flights()
         return cls(name, beliefs.nominal(name), beliefs.present(name), beliefs.hyper(name), flights)
 
@@ -152,12 +153,12 @@ class Believed:
 def fit_heliostat(
     believed: Believed, settings: CycleSettings, model: OwnModel, photographed: Sightings
 ) -> JudgedFit:
-    """Return the fit of one heliostat, by a model, to its photographs and its rows of flights.
+    """Return the fit of one heliostat, by a model, to its photographs and its flight records.
 
-    Photographs and rows of flights are followed through the drift to the latest of them, and the
-    last day's must be explained: what the belief takes for mistakes may be a mirror that has moved
-    an hour ago. If constants explain them better, these are proposed. Rows of flights share errors
-    with other mirrors, of which the joint fit of constants keeps account.
+    The fit follows photographs and flight records through the drift to the latest of them, and must
+    explain the last day's, because what the belief considers outliers may come from a mirror that
+    moved an hour ago. If constant parameters explain them better, these are proposed. Flight
+    records share errors with other heliostats, which the joint fit of constants takes into account.
     """
     if believed.name in believed.flights:
         (constants,) = _fit_group(
@@ -176,7 +177,7 @@ def _following(
     joint: JudgedFit,
     photographed: Sightings | None,
 ) -> JudgedFit:
-    """Return the fit that follows the drift of a mirror with rows of flights, or its constants."""
+    """Return the fit that follows the drift of a heliostat with flight records, or constants."""
     sightings, flown = joint.sightings, believed.flights.flown(believed.name)
     photographs = sightings.take(np.zeros(0, np.intp)) if photographed is None else photographed
     moving = model.following(believed.nominal, photographs, joint.fitted, believed.hyper, flown)
@@ -208,9 +209,10 @@ def _better(
 
 
 def _room(believed: Believed, settings: CycleSettings, flown: Identities) -> float:
-    """Return the beam error that motion within hours leaves, which is not followed, rad RMS.
+    """Return the beam error left by motion within hours, which is not followed, rad RMS.
 
-    A photograph's own sigma says it well enough; a row of a flight is ten times as precise.
+    For a photograph, its own sigma describes this well enough; a flight record is ten times as
+    precise.
     """
     usual = ROOM * settings.sigma
     if not len(flown):
@@ -228,17 +230,17 @@ def _room(believed: Believed, settings: CycleSettings, flown: Identities) -> flo
 def fit_flights(
     beliefs: Beliefs, flights: Flights, settings: CycleSettings, names: Sequence[str]
 ) -> dict[str, JudgedFit]:
-    """Return the joint fits of many heliostats, which share the errors of flights, by name.
+    """Return the joint fits of many heliostats that share the errors of flights, by name.
 
-    All are fitted with the model of few sightings; a visit chooses for each one.
-    A mirror whose fit is wrong says nothing of the shared errors: the others are fitted again
-    without it.
+    All are fitted with the model for few sightings; a visit chooses a model for each one. A
+    heliostat whose fit is wrong says nothing about the shared errors, so the others are fitted
+    again without it.
     """
     fits_by_name: dict[str, JudgedFit] = {}
     groups: dict[int, list[str]] = {}
     for name in names:
         groups.setdefault(id(beliefs.design.find(name)[0]), []).append(name)
-    # With several groups, each is fitted by what the others said last.
+    # If there are several groups, each is fitted with the last result of the others.
     for _ in range(2 if len(groups) > 1 else 1):
         for members in groups.values():
             good = members
@@ -367,8 +369,8 @@ def _judged(
 
 
 def _weighted(errors: FloatArray, sightings: Sightings) -> float:
-    """Return the RMS of errors, each with the weight of its sighting."""
-    # Photographs all have the same sigma; a row of a flight may weigh a hundred times as much.
+    """Return the RMS of errors, weighted by sighting."""
+    # Photographs all have the same sigma; a flight record may weigh a hundred times as much.
     weight = sightings.sigma**-2.0 / np.mean(sightings.sigma**-2.0)
     return root_mean_square(errors * np.sqrt(weight))
 
@@ -380,7 +382,7 @@ def _judge(
     ending = FitOutcome(int(fitted.outcome[0]))
     if ending is not FitOutcome.CONVERGED:
         return CalibrationOutcome.FIT_FAILED, ending.text
-    # The ratio of a worm is searched; its significance has been tested there.
+    # The worm ratio is found by a search, which has tested its significance.
     fits = np.array([not name.endswith("_worm_ratio") for name in fitted.names])
     far = fits * np.abs(fitted.values[0]) / fitted.prior[0]
     if far.max() > settings.most:

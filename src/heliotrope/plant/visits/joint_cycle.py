@@ -36,20 +36,21 @@ from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, light_on
 from heliotrope.plant.visits.visit import Visit
 
-#: Sightings that a first fit needs: all photographs of a visit agree, and others verify it.
+#: Number of sightings that a first fit needs: all photographs of a visit agree, and others verify
+#: it.
 _FIRST = 1
-#: Verdicts on a new mirror whose beam may be beside the target: light that does not move at its
-#: place may be another one's.
+#: Verdicts on a new heliostat whose beam may be beside the target; light that does not move at its
+#: place may come from another heliostat.
 _NOT_FOUND = (Verdict.FAINT, Verdict.ELSEWHERE, Verdict.STUCK)
-#: Joint visits that have not proven a heliostat; one whose beam may be beside the target comes
-#: again, and aims at another place beside it.
+#: Joint visits that did not prove a heliostat. If its beam may be beside the target, it comes again
+#: and aims at another place beside the target.
 JOINT = RetryLaw(
     "joint visit",
     LOOKS,
     0.0,
     "it goes to a target alone, with a search for its beam",
 )
-#: Verdicts that are no mirror's fault: a verification that ends so is made again, once.
+#: Verdicts for which no heliostat is responsible; a verification that ends so is repeated once.
 _AGAIN = (Verdict.JOINED, Verdict.CLOUD)
 
 
@@ -114,12 +115,12 @@ class JointCycle(CodedCycle):
             self.attempts.give_up(name, text, now)
 
     def first(self, heliostats: Sequence[str], target: Target) -> bool:
-        """Return whether a visit uses individual codes: some are new, or not known well enough."""
+        """Return whether a visit uses individual codes: some are new, or poorly known."""
         errors = errors_on(self._plant, target, heliostats, self.settings).values()
         return bool(self.settings.first) and not all(e <= self.settings.known for e in errors)
 
     def having_place(self, heliostats: Sequence[str], target: str) -> tuple[str, ...]:
-        """Return those of some heliostats that have a place in a visit now."""
+        """Return which of some heliostats have a place in a visit now."""
         return self._arranged(self.face(target), tuple(heliostats)).names
 
     # -- a visit ---------------------------------------------------------------------------
@@ -181,16 +182,16 @@ class JointCycle(CodedCycle):
 
 @dataclass(frozen=True)
 class _Waiting:
-    """A heliostat whose local controller stores a fit that is not verified.
+    """A heliostat whose local controller stores a fit that is not verified yet.
 
     Attributes
     ----------
     visit
-        Its visit.
+        Visit of the heliostat.
     fitted, nominal
-        The fit of batch shape (1,), and the mechanism that it starts from.
+        The fit of batch shape (1,), and the mechanism from which it starts.
     problem
-        Gives the reason why the fit is not confirmed, None if it is.
+        Future reason why the fit is not confirmed, None if it is.
     """
 
     visit: Visit
@@ -212,7 +213,7 @@ class _Waiting:
 
 
 class _Verification:
-    """The verification of a joint first visit: one more series of photographs of all together.
+    """The verification of a joint first visit: a further series of photographs of all together.
 
     The fits of the visit end one after the other. Each heliostat that stores new parameters waits
     until all the others do, or have ended otherwise; then they are verified together.
@@ -220,7 +221,7 @@ class _Verification:
     Parameters
     ----------
     coded
-        Makes the visit.
+        Cycle that makes the visit.
     visit, light
         The visit to the target, and the light there.
     heliostats
@@ -231,7 +232,7 @@ class _Verification:
     Attributes
     ----------
     seen
-        Sightings of those that were confirmed, by name.
+        Sightings of the confirmed heliostats, by name.
     """
 
     def __init__(
@@ -260,13 +261,13 @@ class _Verification:
         return await problem
 
     def leave(self, heliostat: str) -> None:
-        """Note that a heliostat does not come any more, or has come."""
+        """Note that a heliostat has come, or will not come any more."""
         self._coming.discard(heliostat)
         if not self._coming:
             self._complete.set()
 
     async def make(self) -> None:
-        """Verify those that wait, once no more can come; where that fails, it fails for them."""
+        """Verify the waiting heliostats once no more can come; a failure applies to all of them."""
         await self._complete.wait()
         try:
             await self._confirm()
@@ -276,11 +277,11 @@ class _Verification:
                     one.problem.set_exception(error)
 
     async def _confirm(self) -> None:
-        """Verify new parameters; the sightings of the confirmed go to `seen`.
+        """Verify new parameters; the sightings of confirmed heliostats are stored in `seen`.
 
-        Those that would make the target too bright are photographed later. Those that other light
-        hid come once more, each with a code of its own. Each series of photographs settles its own,
-        whatever becomes of the next.
+        Heliostats that would make the target too bright are photographed later. Heliostats hidden
+        by other light come once more, each with its own code. Each series of photographs decides
+        about its own heliostats, whatever the next one shows.
         """
         waits, own = tuple(self._waiting), False
         while waits:
@@ -300,8 +301,8 @@ class _Verification:
 
         Returns
         -------
-            The reason why each is not confirmed, None if it is; those that may come once more; and
-            those that wait for another series.
+            The reason why each is not confirmed, None if it is; the heliostats that may come once
+            more; and those that wait for another series.
         """
         plant, target = self._visit.plant, self._visit.target
         sun = plant.sun_vector()

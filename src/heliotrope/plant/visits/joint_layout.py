@@ -26,18 +26,18 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.coded_layout import Layout, SentBeam, beams_of, coded
 from heliotrope.plant.visits.expected_errors import expected_errors
 
-#: A beam keeps this many of its standard deviations from the border, and those of its place.
+#: A beam stays this many of its standard deviations, and of those of its position, from the border.
 _BORDER, _PLACED = 2.0, 3.0
-#: Numbers of codes, for 8 to 256 photographs with movements along both axes, for 8 to 128 along
-#: one.
+#: Possible numbers of codes, for 8 to 256 photographs with movements along both axes, for 8 to 128
+#: along one.
 _CODES = (3, 7, 15, 31, 63, 127)
-#: The verification's movements are up and down; those of first visits are to the right and left.
+#: Movements of a verification are up and down; those of first visits are to the right and left.
 _UP = 1
-#: The same in a first visit.
+#: The same for a first visit.
 _FIRST_BORDER, _FIRST_PLACED = 1.5, 1.5
-#: Standard deviations by which the light may exceed its expectation.
+#: Number of standard deviations by which the light may exceed its expected value.
 _ABOVE = 2.0
-#: Points across the target where its light is computed.
+#: Number of points across the target at which its light is computed.
 _ACROSS = 15
 #: First visits move to the right and left.
 _RIGHT = 0
@@ -54,9 +54,9 @@ def arranged(
     Parameters
     ----------
     plant
-        Knows mirrors, calibrations and the sun.
+        Plant with its heliostats, their calibrations and the sun.
     target, heliostats
-        The target, and names.
+        The target, and names of heliostats.
     settings
         See `JointSettings`.
     """
@@ -87,18 +87,18 @@ def verifying(
     *,
     own: bool = False,
 ) -> tuple[Layout, tuple[str, ...]]:
-    """Return the layout of a joint verification, and heliostats that can be verified later.
+    """Return the layout of a joint verification, and the heliostats to be verified later.
 
-    These would make the target too bright now.
+    The latter would make the target too bright now.
 
     Parameters
     ----------
     plant, target, settings
-        As for `arranged`.
+        As in `arranged`.
     errors
         Expected beam error of each heliostat with its new parameters, rad RMS (2-D).
     own
-        Whether each has a code of its own.
+        Whether each heliostat has its own code.
     """
     again = np.sqrt(2.0) * settings.visit
     all_errors = {name: float(np.hypot(error, again)) for name, error in errors.items()}
@@ -112,7 +112,7 @@ def verifying(
 def _darkened(
     target: Target, known: dict[str, SentBeam], settings: JointSettings
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return places, and the beams that make the target too bright; these are known no more."""
+    """Return places, and the beams that are too bright, which are removed from ``known``."""
     dazzling: list[str] = []
     while known:
         places = _places(target, known)
@@ -126,7 +126,7 @@ def _darkened(
 def _unknown(
     plant: PlantController, name: str, error: float, settings: JointSettings
 ) -> str | None:
-    """Return the reason, if any, why a beam with an expected error is not known well enough."""
+    """Return why a beam with an expected error is not known well enough, if that is the case."""
     if plant.beliefs.record(name) is None:
         return "it has no calibration yet; it is calibrated alone first"
     if error > settings.known:
@@ -146,12 +146,12 @@ def errors_on(
 ) -> dict[str, float]:
     """Return the expected errors of beams on a target, rad RMS (2-D), by heliostat.
 
-    NaN for one that cannot reach it, or was never calibrated and has no ``model``; see
+    NaN for a heliostat that cannot reach it, or was never calibrated and has no ``model``; see
     `expected_errors`.
     """
     aims = np.broadcast_to(target.center, (len(heliostats), 3))
     found = expected_errors(plant, heliostats, aims, model)
-    # The priors of a heliostat that was never calibrated hold what is drawn anew at each visit.
+    # The priors of a heliostat that was never calibrated include what is drawn anew at each visit.
     known = np.array([plant.beliefs.record(name) is not None for name in heliostats])
     found = np.hypot(found, known * np.sqrt(2.0) * settings.visit)
     return dict(zip(heliostats, found.tolist(), strict=True))
@@ -165,7 +165,7 @@ def _places(target: Target, known: Mapping[str, SentBeam]) -> FloatArray:
     low = np.minimum(corners.min(axis=0) + _BORDER * sigma + _PLACED * placed, 0.0)
     high = np.maximum(corners.max(axis=0) - _BORDER * sigma - _PLACED * placed, 0.0)
     size = high - low
-    # As many columns and rows as make the steps alike, in beams.
+    # The numbers of columns and rows that make the spacings equal, in units of the beam size.
     ratio = float(np.clip((size[0] / sigma[0] + 1e-9) / (size[1] / sigma[1] + 1e-9), 0.02, 50.0))
     columns = int(np.clip(round(float(np.sqrt(len(known) * ratio))), 1, len(known)))
     rows = -(-len(known) // columns)
@@ -177,9 +177,9 @@ def _places(target: Target, known: Mapping[str, SentBeam]) -> FloatArray:
 
 
 def _too_bright(known: Mapping[str, SentBeam], places: FloatArray, limit: float) -> str:
-    """Return the beam at the brightest place if that is above a limit, in suns; else "".
+    """Return the beam at the brightest place if it exceeds a limit, in suns; else "".
 
-    One that is alone may be as bright as in a visit of its own.
+    A single beam may be as bright as in a visit of its own.
     """
     if len(known) < 2:
         return ""
@@ -194,7 +194,7 @@ def bells(points: FloatArray, places: FloatArray, moments: FloatArray) -> FloatA
     Parameters
     ----------
     points, places
-        m right of and above the centre, (n, 2) and (M, 2).
+        Positions in m right of and above the centre, (n, 2) and (M, 2).
     moments
         Second moments of the beams, m², (M, 2, 2).
     """
@@ -207,10 +207,10 @@ def bells(points: FloatArray, places: FloatArray, moments: FloatArray) -> FloatA
 def _shared(
     known: Mapping[str, SentBeam], places: FloatArray, along: int | None
 ) -> npt.NDArray[np.intp]:
-    """Return the code of each beam: as few codes as keep beams of one code apart, (M,)."""
+    """Return the code of each beam, (M,), with as few codes as keep beams of one code apart."""
     spread = np.array([b.moments + b.variance * np.eye(2) for b in known.values()])
     for few in _CODES if len(known) else ():
-        # A stack of movements along one axis has twice as many codes.
+        # A series of movements along one axis has twice as many codes.
         code = shared_codes(places, spread, few if along is None else 2 * few + 1)
         if code is not None:
             return code
@@ -230,15 +230,15 @@ def newcomers(
     Parameters
     ----------
     plant
-        Knows mirrors and the sun.
+        Plant with its heliostats and the sun.
     target, heliostats
-        The target, and names of heliostats that are known badly, or were never calibrated.
+        The target, and names of heliostats that are poorly known or were never calibrated.
     settings
         See `JointSettings`.
     model
-        Names of the parameters whose priors say how far each beam may miss, by heliostat.
+        Names of the parameters whose priors determine how far each beam may miss, by heliostat.
     missed
-        Joint first visits in which a beam was not found, by heliostat.
+        Number of joint first visits in which a beam was not found, by heliostat.
     """
     sent, wrong = beams_of(
         plant, target, errors_on(plant, target, heliostats, settings, model), settings
@@ -258,7 +258,7 @@ def newcomers(
 
 
 def _first_places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:
-    """Return places, right of and above the centre, m, (M, 2); the surest go far out."""
+    """Return places, right of and above the centre, m, (M, 2); the best known go far out."""
     if not sent:
         return np.zeros((0, 2))
     half = np.abs(target.plane_coordinates(target.corners)).min(axis=0)
@@ -276,7 +276,7 @@ def _first_places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:
 
 
 def _brightest(target: Target, sent: Mapping[str, SentBeam], places: FloatArray) -> float:
-    """Return the most light at a place of the target that is to be reckoned with, in suns."""
+    """Return the most light that must be expected at a place of the target, in suns."""
     corners = target.plane_coordinates(target.corners)
     x, y = (np.linspace(low, high, _ACROSS) for low, high in zip(*_ends(corners), strict=True))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The model with which each heliostat of a running plant is fitted."""
+"""The model used to fit each heliostat of a running plant."""
 
 from heliotrope.calibration.learn.own_model import OwnModel, choose_own_model
 from heliotrope.calibration.sightings import Sightings
@@ -7,19 +7,19 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.visits.settings import SIMPLE, CycleSettings
 from heliotrope.plant.workers import Worker
 
-#: The model is chosen again when there are this many times as many sightings.
+#: The model is chosen again when the number of sightings has grown by this factor.
 MORE = 1.25
 
 
 class ModelOfEach:
-    """Models by heliostat, kept until there are many more sightings to choose from.
+    """Models by heliostat, kept until many more sightings are available for the choice.
 
     Parameters
     ----------
     settings
-        Its ``model`` is for all heliostats, unless it is "auto".
+        Settings, whose ``model`` applies to all heliostats unless it is "auto".
     worker
-        Compares the candidates.
+        Function that compares the candidates.
     """
 
     def __init__(self, settings: CycleSettings, worker: Worker) -> None:

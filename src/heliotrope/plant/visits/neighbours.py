@@ -21,7 +21,7 @@ from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.visits.photographs import Shot, TargetCamera
 from heliotrope.plant.workers import Worker
 
-#: An axis turns that is further than this from its goal, rad.
+#: An axis is turning if it is further than this from its goal, rad.
 _TURNS = 2e-3
 #: Step counts older than this leave the shift unknown, s.
 _OLD = 30.0
@@ -126,14 +126,14 @@ class Unhidden:
 
 
 class UnhiddenCamera:
-    """A camera of targets whose shots are corrected for what neighbours hide.
+    """A target camera whose shots are corrected for obstruction by neighbours.
 
     Parameters
     ----------
     camera
-        Takes the photographs.
+        Camera that takes the photographs.
     unhidden
-        Corrects them.
+        Corrects the photographs.
     """
 
     def __init__(self, camera: TargetCamera, unhidden: Unhidden) -> None:

@@ -22,13 +22,13 @@ from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.visits.swings import spread_at
 from heliotrope.plant.visits.visit import Visit
 
-#: Where the photographs after the first are taken: right and up, in turn.
+#: Positions of the photographs after the first: right and up, in turn.
 CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))
-#: Spare photographs: some may be cut off at the edge of the target.
+#: Number of spare photographs, because some may be cut off at the edge of the target.
 _SPARE = 2
-#: A light that was missed where it was expected has followed the aim this often, or is not used.
+#: A light that was absent where it was expected must have followed the aim this often to be used.
 _FOLLOWED = 2
-#: An aim this close to the one before is not sent, m.
+#: An aim this close to the previous one is not sent, m.
 _SAME = 0.05
 
 #: Called with the name of each step.
@@ -78,7 +78,7 @@ class Photographs:
     Attributes
     ----------
     used
-        Each with the step counts of the two axes, (2,), at its exposure.
+        Photographs, each with the step counts of the two axes, (2,), at its exposure.
     rejected
         Why other photographs were not used, in words.
     found
@@ -91,7 +91,7 @@ class Photographs:
 
 
 class Photographing(Protocol):
-    """A way to take the photographs of a visit."""
+    """A method of taking the photographs of a visit."""
 
     async def take(self, visit: Visit, tell: Tell) -> Photographs:
         """Photograph the beam of a heliostat that has arrived at its target."""
@@ -99,7 +99,7 @@ class Photographing(Protocol):
 
 
 class Plain:
-    """Photographs of the beam where it is, without search or centring."""
+    """Photographs of the beam in its present position, without search or centring."""
 
     def __init__(self, camera: TargetCamera, settings: CycleSettings) -> None:
         self._camera, self._settings = camera, settings
@@ -148,7 +148,7 @@ class Centred:
 
         Returns
         -------
-            How far it misses its aim, right and up, m, (2,), None if it was not found; and why.
+            Distance by which it misses its aim, right and up, m, (2,), None if not found; and why.
         """
         target = visit.target
         light = await self._find(visit, np.asarray(target.center), tell)
@@ -169,7 +169,7 @@ class Centred:
         return light.place - target.axes @ (light.first - target.center), ""
 
     async def _find(self, visit: Visit, before: FloatArray, tell: Tell) -> "_Light | None":
-        """Search for the beam and bring it near the middle; None if it is nowhere.
+        """Search for the beam and bring it near the middle; None if it is not found.
 
         ``before`` is the present aim.
         """
@@ -188,7 +188,7 @@ class Centred:
     async def _centre(
         self, visit: Visit, aim: FloatArray, place: FloatArray, tell: Tell
     ) -> "_Light":
-        """Move the aim by as much as the beam is off the middle."""
+        """Move the aim by the distance of the beam from the middle."""
         target = visit.target
         if np.linalg.norm(place) <= self._centring.near * min(target.width, target.height):
             return _Light(aim, aim, place)
@@ -201,13 +201,13 @@ class Centred:
     async def _series(
         self, visit: Visit, light: "_Light", taken: Photographs, tell: Tell
     ) -> FloatArray:
-        """Take the photographs of the beam that was found; end at once if it is another's.
+        """Take the photographs of the beam that was found; end at once if it is another beam.
 
         Returns the last aim.
         """
         plant, settings = visit.plant, self._settings
         aim, room = light.aim, room_of(visit, self._centring)
-        # Whether the beam was missing where it was expected, and how often it followed its aim.
+        # Whether the beam was absent where it was expected, and how often it followed its aim.
         missed, moves = False, 0
         last = light.aim
         for k in range(settings.shots + _SPARE):
@@ -225,7 +225,7 @@ class Centred:
                 taken.rejected.append(f"photograph {k + 1}: {astray or '; '.join(shot.reasons)}")
             if len(taken.used) >= settings.shots or (astray and not taken.used):
                 break
-            # A photograph that failed off the middle may succeed in the middle.
+            # A photograph that failed away from the middle may succeed in the middle.
             corner = np.array(CORNERS[k % len(CORNERS)]) * (room if good else 0.0)
             goal = np.asarray(light.aim + corner @ visit.target.axes)
             await self._go(visit, goal, aim)
@@ -233,13 +233,14 @@ class Centred:
             while plant.now() < due:
                 await visit.look()
         if missed and moves < min(_FOLLOWED, settings.shots - 1):
-            # Any light agrees with the place where it was found, and a passing one with the next.
+            # Any light agrees with the place where it was found, and passing light may agree with
+            # the next.
             taken.used.clear()
             taken.rejected.append("the light did not move with the aim often enough")
         return aim
 
     def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str | None:
-        """Return the reason why light is not the beam: a beam moves with its aim."""
+        """Return why light is not the beam, which moves with its aim."""
         place = seen(target, shot)
         if place is None:
             return None if shot.reasons else "no light on the target"
@@ -280,7 +281,7 @@ async def photographed(camera: TargetCamera, visit: Visit) -> Shot:
     Raises
     ------
     RefusedError
-        If it left its aim meanwhile.
+        If it left its aim in the meantime.
     """
     shot = await camera.photograph(visit.target, visit.heliostat)
     if visit.state != states.TRACKING:
@@ -291,19 +292,19 @@ async def photographed(camera: TargetCamera, visit: Visit) -> Shot:
 async def measured(visit: Visit, shot: Shot) -> tuple[Shot, FloatArray]:
     """Return a shot and the step counts at its exposure, (2,).
 
-    Its point is less sure where an axis may have been taking up its play; see `swings`.
+    Its point is less certain if an axis may have been taking up its backlash; see `swings`.
 
     Raises
     ------
     RefusedError
-        As `Visit.counts_at`.
+        As in `Visit.counts_at`.
     """
     counts = await visit.counts_at(shot.at)
     return shot.wider(spread_at(visit, shot.at, counts)), counts
 
 
 def seen(target: Target, shot: Shot) -> FloatArray | None:
-    """Return where a shot shows light, right of and above the centre, m, (2,); None: nowhere."""
+    """Return where a shot shows light, right of and above the centre, m, (2,), or None."""
     if not np.isfinite(shot.point).all():
         return None
     place = target.plane_coordinates(shot.point)
@@ -314,7 +315,7 @@ def seen(target: Target, shot: Shot) -> FloatArray | None:
 
 
 def spiral(count: int) -> Iterator[tuple[int, int]]:
-    """Yield the first places of a square spiral about (0, 0), which is left out."""
+    """Yield the first places of a square spiral about (0, 0), without (0, 0) itself."""
     x = y = 0
     step, turn, left = 1, 0, 1
     ways = ((1, 0), (0, 1), (-1, 0), (0, -1))

@@ -4,9 +4,8 @@ A few dozen heliostats that track the receiver move their beams by a milliradian
 code, while all others keep tracking. A camera observes the receiver. The movements are orders of
 the plant like any other, each proven before it is sent; the plant moves the beams back to their
 aims whatever happens to the visit (`movements`). A heliostat leaves the receiver only for new
-parameters that are worth it, a few heliostats at a time, and only if no photograph must confirm
-them. Changes that need confirmation, and heliostats with any fault, are left to a visit to a
-target.
+parameters that justify it, a few heliostats at a time, and only if no photograph must confirm them.
+Changes that need confirmation, and heliostats with any fault, are left to a visit to a target.
 """
 
 import asyncio
@@ -33,11 +32,11 @@ from heliotrope.plant.visits.receiver_layout import arranged_on
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, light_on
 from heliotrope.plant.visits.visit import Visit
 
-#: Longest time of a movement, and of the way back to the aims, s.
+#: Longest time for a movement, and for the return to the aims, s.
 _ORDER, _BACK = 20.0, 60.0
-#: Photographs that show whether the sun is steady, and the time between them, s.
+#: Number of photographs that show whether the sun is steady, and the interval between them, s.
 _LOOKS, _BETWEEN = 3, 2.0
-#: Least share of the receiver that a photograph shows below full scale.
+#: Smallest fraction of the receiver that a photograph must show below full scale.
 _SEEN = 0.5
 
 
@@ -117,7 +116,7 @@ class ReceiverCycle(CodedCycle):
         light: Light,
         tell: Tell,
     ) -> dict[str, CycleResult]:
-        """Learn from each proven beam; a mirror that leaves the receiver returns to its aim."""
+        """Learn from each proven beam; a heliostat that leaves the receiver returns to its aim."""
         del layout, light, tell
         plant = self._plant
         lit = plant.field.among((states.TRACKING,), plant.now())

@@ -32,9 +32,9 @@ def arranged_on(
     Parameters
     ----------
     plant
-        Knows mirrors, aims, calibrations and the sun.
+        Plant with its heliostats, their aims and calibrations, and the sun.
     face, heliostats
-        The face of the receiver, and names.
+        The face of the receiver, and names of heliostats.
     settings
         See `ReceiverSettings`.
     """
@@ -81,7 +81,7 @@ def arranged_on(
                 f"with its movements the visit would cost more than {100.0 * settings.power:g} % "
                 "of the power on the receiver"
             )
-    # On a receiver all beams overlap, so that each has a code of its own.
+    # On a receiver all beams overlap, so each has its own code.
     own = np.arange(len(known), dtype=np.intp)
     where = np.array([places[name] for name in known]).reshape(-1, 2)
     powers = np.array([beam.power for beam in known.values()])
@@ -90,7 +90,7 @@ def arranged_on(
 
 
 def sunlight_on(plant: PlantController, face: Target) -> float:
-    """Return the light that is sent to a receiver now, in square metres of sunlight."""
+    """Return the light that is now sent to a receiver, in square metres of sunlight."""
     field = plant.field
     rows = np.flatnonzero(field.among((states.TRACKING,), plant.now()) & face.holds(plant.aims))
     if not len(rows):
@@ -102,7 +102,7 @@ def sunlight_on(plant: PlantController, face: Target) -> float:
 
 
 def caught(face: Target, place: FloatArray, moments: FloatArray) -> float:
-    """Return the share of a beam that a face catches."""
+    """Return the fraction of a beam that a face catches."""
     corners = face.plane_coordinates(face.corners)
     low, high = corners.min(axis=0), corners.max(axis=0)
     share = 1.0

@@ -11,18 +11,18 @@ from heliotrope.plant.controller import PlantController
 
 Rows = npt.NDArray[np.intp]
 
-#: A coded movement has at least this many of the steps in which a beam follows its aim. The ends of
-#: a movement are each off by half a step at most, so its size is off by a quarter; a beam that
-#: moves by 0.3 more or less than its light says is taken for two (`imaging.coded`).
+#: Minimum size of a coded movement, in steps in which a beam follows its aim. Each end of a
+#: movement is off by at most half a step, so its size is off by a quarter. A beam whose movement
+#: differs by 0.3 from what its light indicates is taken for two beams (`imaging.coded`).
 LEAST_STEPS = 2.0
-#: Steps over which a beam's motion is a straight line.
+#: Number of steps over which a beam's motion is a straight line.
 _STRAIGHT = 10.0
 
 
 def beam_slopes(
     plant: PlantController, row: int | Rows, target: Target, sun: FloatArray, counts: FloatArray
 ) -> FloatArray:
-    """Return how far a step of each drive moves beams on a target, ENU, m, (..., 2, 3).
+    """Return the displacement of beams on a target by a drive step, ENU, m, (..., 2, 3).
 
     Parameters
     ----------
@@ -50,13 +50,13 @@ def beam_steps(
 ) -> FloatArray:
     """Return the steps in which beams follow their aims, m right and up on the target, (K, 2).
 
-    In fine stepping a drive stops at whole counts. One that has play follows a goal that goes down
-    only once it has gone by the lead (`AxisLimits.lead`).
+    In fine stepping a drive stops at whole counts. A drive with backlash follows a goal that moves
+    down only once the goal has moved by the lead (`AxisLimits.lead`).
 
     Parameters
     ----------
     plant, target, sun
-        As for `beam_slopes`.
+        As in `beam_slopes`.
     rows, aims
         Rows of the heliostats, (K,), and aims of their beams, ENU, m, (K, 3).
     """

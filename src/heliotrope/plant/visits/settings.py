@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from heliotrope.errors import InputError
 
-#: The model of a heliostat with few sightings where the model is "auto".
+#: The model for a heliostat with few sightings if the model is "auto".
 SIMPLE = "malan8+canting"
 
 

@@ -17,10 +17,12 @@ from heliotrope.mechanism.machine import AxisLimits
 from heliotrope.plant.visits.resolution import beam_slopes
 from heliotrope.plant.visits.visit import Visit
 
-#: Mean square over time of a motion that speeds up and slows down evenly, of its length.
+#: Time average of the squared distance in a motion that speeds up and slows down evenly, as a
+#: fraction of its squared length.
 _MEAN_SQUARE = 23.0 / 60.0
-#: The variance of the mixture is taken this many times: its own, with one photograph of five in a
-#: swing, would leave the deepest point 3.5 standard deviations away; this leaves it 2 away.
+#: Factor applied to the variance of the mixture. With one photograph in five within a swing, the
+#: variance itself would leave the deepest point 3.5 standard deviations away; with this factor it
+#: is 2.
 _TAIL = 3.0
 
 
@@ -30,13 +32,14 @@ def swung(axis: AxisLimits, fall: float, span: float, heard: float = math.inf) -
     Parameters
     ----------
     axis
-        Of the machine.
+        Axis of the machine.
     fall
-        Steps by which its goal fell between two reports from its goals; 0 or less: it did not.
+        Steps by which its goal dropped between two reports at its goals; 0 or less: it did not
+        drop.
     span
         Time between the reports, s.
     heard
-        Time from the instant to the nearest report from beside its goal, s.
+        Time from the instant to the nearest report away from its goal, s.
     """
     if axis.backlash == 0 or not (fall > 0.0 and span > 0.0):
         return 0.0
@@ -56,16 +59,16 @@ def _lasts(axis: AxisLimits, steps: float) -> float:
 
 
 def spread_at(visit: Visit, instant: float, counts: FloatArray) -> FloatArray:
-    """Return the covariance of a beam on the visit's target by swings at an instant, m², (3, 3).
+    """Return the covariance of a beam on the visit's target due to swings, m², (3, 3).
 
     Parameters
     ----------
     visit
-        With the reports before and after the instant.
+        Visit with the reports before and after the instant.
     instant
         Monotonic s.
     counts
-        Step counts then, (2,).
+        Step counts at the instant, (2,).
     """
     plant, row, target = visit.plant, visit.row, visit.target
     machine, (falls, span) = plant.beams.machines.get(visit.heliostat), visit.fell(instant)

@@ -17,10 +17,10 @@ from heliotrope.imaging.targets.view import FaceView
 from heliotrope.plant.visits.photographs import TargetCamera
 
 T = TypeVar("T")
-#: A pixel is left out that is at full scale by this share in any photograph.
+#: A pixel is left out if it is clipped to at least this degree in any photograph.
 _FULL = 0.01
-#: A beam is joined whose power differs from that of the others, for its mirror's size, by this
-#: share, and by this many of their standard deviations.
+#: A beam is joined with other light if its power, relative to the size of its mirror, differs from
+#: that of the others by this fraction and by this many of their standard deviations.
 _OTHER, _SIGMAS = 0.4, 4.0
 
 
@@ -35,15 +35,15 @@ class TargetLight:
     step
         Size of a pixel, m.
     first
-        Place of the first pixel's centre, m right of and above the target's centre, (2,).
+        Position of the first pixel's centre, m right of and above the target's centre, (2,).
     seen
-        Pixels that show bare paint of the target, none at full scale, (H, W).
+        Mask of the pixels that show bare paint of the target below full scale, (H, W).
     exposure
         Exposure times gain.
     at
         Middle of the exposure, s of the plant's monotonic clock.
     view
-        How the target's face lies in the frame; None where no frame was taken.
+        Position of the target's face in the frame; None if no frame was taken.
     shift
         The target's centre in the plane of the face, m, (2,).
     """
@@ -77,7 +77,7 @@ class TargetLight:
         return float(self.values[self.seen].mean()) / self.exposure
 
     def covariance_at(self, place: FloatArray) -> FloatArray:
-        """Return the covariance of a place (2,) on the target by the view's error, m², (2, 2)."""
+        """Return the covariance of a position (2,) on the target by the view error, m², (2, 2)."""
         if self.view is None:
             return np.zeros((2, 2))
         return self.view.covariance_at(np.asarray(place) + self.shift)
@@ -95,9 +95,10 @@ def separated(
     Parameters
     ----------
     pictures, empty
-        The light in K photographs, and that of the surface without beams; None: it is never seen.
+        The light in K photographs, and the light of the surface without beams; None: never
+        observed.
     moves, beams
-        Movements, m right and up, (K, M, 2), and the beams as they are expected.
+        Movements, m right and up, (K, M, 2), and the expected beams.
     powers
         See `judged`; None: the powers of beams are not compared.
     """
@@ -115,16 +116,16 @@ def separated(
 
 
 def judged(beams: Sequence[SeparatedBeam], powers: FloatArray) -> list[SeparatedBeam]:
-    """Return beams (M,); those are joined whose power does not fit the size of their mirrors.
+    """Return beams (M,), with those marked as joined whose power does not fit their mirror size.
 
-    How bright a mirror shows is not known before, but it is alike for all of them.
+    The apparent brightness of the mirrors is not known in advance, but it is the same for all.
 
     Parameters
     ----------
     beams
-        As they were separated.
+        Beams as they were separated.
     powers
-        Expected, in any one unit, (M,).
+        Expected powers, in any common unit, (M,).
     """
     proven = np.array([beam.verdict is Verdict.PROVEN for beam in beams], dtype=np.bool_)
     if not proven.any():
@@ -143,14 +144,14 @@ def judged(beams: Sequence[SeparatedBeam], powers: FloatArray) -> list[Separated
 
 @dataclass(frozen=True)
 class Exposed:
-    """A photograph that has been taken, and is read while the beams move on.
+    """A photograph that has been taken, and is evaluated while the beams move on.
 
     Attributes
     ----------
     at
         Middle of the exposure, s of the plant's monotonic clock.
     light
-        Gives the light on the target, or raises why there is none.
+        Future light on the target; it raises the reason if there is none.
     """
 
     at: float
@@ -158,19 +159,19 @@ class Exposed:
 
     @classmethod
     def read(cls, light: TargetLight) -> "Exposed":
-        """Return a photograph that is read already."""
+        """Return a photograph that has already been evaluated."""
         done: asyncio.Future[TargetLight] = asyncio.get_running_loop().create_future()
         done.set_result(light)
         return cls(light.at, done)
 
 
 class LightCamera(TargetCamera, Protocol):
-    """A camera that gives the light on targets."""
+    """A camera that measures the light on targets."""
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
         """Photograph a target, and return as soon as the photograph is taken.
 
-        With the view of an earlier photograph the target is not searched for.
+        If the view of an earlier photograph is passed, the target is not searched for.
         """
         ...
 
@@ -183,7 +184,7 @@ async def light_on(
 
 
 async def noting(look: Callable[[], Awaitable[None]], made: Awaitable[T]) -> T:
-    """Return the result of work, and poll the heliostats meanwhile.
+    """Return the result of work, polling the heliostats in the meantime.
 
     Raises
     ------
@@ -201,7 +202,7 @@ async def noting(look: Callable[[], Awaitable[None]], made: Awaitable[T]) -> T:
         try:
             found.append(await made)
         except HeliotropeError as error:
-            found.append(error)  # a group would wrap it
+            found.append(error)  # a task group would wrap the error
         looking.cancel()
     if isinstance(found[0], HeliotropeError):
         raise found[0]

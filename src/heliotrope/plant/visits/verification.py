@@ -3,7 +3,7 @@
 A fit explains whatever the photographs show, stray light as well as the beam. The heliostat
 therefore returns to the target with its new parameters, to a position away from all earlier
 photographs, and its beam must be where they predict it. The photograph tests a fit that has not
-used it; once it has confirmed the fit, it is a sighting like any other.
+used it; once it has confirmed the fit, it becomes a sighting like any other.
 """
 
 import asyncio
@@ -37,7 +37,7 @@ from heliotrope.plant.visits.visit import Visit
 
 
 class Confirming(Protocol):
-    """A way to confirm new parameters that a local controller stores."""
+    """A method of confirming new parameters that a local controller stores."""
 
     async def __call__(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
@@ -48,7 +48,7 @@ class Confirming(Protocol):
 
 @dataclass(frozen=True)
 class Prediction:
-    """The distance of a beam from the place that a fit predicts.
+    """The distance of a beam from the position that a fit predicts.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Prediction:
         Parameters
         ----------
         mechanism
-            With the fitted parameters, batch shape (1,).
+            Mechanism with the fitted parameters, batch shape (1,).
         fitted
             The fit, of batch shape (1,).
         made
@@ -82,7 +82,7 @@ class Prediction:
         """
         line = linearise(mechanism, made, tuple(fitted.names))
         slope = line.jacobian[0]
-        # The whitened residual has unit noise of its own, beside that of the parameters.
+        # The whitened residual has unit noise of its own, in addition to that of the parameters.
         spread = np.eye(2) + slope @ fitted.covariance[0] @ slope.T
         residual = line.residual[0]
         deviations = float(np.sqrt(residual @ np.linalg.solve(spread, residual)))
@@ -102,7 +102,7 @@ class Verification:
     settings, centring
         See their classes.
     sighting
-        Makes a sighting of a shot and the step counts at its exposure.
+        Function that creates a sighting from a shot and the step counts at its exposure.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Verification:
         self._confirmed: dict[str, Photographs] = {}
 
     def confirmed(self, heliostat: str) -> Photographs | None:
-        """Return the photograph that confirmed the last fit of a heliostat, once; None: none."""
+        """Return the photograph that confirmed the last fit of a heliostat, once; None if none."""
         return self._confirmed.pop(heliostat, None)
 
     def judge(
@@ -132,14 +132,14 @@ class Verification:
     ) -> str | None:
         """Return the reason why the new parameters are not confirmed, None if they are.
 
-        The heliostat stores them already. It is at standby before and after.
+        The heliostat already stores them. It is at standby before and after.
 
         Parameters
         ----------
         visit
-            Of the heliostat.
+            Visit of the heliostat.
         fitted, nominal
-            The fit of batch shape (1,), and the mechanism that it starts from.
+            The fit of batch shape (1,), and the mechanism from which it starts.
         used
             The photographs that the fit used in this visit.
         tell
@@ -150,7 +150,7 @@ class Verification:
         RefusedError
             If a command is refused, or the heliostat does not carry it out.
         """
-        # Of several that are verified after a joint visit, one goes to the target at a time.
+        # If several heliostats are verified after a joint visit, one goes to the target at a time.
         async with self._alone.setdefault(visit.target.name, asyncio.Lock()):
             return await self._photographed(visit, fitted, nominal, used, tell)
 
@@ -191,14 +191,14 @@ class Verification:
 def apart(target: Target, points: list[FloatArray], room: float) -> FloatArray:
     """Return the aim on a target that is farthest from points already photographed, (3,).
 
-    A false light that stands still cannot be where the beam is predicted there.
+    Stray light that does not move cannot be at the predicted position of the beam there.
 
     Parameters
     ----------
     target
         The target.
     points
-        Places of the photographs, ENU, m, each (3,).
+        Positions of the photographs, ENU, m, each (3,).
     room
         How far the beam may be moved off the middle, right and up, m.
     """

@@ -26,15 +26,16 @@ from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.orders.authority import Mandate, RefusedError
 from heliotrope.plant.orders.tickets import Ticket
 
-#: Gives an order to some heliostats.
+#: Function that issues an order to some heliostats.
 Order = Callable[[tuple[str, ...]], Ticket]
 
-#: A mirror has arrived when both axes are this close (rad) to their goals, in two rows running.
+#: A heliostat has arrived when both axes are this close (rad) to their goals in two consecutive
+#: reports.
 ARRIVED = 3e-4
-#: Longest silence of a mirror after a command is done, and longest time for which a reason that
-#: ends by itself may hold an order up, s.
+#: Longest silence of a heliostat after a command is done, and longest time for which a reason that
+#: ends by itself may delay an order, s.
 SILENT = 10.0
-#: Time between looks at the field, s.
+#: Interval between checks of the field, s.
 _LOOK = 0.25
 
 
@@ -45,21 +46,22 @@ async def carried_out(
     limit: float,
     look: Callable[[], Awaitable[None]],
 ) -> dict[str, str]:
-    """Give heliostats an order and wait until it is done; return those that fail, and why.
+    """Issue an order to heliostats and wait until it is done; return those that fail, and why.
 
-    What ends by itself within seconds ends no visit: a heliostat that is refused for such a reason
-    (`refusals.SOON`) gets the order again, until nothing has changed for `SILENT` s.
+    A reason that ends by itself within seconds does not end a visit: a heliostat that is refused
+    for such a reason (`refusals.SOON`) gets the order again, until nothing has changed for `SILENT`
+    s.
 
     Parameters
     ----------
     plant, heliostats
         The plant, and the names.
     order
-        Gives the order to some of them.
+        Function that issues the order to some of them.
     limit
-        Time in which it must be done once it is accepted, s.
+        Time within which it must be done once it is accepted, s.
     look
-        Waits a little between two attempts.
+        Function that waits a little between two attempts.
 
     Raises
     ------
@@ -102,7 +104,7 @@ class BroughtHome(ABC):
 
     @abstractmethod
     async def home(self) -> None:
-        """Bring it home, or off the target; raise RefusedError if the plant refuses."""
+        """Bring the heliostats home, or off the target; raise RefusedError if the plant refuses."""
 
     async def __aenter__(self) -> Self:
         """Begin the visit; at its end the heliostats are brought home."""
@@ -176,24 +178,24 @@ class Visit(BroughtHome):
         return int(self.plant.field.rows["state"][self.row])
 
     async def obey(self, what: str, order: Order, limit: float) -> None:
-        """Give an order, and wait until it is done and a later report has arrived.
+        """Issue an order, and wait until it is done and a later report has arrived.
 
         Parameters
         ----------
         what, order
-            The command, for display, and the function that gives it; see `carried_out`.
+            The command, for display, and the function that issues it; see `carried_out`.
         limit
             s.
 
         Raises
         ------
         RefusedError
-            If it is refused, or not done within ``limit`` s, or no report follows; or if another
-            order has removed the heliostat from the visit.
+            If the order is refused, or not done within ``limit`` s, or no report follows; or if
+            another order has removed the heliostat from the visit.
         """
         if failed := await carried_out(self.plant, order, self.names, limit, self.look):
             raise BeamError(what, failed)
-        # The row in the table may be older than the end of the command.
+        # The report in the table may be older than the end of the command.
         ended = self.plant.now()
         while self.plant.field.heard[self.row] <= ended:
             if self.plant.now() - ended > SILENT:
@@ -203,12 +205,12 @@ class Visit(BroughtHome):
     async def command(
         self, name: str, values: tuple[float, ...] = (), limit: float = 120.0
     ) -> None:
-        """Give the heliostat a command and wait until it is done; see `obey`."""
+        """Send the heliostat a command and wait until it is done; see `obey`."""
         person, token, plant = self.mandate.person, self.mandate.token, self.plant
         await self.obey(name, lambda some: plant.command(person, token, name, some, values), limit)
 
     async def aim(self, point: FloatArray, limit: float = 120.0) -> None:
-        """Give the heliostat an aim and wait until it has accepted it; see `obey`."""
+        """Send the heliostat an aim and wait until it has accepted the aim; see `obey`."""
         person, token, plant = self.mandate.person, self.mandate.token, self.plant
         await self.obey(
             "AIM", lambda some: plant.aim(person, token, dict.fromkeys(some, point)), limit
@@ -311,10 +313,12 @@ class Visit(BroughtHome):
 
     def note(self) -> None:
         """Note the last reported step counts, if they are new."""
-        # Counts may be polled less often than the state; their own age says when they were true.
+        # Counts may be polled less often than the state; their own age gives their time of
+        # validity.
         counted = float(self.plant.field.counted_at[self.row])
         node = self.plant.field.rows[self.row]
-        # The age of a row jitters with the delay of its message: not every change is a new answer.
+        # The age of a report jitters with the delay of its message, so not every change is a new
+        # reply.
         if np.isfinite(counted) and (not self._times or counted > self._times[-1] + _LOOK):
             self._times.append(counted)
             self._counts.append(np.array([node["primary"], node["secondary"]], dtype=np.float64))
@@ -351,9 +355,10 @@ class Visit(BroughtHome):
         return np.asarray(counts[after - 1] + share * (counts[after] - counts[after - 1]))
 
     def fell(self, instant: float) -> tuple[FloatArray, float]:
-        """Return how far the goals dropped around an instant, steps, (2,), and within what time, s.
+        """Return how far the goals dropped around an instant, steps, (2,), and in what time, s.
 
-        Between the reports before and after the instant that `counts_at` uses and has waited for.
+        This is between the reports before and after the instant that `counts_at` has used and
+        awaited.
         """
         times = self._heard_there()
         goals = [row for row, there in zip(self._goals, self._there, strict=True) if there]
@@ -366,12 +371,12 @@ class Visit(BroughtHome):
         return min((abs(at - instant) for at, there in rows if not there), default=math.inf)
 
     def _heard_there(self) -> list[float]:
-        """Return the times of the rows in which both axes are at their goals."""
+        """Return the times of the reports in which both axes are at their goals."""
         return [at for at, there in zip(self._times, self._there, strict=True) if there]
 
     @property
     def counted(self) -> tuple[FloatArray, FloatArray]:
-        """The times, monotonic s, (R,), and the step counts, (R, 2), that were noted."""
+        """The recorded times, monotonic s, (R,), and step counts, (R, 2)."""
         return np.array(self._times), np.array(self._counts).reshape(-1, 2)
 
     def taken_off(self) -> None:
