@@ -64,7 +64,7 @@ def worths(first, last, mirrors, images, shifts, price, spans, out):
 
 @njit(**_INNER_SUMS)
 def _rectangle(i, a, images, shifts, number):
-    """First column, columns, first row, end row, and place and height of a candidate's cells."""
+    """First column, columns, first row, end row, and position and height of a candidate's cells."""
     _, begin, box, looks, _ = images
     count = shifts.shape[1]
     j = i * looks + a // count
@@ -188,7 +188,7 @@ def _above(i, a, images, shifts, flux, cap):
 
 @njit(**_SUMS)
 def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
-    """Let each mirror in turn take the candidate of most power less a fine; returns the changes.
+    """Let each mirror in turn take the best candidate after penalties; return the changes.
 
     ``fine``: penalty on the excess that a candidate adds, W per W/m². ``idle``: the value of
         sending no light, W. Without

@@ -309,7 +309,7 @@ class _Walk:
         return moves
 
     def _batch(self, ways: dict[int, Way]) -> list[int]:
-        """Return the mirrors that move next: those that relieve the fullest cells come first."""
+        """Return the mirrors that move next; those that relieve the fullest cells come first."""
         fullness = (self._flux / np.maximum(self._cap, 1.0)) ** 8
         gain = {row: float(((after - b) * fullness).sum()) for row, (b, _, after) in ways.items()}
         bound = self._flux.copy()
@@ -337,7 +337,7 @@ class _Walk:
         return stuck[: min(self._now.together, self._now.most - self._moved)]
 
     def relieved(self, rows: Rows) -> list[Move]:
-        """Return the smallest set of mirrors whose rest brings all cells back under the limit."""
+        """Rest a few mirrors while cells are above the limit, the most effective first."""
         moves: list[Move] = []
         while len(rows):
             over = np.maximum(self._flux - (1.0 + HOLDS) * self._cap, 0.0)
