@@ -138,7 +138,7 @@ class ExactCamera:
         """Do nothing: there are no pictures."""
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return where a heliostat's beam is on a target; NaN where it is far from it."""
+        """Return the position of a heliostat's beam on a target; NaN if the beam is far away."""
         at = await self._sight.exposure()
         mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
         sun = self._sight.sun()
@@ -160,7 +160,7 @@ class ExactCamera:
         return Exposed.read(light)
 
     async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on a target: each beam a Gaussian at its true place, with noise."""
+        """Return the light on a target: a Gaussian at each beam's true position, with noise."""
         del view
         at, sun = await self._sight.exposure(), self._sight.sun()
         corners = target.plane_coordinates(target.corners)
@@ -362,7 +362,7 @@ class RenderedCamera:
         return Exposed(at, asyncio.create_task(read()))
 
     def beams(self, target: Target) -> tuple[Thrown, ...]:
-        """Return the beams on a target, and those beside it that a frame would show, now."""
+        """Return the present beams on a target, and those beside it that a frame would show."""
         return thrown(target, self._sight.mirrors(), self._sight.sun(), self._optics)
 
     def _known_of(self, name: str) -> tuple[Camera, Target]:

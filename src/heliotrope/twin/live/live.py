@@ -340,7 +340,7 @@ class World:
             self.field.advance(50 * ticks)
 
     def put_up(self) -> None:
-        """Put a field of arrays on track, as on a working day; a plant must control it."""
+        """Set a field of arrays to tracking, as on a working day; a plant must control it."""
         gps = gps_seconds(self.clock.utc())
         utc = self.clock.utc().timestamp()
         values = sun.broadcast_values(round(gps), utc, self.design.site)
@@ -389,7 +389,7 @@ def _installed(group: Heliostats, options: WorldOptions, number: int) -> Mechani
 
 
 def together(parts: Sequence[Mechanism]) -> Mechanism:
-    """Return arrays of mechanisms as one array; several kinds become armatures with drives."""
+    """Return arrays of mechanisms as one array; different kinds become armatures with drives."""
     if len(parts) == 1:
         return parts[0]
     return kinds.of_armature(

@@ -54,7 +54,7 @@ class _Pace(selectors.DefaultSelector):
         return list(events)
 
     def _advance(self, most: float) -> None:
-        """Advance time, to the next timer at ``most`` and not beyond `until`."""
+        """Advance time, but not beyond the next timer at ``most`` or beyond `until`."""
         target = self._target()
         self.lag += max(0.0, target - most - LATE, target - max(self.until, self.now))
         self.now = max(self.now, min(target, most, self.until))

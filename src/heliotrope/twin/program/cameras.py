@@ -54,7 +54,7 @@ class TwinCameras:
                 self._scenes[camera.name] = Scene(camera, seen)
 
     def wait(self) -> None:
-        """Wait until it draws, which takes some seconds at first; to be called in a thread."""
+        """Wait until the rendering process is ready, at first some seconds; call it in a thread."""
         for name in list(self._scenes)[:1]:
             self.photograph(name)
 

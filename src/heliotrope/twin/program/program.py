@@ -109,7 +109,7 @@ class TwinProgram:
         self._parts: _Parts | None = None
 
     def loop(self) -> asyncio.AbstractEventLoop:
-        """Return a new event loop for it, whose time does not advance until the field starts."""
+        """Return a new event loop for the program, whose time stands until the field starts."""
         if self._options.start is None:
             return asyncio.SelectorEventLoop()
         loop = PacedLoop(self._options.speed)
