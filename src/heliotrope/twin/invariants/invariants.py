@@ -280,7 +280,7 @@ class Judge:
     def on_progress(self, message: Progress, now: float) -> None:
         """Note a report to the plant about a command."""
 
-    # -- the plant's program and its persons -------------------------------------------------
+    # -- the plant's program and its operators -------------------------------------------------
 
     def on_alarm(self, alarm: Alarm, now: float) -> None:
         """Note an alarm of the plant."""
@@ -291,10 +291,10 @@ class Judge:
     def on_accepted(
         self, person: Person, token: int, ticket: Ticket, what: str, now: float
     ) -> None:
-        """Note a command of a person that the plant has accepted."""
+        """Note a command of an operator that the plant has accepted."""
 
     def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
-        """Note DEFOCUS or STOW by a person, which needs no authority."""
+        """Note DEFOCUS or STOW by an operator, which needs no authority."""
 
     def on_refused(
         self, person: Person, token: int, asked: tuple[str, Sequence[str]], reason: str, now: float
@@ -302,7 +302,7 @@ class Judge:
         """Note a refusal of a command (name and heliostats), and its reason."""
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an emergency that a person has raised."""
+        """Note an emergency that an operator has raised."""
 
 
 class Observer(Judge):
