@@ -249,7 +249,7 @@ def bisector(source: npt.ArrayLike, destination: npt.ArrayLike) -> FloatArray:
     """Return the unit normal that sends light from ``source`` towards ``destination``.
 
     Law of reflection: n ∥ s + t, where s and t are unit vectors (..., 3) that point away from the
-        mirror.
+    mirror.
 
     Raises
     ------

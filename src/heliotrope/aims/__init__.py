@@ -2,10 +2,10 @@
 
 - `FluxLimit`: the allowable flux on a receiver, a number or a map (`heliotrope.field.flux_limit`).
 - `candidates` and `optimiser`: images of each mirror at a few aims, and the choice that maximises
-power.
+  power.
 - `errors`: the uncertainty of the flux due to each mirror's own error and to shared errors.
 - `scene_aims`: aims for a scene; `plan`: aims for a plant; `strategies`: simpler strategies for
-comparison.
+  comparison.
 
 Begin with `plan_aims`, which is `heliotrope.aim`.
 """

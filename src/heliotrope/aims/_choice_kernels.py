@@ -191,7 +191,7 @@ def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
     """Let each mirror in turn take the best candidate after penalties; return the changes.
 
     ``fine``: penalty on the excess that a candidate adds, W per W/m². ``idle``: the value of
-        sending no light, W. Without
+    sending no light, W. Without
     ``fill`` only mirrors that add to an excess change.
     """
     changed = 0

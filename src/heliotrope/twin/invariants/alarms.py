@@ -119,7 +119,7 @@ class AlarmObserver(Judge):
         """Note an alarm of the plant; it is judged at the next check.
 
         The same alarm may arrive twice: from the controller, and from the logbook, which also
-            contains the alarms of automatic control.
+        contains the alarms of automatic control.
         """
         key = alarm.condition, alarm.subject
         if self._last.get(key) == alarm:

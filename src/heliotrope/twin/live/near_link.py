@@ -1,7 +1,7 @@
 """A link between plant and cluster within one process, without delay or loss.
 
 For whole fields: with hundreds of clusters, the heartbeats of real links would cost more than all
-    other work. `links.in_process` simulates the effects of a real line on messages.
+other work. `links.in_process` simulates the effects of a real line on messages.
 """
 
 import asyncio
