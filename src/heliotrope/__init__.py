@@ -137,14 +137,14 @@ _HOMES = {
     "write_report": "heliotrope.calibration",
     "write_sightings": "heliotrope.calibration",
 }
-#: Names that are shorter here than in their modules.
+#: Public names that are shorter than the names in their modules.
 _SHORT = {
     "aim": "plan_aims",
     "compare": "compare_models",
     "flux": "field_flux",
     "open": "open_plant",
 }
-#: Modules that are used as such.
+#: Names that stand for a whole module.
 _MODULES = {
     "aims": "heliotrope.aims",
     "geometry": "heliotrope.geometry",
@@ -218,7 +218,7 @@ __all__ = [
     "write_solarpilot",
 ]
 
-# Hidden from type checkers, for which every misspelt name would otherwise be there.
+# Hidden from type checkers, because with it they would accept every misspelt name.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:

@@ -18,12 +18,12 @@ import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-#: Longest value in an error, in characters.
+#: Longest value that an error message quotes, in characters.
 _LONGEST = 60
 
 
 def shown(value: object) -> str:
-    """Return a value as an error shows it: in one line, and not too long."""
+    """Return a value as an error message quotes it: on one line, shortened if need be."""
     text = " ".join(repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
@@ -35,17 +35,17 @@ def kind_of(value: object) -> str:
     return f"{'an' if text[0].lower() in 'aeiou' else 'a'} {text}"
 
 
-#: Kinds of things that are often named after their kind.
+#: Kinds of object whose names often include the kind.
 _DOUBLED = re.compile(r"\b(receiver|target|camera|cluster|sensor|heliostat|group) \1\b")
 
 
 def once(text: str) -> str:
-    """Return a text in which a kind that its name repeats stands once: no "receiver receiver"."""
+    """Return the text with repeated kinds removed, so that no error says "receiver receiver"."""
     return _DOUBLED.sub(r"\1", text)
 
 
 class HeliotropeError(Exception):
-    """Root of everything that Heliotrope raises on purpose."""
+    """Base class of all exceptions that Heliotrope raises on purpose."""
 
 
 class InputError(HeliotropeError, ValueError):
@@ -53,12 +53,12 @@ class InputError(HeliotropeError, ValueError):
 
 
 def require(name: str, value: object, kind: type | tuple[type, ...], advice: str) -> None:
-    """Refuse an argument of another type, by its name.
+    """Raise an error that names the argument if its type is wrong.
 
     Raises
     ------
     InputError
-        The text says what it is, and the advice: what to give.
+        The message says what the argument is, and advises what to pass instead.
     """
     counted = kind in (numbers.Integral, numbers.Real) and isinstance(value, bool)
     if counted or not isinstance(value, kind):

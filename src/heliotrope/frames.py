@@ -1,8 +1,8 @@
 """Array records as tables and as labelled arrays: pandas and xarray.
 
-A class declares once which axes its arrays have (`Labelled`); the data frame and the dataset follow
-from that. Units are stored in ``attrs``: for each variable of a dataset (``units``), and for a
-frame in ``frame.attrs["units"]`` by column. Times are UTC.
+A class declares once which axes its arrays have (`Labelled`); the data frame and the dataset are
+built from this declaration. Units are stored in ``attrs``: for each variable of a dataset
+(``units``), and for a frame in ``frame.attrs["units"]`` by column. Times are UTC.
 """
 
 from abc import abstractmethod
@@ -28,7 +28,7 @@ ACROSS = ("right", "up")
 
 @dataclass(frozen=True)
 class Variable:
-    """An array with the names of its axes, and its unit ("" for none) or those along the last."""
+    """An array with its axis names and its unit ("" for none) or the units along its last axis."""
 
     axes: tuple[str, ...]
     values: npt.ArrayLike
@@ -36,7 +36,7 @@ class Variable:
 
     @property
     def units(self) -> str:
-        """The unit, or those along the last axis in their order."""
+        """Return the unit, or the units along the last axis in order."""
         return self.unit if isinstance(self.unit, str) else ", ".join(u or "1" for u in self.unit)
 
 
@@ -49,15 +49,15 @@ class Labelled:
     rows
         The axes that make the rows of a frame; the others become columns.
     labels
-        Labels of each axis.
+        Labels along each axis.
     variables
         By name.
     large
-        Names that only the dataset has, because they would be many columns.
+        Variables that only the dataset has, because a frame would need too many columns for them.
     notes
-        Attributes of the whole.
+        Attributes of the whole frame or dataset.
     on_request
-        Names that a frame has only if it is full, because few readers need them.
+        Variables that only a full frame has, because few readers need them.
     """
 
     rows: tuple[str, ...]
@@ -69,7 +69,7 @@ class Labelled:
 
 
 class Framed:
-    """Base of records that can be given as a frame or as a dataset."""
+    """Base class of records that convert to a data frame or a dataset."""
 
     @abstractmethod
     def _labelled(self) -> Labelled:
@@ -149,14 +149,14 @@ def batched(
     labels: Mapping[str, npt.ArrayLike],
     large: frozenset[str] = frozenset(),
 ) -> Labelled:
-    """Return arrays of a batch with a row for each of its objects.
+    """Return the arrays of a batch with one row for each object.
 
     Parameters
     ----------
     shape
         The batch shape; the batch axes of the arrays are broadcast to it.
     own
-        Arrays by name, with the axes behind those of the batch.
+        Arrays by name, with the axes that follow the batch axes.
     labels
         Labels of these axes.
     large
@@ -174,7 +174,7 @@ def batched(
     return Labelled(tuple(rows), {**rows, **labels}, variables, large)
 
 
-#: Times up to so far from 1970 fit into the nanoseconds of a frame, s.
+#: Largest distance from 1970 that fits into a frame's nanosecond times, s.
 LATEST = 9.2e9
 
 

@@ -16,7 +16,7 @@ from heliotrope.errors import InputError, shown
 FloatArray = npt.NDArray[np.float64]
 
 TAU = 2.0 * np.pi
-#: Largest angle of an argument, rad: four turns, because degrees are mostly larger.
+#: Largest angle accepted, rad: four turns. A larger number is probably in degrees.
 MOST_TURNS = 4.0 * TAU
 #: One milliradian, so that tolerances can be written as ``0.01 * MRAD``.
 MRAD = 1e-3
@@ -37,23 +37,23 @@ def as_numbers(
 ) -> FloatArray:
     """Return ``value`` as an array of numbers that lie within ``low`` and ``high``.
 
-    A number may be infinite only where a limit is; NaN never passes.
+    Infinity passes only where the limit itself is infinite; NaN never passes.
 
     Parameters
     ----------
     value
         Of any shape.
     name, unit
-        Name and unit of the value in the error.
+        Name and unit of the value for the error message.
     low, high
         Limits, in the unit.
     advice
-        What to do, for the error.
+        Advice for the error message.
 
     Raises
     ------
     InputError
-        If it is not an array of numbers, or a number is not within the limits.
+        If the value is not an array of numbers, or a number is outside the limits.
     """
     try:
         array = as_float(value)
@@ -72,12 +72,12 @@ def as_numbers(
 
 
 def as_angles(value: npt.ArrayLike, name: str, limit: float) -> FloatArray:
-    """Return ``value`` as angles in radians of at most ``limit``; degrees are mostly larger.
+    """Return ``value`` as angles in radians of at most ``limit``, which most degree values exceed.
 
     Raises
     ------
     InputError
-        If it is not an array of numbers, or a number is larger or not finite.
+        If the value is not an array of numbers, or a number exceeds the limit or is not finite.
     """
     return as_numbers(value, name, -limit, limit, "rad", "degrees need numpy.radians")
 
@@ -103,7 +103,7 @@ def as_vectors(value: npt.ArrayLike, name: str) -> FloatArray:
 
 
 def common_shape(**arrays: FloatArray) -> tuple[int, ...]:
-    """Return the shape that arrays broadcast to; their names are for the error.
+    """Return the shape that the named arrays broadcast to; the error message quotes the names.
 
     Raises
     ------
@@ -114,12 +114,12 @@ def common_shape(**arrays: FloatArray) -> tuple[int, ...]:
 
 
 def common_batch(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, ...]:
-    """Return the shape that batches of these shapes broadcast to.
+    """Return the shape that these batch shapes broadcast to.
 
     Raises
     ------
     InputError
-        If they do not broadcast together; it names one of each shape.
+        If they do not broadcast together; the message names one array of each shape.
     """
     try:
         return np.broadcast_shapes(*shapes.values())
@@ -141,7 +141,7 @@ def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
     vectors
         Shape (..., 3), any non-zero length.
     name
-        Name of the vectors in an error.
+        Name of the vectors for the error message.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
         If a vector is zero or not finite.
     """
     array = as_vectors(vectors, name)
-    # Scaled by the largest component, so that neither tiny nor huge vectors lose digits.
+    # Scaling by the largest component keeps the digits of tiny and huge vectors.
     largest = np.abs(array).max(axis=-1, keepdims=True, initial=0.0)
     if (largest == 0.0).any():
         raise InputError(f"{name}: a vector of length 0 has no direction; give a direction")
@@ -173,8 +173,8 @@ def rotation(axis: npt.ArrayLike, angle: npt.ArrayLike) -> FloatArray:
     Parameters
     ----------
     axis
-        Shape (..., 3); need not be of unit length. A zero axis gives the identity,
-        which is how a missing second axis is written.
+        Shape (..., 3); need not be of unit length. A zero axis yields the identity, and so stands
+        for a missing second axis.
     angle
         Radians, shape (...).
 
@@ -200,7 +200,7 @@ def direction(azimuth: npt.ArrayLike, elevation: npt.ArrayLike) -> FloatArray:
         If the azimuth is not within four turns, or the elevation not within −π/2 to π/2.
     """
     az = as_angles(azimuth, "azimuth", MOST_TURNS)
-    # A rounding beyond the zenith is the zenith.
+    # Rounding may push the elevation beyond the zenith; clip it there.
     el = as_angles(elevation, "elevation", 0.5 * np.pi + 1e-9)
     common_shape(azimuth=az, elevation=el)
     az, el = np.broadcast_arrays(az, el)
@@ -248,7 +248,8 @@ def angle_between(a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
 def bisector(source: npt.ArrayLike, destination: npt.ArrayLike) -> FloatArray:
     """Return the unit normal that sends light from ``source`` towards ``destination``.
 
-    The one law: n ∥ s + t, both unit vectors (..., 3) that point away from the mirror.
+    Law of reflection: n ∥ s + t, where s and t are unit vectors (..., 3) that point away from the
+    mirror.
 
     Raises
     ------
@@ -265,7 +266,7 @@ def bisector(source: npt.ArrayLike, destination: npt.ArrayLike) -> FloatArray:
 
 
 def reflect(direction_in: npt.ArrayLike, normal: npt.ArrayLike) -> FloatArray:
-    """Return the direction in which light from ``direction_in`` leaves: 2 (n·s) n − s."""
+    """Return the direction of the reflected light, 2 (n·s) n − s, with s = ``direction_in``."""
     s, n = as_float(direction_in), as_float(normal)
     return as_float(2.0 * np.sum(s * n, axis=-1, keepdims=True) * n - s)
 
@@ -304,7 +305,7 @@ def geodetic_to_enu(
     height: npt.ArrayLike,
     origin: tuple[float, float, float],
 ) -> FloatArray:
-    """Return ENU metres (..., 3) about ``origin`` of WGS84 positions.
+    """Return WGS84 positions as ENU metres (..., 3) about ``origin``.
 
     Exact (geodetic to Earth-centred to local); a linearised conversion is 3 mm off
     at 210 m. ``origin`` is latitude and longitude in degrees and height in metres.
@@ -322,7 +323,7 @@ def geodetic_to_enu(
 def enu_to_geodetic(
     points: npt.ArrayLike, origin: tuple[float, float, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return latitude and longitude in degrees and height in metres of ENU points (..., 3)."""
+    """Return ENU points (..., 3) as latitude and longitude in degrees and height in metres."""
     import pymap3d
 
     _check_origin(origin)

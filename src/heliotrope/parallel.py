@@ -1,8 +1,8 @@
 """Splits independent rows across threads.
 
 The numeric kernels are compiled with ``nogil`` and treat every row (heliostat, time) independently,
-so rows can be cut into contiguous blocks and run on as many threads as there are cores. The result
-cannot depend on the number of threads, because no row reads what another writes.
+so contiguous blocks of rows can run on as many threads as there are cores. The result does not
+depend on the number of threads, because no row reads what another writes.
 """
 
 import os
@@ -58,7 +58,7 @@ def run_blocks(
     if workers == 1 or rows < minimum_rows:
         kernel(0, rows)
         return
-    # Four blocks per thread even out rows of unequal cost.
+    # Four blocks per thread balance the load when rows differ in cost.
     blocks = min(4 * workers, rows)
     edges = [rows * k // blocks for k in range(blocks + 1)]
     pool = _pool(workers)

@@ -1,4 +1,4 @@
-"""Child processes that end with this one, however it ends, and yield the CPU to it."""
+"""Child processes that end when this process ends, for whatever reason, and yield the CPU to it."""
 
 import contextlib
 import os
@@ -10,12 +10,12 @@ from multiprocessing.connection import wait
 
 
 def pool(processes: int, niceness: int | None = None) -> ProcessPoolExecutor:
-    """Return a pool of processes that begin anew and end with this one.
+    """Return a pool of freshly started processes that end when this process ends.
 
-    A forked child would inherit the locks of this process's threads. When this process is killed,
-    they end; else they would wait for work for ever. With a ``niceness`` they compute beside a
-    plant: they leave it the machine from their first import on, have one thread each, and Ctrl-C in
-    its terminal is not theirs.
+    The processes are not forked, because a forked child would inherit the locks of this process's
+    threads. They end even if this process is killed; otherwise they would wait for work for ever.
+    With a ``niceness`` they compute beside a running plant: they give way to it from their first
+    import on, use one thread each and ignore Ctrl-C in its terminal.
     """
     return ProcessPoolExecutor(
         processes,
@@ -26,14 +26,14 @@ def pool(processes: int, niceness: int | None = None) -> ProcessPoolExecutor:
 
 
 def give_way(niceness: int) -> None:
-    """Let this process take what others leave of the machine, where the system allows that."""
-    # A unit of systemd may deny the call: then all are equal.
+    """Let this process use only the CPU time that others leave, where the system allows that."""
+    # A systemd unit may deny the call; then all processes have equal priority.
     with contextlib.suppress(OSError):
         os.nice(niceness)
 
 
 def end(pool: ProcessPoolExecutor) -> None:
-    """End a pool at once; what its processes compute is lost."""
+    """End a pool at once and discard its unfinished work."""
     # Python 3.14 has kill_workers for this.
     running = list((pool._processes or {}).values())  # noqa: SLF001
     pool.shutdown(wait=False, cancel_futures=True)
@@ -42,7 +42,7 @@ def end(pool: ProcessPoolExecutor) -> None:
 
 
 def _begin(niceness: int | None) -> None:
-    """Prepare a process; it has loaded nothing yet."""
+    """Prepare a new process before it imports anything."""
     if niceness is not None:
         give_way(niceness)
         signal.signal(signal.SIGINT, signal.SIG_IGN)

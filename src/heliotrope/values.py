@@ -1,4 +1,4 @@
-"""What array records have in common: comparison by content, display in one line or as a table.
+"""Common base of array records: comparison by content, display on one line or as a table.
 
 A class provides a `Card`: one line for ``repr``, and a table with units and a small plot for a
 notebook. Both stay short, whatever the size of the arrays.
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-#: Most rows of a table in a notebook, and most dots of a picture.
+#: Maximum number of rows in a notebook table, and of dots in a picture.
 MOST_ROWS, MOST_DOTS = 24, 300
 #: Longest line, in characters.
 _LONGEST = 200
@@ -23,7 +23,7 @@ _SIZE, _MARGIN = 160.0, 8.0
 
 @dataclass(frozen=True)
 class Card:
-    """How a value shows itself.
+    """How a value is displayed.
 
     Attributes
     ----------
@@ -44,8 +44,8 @@ class Card:
 class Value:
     """Base of frozen dataclasses of arrays (``eq=False, repr=False``).
 
-    ``==`` compares their content: arrays are equal if shape and numbers are; NaN equals NaN.
-    Values have no hash.
+    ``==`` compares their content: arrays are equal if their shapes and numbers are equal; NaN
+    equals NaN. Values have no hash.
     """
 
     @abstractmethod
@@ -86,7 +86,7 @@ def _table(card: Card) -> str:
 
 
 def card_of_arrays(value: Any) -> Card:
-    """Return the card of a value that is nothing but named arrays: their shapes and ranges."""
+    """Return the card of a value that consists of named arrays, with their shapes and ranges."""
     arrays = {
         f.name: getattr(value, f.name)
         for f in fields(value)
@@ -110,14 +110,14 @@ def span(values: npt.ArrayLike, scale: float = 1.0, unit: str = "") -> str:
 
 
 def amount(count: int, noun: str) -> str:
-    """Return a count with its noun: "1 target", "3 targets"."""
+    """Return a count with its noun in the singular or plural: "1 target", "3 targets"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def dots(x: npt.ArrayLike, y: npt.ArrayLike, title: str) -> str:
     """Return a small SVG of points, x to the right and y upwards, at one scale.
 
-    At most `MOST_DOTS` of them are drawn, evenly chosen.
+    At most `MOST_DOTS` evenly spaced points are drawn.
     """
     points = np.stack([np.ravel(x), np.ravel(y)], axis=-1).astype(np.float64)
     points = points[np.isfinite(points).all(axis=-1)]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from heliotrope.calibration.sightings import Sightings
     from heliotrope.mechanism.chain import Mechanism
 
-#: What a second process is called with, to compile the other half.
+#: Argument with which a second process is started to compile the other half.
 OTHER_HALF = "other-half"
 
 
@@ -40,9 +40,9 @@ def compiling() -> Iterator[None]:
     """Compile the kernels of a calibration, in two processes, unless they are compiled.
 
     Tracking is compiled when the block begins, fitting when it ends. With one core, or where
-    machine code cannot be kept, kernels are compiled when they are needed. The halves take as
-    long as each other, on condition that tracking comes last: by then the other process has
-    compiled and kept the chain of joints, which both need.
+    machine code cannot be kept, kernels are compiled when they are needed. The halves take equally
+    long if tracking comes last, because by then the other process has compiled and cached the joint
+    chain, which both need.
     """
     from heliotrope.calibration.fit import estimator
 
@@ -50,7 +50,7 @@ def compiling() -> Iterator[None]:
         yield
         return
     command = [sys.executable, "-m", "heliotrope.warm", OTHER_HALF]
-    # What goes wrong there goes wrong here too, where it is seen.
+    # A fault in the other process occurs in this one too, where it is reported.
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):  # noqa: S603
         searching()
         breaking()
@@ -59,13 +59,13 @@ def compiling() -> Iterator[None]:
 
 
 def controlling() -> None:
-    """Compile or load the kernels of a plant's loop, which would hold it up for seconds."""
+    """Compile or load the kernels of a plant's loop in advance, so that the loop is not delayed."""
     for part in (tracking, following, guarding):
         part()
 
 
 def computing() -> None:
-    """Load the kernels of the processes beside a plant's loop."""
+    """Load the kernels that the processes beside a plant's loop use."""
     from heliotrope.imaging import coded, photograph  # noqa: F401 - only loaded
 
     tracking()
@@ -73,7 +73,7 @@ def computing() -> None:
 
 
 def tracking() -> None:
-    """Track a mirror."""
+    """Track a heliostat."""
     from heliotrope.mechanism.tracking import track
 
     mechanism, seen = _case()
@@ -82,7 +82,7 @@ def tracking() -> None:
 
 
 def fitting() -> None:
-    """Place a mirror and fit it."""
+    """Place a heliostat and fit its model."""
     from heliotrope.calibration.fit.estimator import fit
 
     mechanism, seen = _case()
@@ -93,14 +93,14 @@ def fitting() -> None:
 
 
 def searching() -> None:
-    """Search for the hyperparameters of a mirror."""
+    """Search for the hyperparameters of a heliostat."""
     from heliotrope.calibration.learn import drift
 
     drift.refine(*_drifting(), iterations=1)
 
 
 def breaking() -> None:
-    """Search for steps and regimes of a mirror."""
+    """Search for steps and regimes in a heliostat's history."""
     from heliotrope.calibration.learn import drift
     from heliotrope.calibration.learn.regimes import find_regimes
 
@@ -110,7 +110,7 @@ def breaking() -> None:
 
 
 def following() -> None:
-    """Learn on from a sighting, and ask for the resolution of drives and the derivatives."""
+    """Update a model with one sighting, and compute the drive resolution and the derivatives."""
     from heliotrope.calibration.learn import stream
 
     mechanism, seen = _case()
@@ -121,7 +121,7 @@ def following() -> None:
 
 
 def guarding() -> None:
-    """Prove of a beam that it stays clear of one volume, and find it in another."""
+    """Check that a beam stays clear of one volume and that it enters another."""
     import numpy as np
 
     from heliotrope.field.volumes import Box
@@ -138,7 +138,7 @@ def guarding() -> None:
 
 
 def lighting() -> None:
-    """Cast the light of three mirrors on a receiver."""
+    """Cast the light of three heliostats on a receiver."""
     from heliotrope.field.layouts import malan_plant
     from heliotrope.geometry import normalize
     from heliotrope.optics.plant_flux import FieldOptics
@@ -148,7 +148,7 @@ def lighting() -> None:
 
 
 def cutting() -> None:
-    """Cast the light of three mirrors on a mesh, and cut one mirror."""
+    """Cast the light of three heliostats on a mesh, and clip one mirror."""
     from dataclasses import replace
 
     import numpy as np
@@ -179,7 +179,7 @@ def _case() -> "tuple[Mechanism, Sightings]":
 
 
 def _drifting() -> "tuple[Hyperparameters, Linear]":
-    """Return sightings of a mirror on eight days, linear in its parameters."""
+    """Return sightings of a heliostat on eight days, linear in its parameters."""
     import numpy as np
 
     from heliotrope.calibration.learn import drift

@@ -1,9 +1,11 @@
-"""Aims that keep the flux on a receiver under a limit, although mirrors err.
+"""Aim points that keep the flux on a receiver under a limit despite pointing errors.
 
-- `FluxLimit`: what a receiver may get: a number or a map (`heliotrope.field.flux_limit`).
-- `candidates` and `optimiser`: images of each mirror at a few aims, and the choice of most power.
-- `errors`: how far the flux may be off, by each mirror's own error and by shared ones.
-- `scene_aims`: all of this for a scene; `plan`: for a plant; `strategies`: what to compare with.
+- `FluxLimit`: the allowable flux on a receiver, a number or a map (`heliotrope.field.flux_limit`).
+- `candidates` and `optimiser`: images of each mirror at a few aims, and the choice that maximises
+  power.
+- `errors`: the uncertainty of the flux due to each mirror's own error and to shared errors.
+- `scene_aims`: aims for a scene; `plan`: aims for a plant; `strategies`: simpler strategies for
+  comparison.
 
 Begin with `plan_aims`, which is `heliotrope.aim`.
 """

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: prices of images, and sweeps in which each mirror takes the aim that pays best.
+"""Compiled: prices of images, and sweeps in which each mirror takes the most valuable aim.
 
 Candidate a of mirror i is image ``a // S`` of the mirror, moved up by ``shifts[i, a % S]`` rows;
 −1 is none: the mirror is defocused. Maps are (columns, rows), so that a column lies in a row.
@@ -64,7 +64,7 @@ def worths(first, last, mirrors, images, shifts, price, spans, out):
 
 @njit(**_INNER_SUMS)
 def _rectangle(i, a, images, shifts, number):
-    """First column, columns, first row, end row, and place and height of a candidate's cells."""
+    """First column, columns, first row, end row, and position and height of a candidate's cells."""
     _, begin, box, looks, _ = images
     count = shifts.shape[1]
     j = i * looks + a // count
@@ -100,7 +100,7 @@ def flux_of(mirrors, choice, images, shifts, flux):
 
 @njit(**_INNER_SUMS)
 def _reprice(i, a, images, shifts, flux, cap, toll, steep, price, spans):
-    """Bring the prices of the cells of a candidate up to date."""
+    """Update the prices of a candidate's cells."""
     wide, number = flux.shape
     c, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
     for _ in range(columns):
@@ -124,10 +124,11 @@ def _reprice(i, a, images, shifts, flux, cap, toll, steep, price, spans):
 
 @njit(**_SUMS)
 def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, price, spans):
-    """Let each mirror in turn take the candidate that pays best; returns how many changed.
+    """Let each mirror in turn take its most valuable candidate; return the number of changes.
 
-    A cell asks ``max(0, toll + steep (flux − cap))`` for the flux, W per W/m², as an augmented
-    Lagrangian does. ``power`` (H, A) in W; ``idle``: what no light is worth, W. ``choice`` (H,),
+    The price of flux in a cell is ``max(0, toll + steep (flux − cap))``, W per W/m², as in an
+    augmented Lagrangian. ``power`` (H, A) in W; ``idle``: the value of sending no light, W.
+    ``choice`` (H,),
     ``flux``, ``price`` and ``spans`` are kept up to date.
     """
     worth = np.empty(power.shape[1])
@@ -153,7 +154,7 @@ def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, pr
 
 @njit(**_INNER_SUMS)
 def _excess(i, a, images, shifts, flux, cap, most):
-    """Excess over the cap with a candidate, summed over its cells; no further than ``most``."""
+    """Excess over the cap with a candidate, summed over its cells; the sum stops at ``most``."""
     values, weight = images[0], images[4]
     wide, number = flux.shape
     c, columns, low, high, at, rows = _rectangle(i, a, images, shifts, number)
@@ -172,7 +173,7 @@ def _excess(i, a, images, shifts, flux, cap, most):
 
 @njit(**_INNER_SUMS)
 def _above(i, a, images, shifts, flux, cap):
-    """The present excess in the cells of a candidate, without it."""
+    """The present excess in a candidate's cells, without that candidate."""
     wide, number = flux.shape
     c, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
     total = 0.0
@@ -187,9 +188,10 @@ def _above(i, a, images, shifts, flux, cap):
 
 @njit(**_SUMS)
 def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
-    """Let each mirror in turn take the candidate of most power less a fine; returns the changes.
+    """Let each mirror in turn take the best candidate after penalties; return the changes.
 
-    ``fine``: for the excess that it adds, W per W/m². ``idle``: what no light is worth, W. Without
+    ``fine``: penalty on the excess that a candidate adds, W per W/m². ``idle``: the value of
+    sending no light, W. Without
     ``fill`` only mirrors that add to an excess change.
     """
     changed = 0
@@ -213,7 +215,7 @@ def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
             for b in range(1, len(net)):
                 if net[b] > net[a]:
                     a = b
-            # The others have less power, so that none is better.
+            # The remaining candidates have less power, so none of them is better.
             if net[a] <= gain:
                 break
             present = _above(i, a, images, shifts, flux, cap)
@@ -234,7 +236,7 @@ def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
 def place(order, images, shifts, cells, choice, flux):
     """Let each mirror in turn aim where there is least flux.
 
-    ``cells`` (H, A, 2): column and row of each candidate, −1 of one that is not to be taken.
+    ``cells`` (H, A, 2): column and row of each candidate, −1 if the candidate is excluded.
     """
     for i in order:
         best, least = -1, 1e300

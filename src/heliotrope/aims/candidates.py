@@ -1,4 +1,4 @@
-"""The aims among which each mirror chooses, and its image at each."""
+"""The candidate aims of each mirror, and its image at each aim."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,11 +15,12 @@ from heliotrope.optics.shading import IntArray
 from heliotrope.optics.surfaces import Cylinder, Plate
 from heliotrope.parallel import run_blocks
 
-#: Heights of the candidates of a mirror, and places across a cylinder and across a plate.
+#: Number of heights of a mirror's candidates, and of positions across a cylinder and across a
+#: plate.
 HEIGHTS, AROUND, ACROSS = 9, 3, 5
 #: The outermost aim lies this many standard deviations of the beam within the edge.
 WITHIN = 0.5
-#: Outermost aim on a cylinder, across the beam, over its radius.
+#: Offset of the outermost aim on a cylinder, across the beam, as a fraction of the radius.
 ASIDE = 0.4
 
 
@@ -32,7 +33,7 @@ class Candidates:
     images
         At the K places, at half height.
     weight
-        Light of each mirror over that of its images, (H,).
+        Ratio of each mirror's light to the light in its images, (H,).
     shifts
         Displacements of the images in rows, (H, S).
     aims
@@ -52,7 +53,7 @@ class Candidates:
 
     @property
     def table(self) -> tuple[Any, ...]:
-        """What kernels take as images."""
+        """The images in the form that the kernels take."""
         i = self.images
         return i.values, i.begin, i.box, i.looks, self.weight
 
@@ -82,7 +83,7 @@ class Candidates:
         return flux
 
     def relit(self, weight: FloatArray) -> "Candidates":
-        """Return the candidates with other light on the mirrors, (H,)."""
+        """Return the candidates with a different amount of light on each mirror, (H,)."""
         ratio = weight / np.where(self.weight > 0.0, self.weight, 1.0)
         return replace(self, weight=weight, power=as_float(self.power * ratio[:, None]))
 
@@ -139,7 +140,7 @@ def candidates(engine: FieldFlux) -> Candidates:
     Parameters
     ----------
     engine
-        Its flux, with aims on the receiver; see `FieldFlux.images` for what stays as it is.
+        Flux engine of the scene, with aims on the receiver; `FieldFlux.images` says what is kept.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-r"""How far the flux may be off: each mirror's own error, and errors that mirrors share.
+r"""Uncertainty of the flux: each mirror's own error, and errors that mirrors share.
 
 To first order a cell's flux is $F_c + \sum_i g_{ic} · δ_i$, where $δ_i$ is the displacement of
-mirror i's beam and $g_{ic}$ the derivative of its image. With own errors of covariance $Σ_i$ and
-shared ones $z_m$, normal of variance 1, that displace beam i by $d_{im}$,
+mirror i's beam and $g_{ic}$ the derivative of its image. If the mirrors' own errors have covariance
+$Σ_i$, and shared errors $z_m$ (normal, variance 1) displace beam i by $d_{im}$, then
 
 $$σ_c^2 = \sum_i g_{ic}^\mathsf{T} Σ_i g_{ic} + \sum_m (\sum_i g_{ic} · d_{im})^2.$$
 """
@@ -17,11 +17,12 @@ from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import Mirrors
 from heliotrope.optics.shading import IntArray
 
-#: Draws from which the quantile of the hottest cell is taken, and cells that they look at at most.
+#: Number of draws from which the quantile of the hottest cell is taken, and maximum number of cells
+#: that they cover.
 DRAWS, LOOKED = 2_000, 500
-#: Waves that such maps of own errors are made of.
+#: Number of waves that make up each random map of the mirrors' own errors.
 WAVES = 64
-#: Cells that lie more standard deviations below the limit are not looked at.
+#: Cells that lie further below the limit than this many standard deviations are ignored.
 NEAR = 6.0
 #: Speed of the sun across the sky, rad/s.
 _SKY = 2.0 * np.pi / 86164.1
@@ -34,13 +35,13 @@ class SharedErrors:
     Attributes
     ----------
     drift
-        Turn of all mirrors' normals about the east and about the north, rad, as by refraction or
-        wind.
+        Rotation of all mirrors' normals about east and about north, rad, such as refraction or wind
+        causes.
     clock
-        Of the time for which the sun is computed, s.
+        Error of the time for which the sun position is computed, s.
     cluster
-        Turn of the normals of one cluster, as by its tilted ground, about the east and about the
-        north, rad.
+        Rotation of the normals of one cluster about east and about north, rad, such as tilted
+        ground causes.
     """
 
     drift: float = 0.0
@@ -58,14 +59,14 @@ class SharedErrors:
 
     @property
     def any(self) -> bool:
-        """Whether there is any."""
+        """Whether any error is above 0."""
         return max(self.drift, self.clock, self.cluster) > 0.0
 
     def modes(self, mirrors: Mirrors, sun: FloatArray, pole: FloatArray) -> FloatArray:
-        """Return how one standard deviation of each displaces the beams, rad, (H, 5, 2).
+        """Return the beam displacement by one standard deviation of each error, rad, (H, 5, 2).
 
-        Right and up as seen from the mirror; the first three are the field's, the others each
-        cluster's.
+        Right and up as seen from the mirror; the first three modes affect the whole field, the
+        other two each cluster.
 
         Parameters
         ----------
@@ -83,36 +84,36 @@ class SharedErrors:
         up = np.cross(right, ray)
 
         def beam(turn: FloatArray) -> FloatArray:
-            """Return the displacement by a small change of the normals, (H, 2)."""
+            """Return the beam displacement that a small change of the normals causes, (H, 2)."""
             along = np.sum(turn * light, axis=-1, keepdims=True)
             change = 2.0 * (along * normal + (normal @ sun)[:, None] * turn)
             return np.stack([np.sum(change * right, -1), np.sum(change * up, -1)], axis=-1)
 
         tilts = [beam(np.cross(axis, normal)) for axis in np.eye(3)[:2]]
-        # The mirrors take the sun for where it will be; its true light goes elsewhere.
+        # The mirrors point for the sun's later position, so the true light is displaced.
         moved = -np.cross(pole, light) * _SKY
         late = normalize(ray + light + moved) - normal
         columns = [self.drift * tilts[0], self.drift * tilts[1], self.clock * beam(late)]
         return np.stack([*columns, *(self.cluster * tilt for tilt in tilts)], axis=1)
 
 
-#: Modes of the field among those of `SharedErrors.modes`.
+#: Number of field-wide modes in `SharedErrors.modes`.
 FIELD_MODES = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Risk:
-    """How far the flux on a receiver may be off.
+    """Uncertainty of the flux on a receiver.
 
     Attributes
     ----------
     sigma
         Standard deviation of each cell's flux, W/m², (rows, columns).
     factor
-        With the chosen probability no cell is further above its expected flux than this many
+        With the chosen probability, no cell exceeds its expected flux by more than this many
         standard deviations.
     own
-        Standard deviation by the mirrors' own errors alone, W/m², (rows, columns).
+        Standard deviation due to the mirrors' own errors alone, W/m², (rows, columns).
     """
 
     sigma: FloatArray
@@ -121,7 +122,7 @@ class Risk:
 
     @property
     def above(self) -> FloatArray:
-        """What the flux may be above the expected, W/m², (rows, columns)."""
+        """Margin by which the flux may exceed its expectation, W/m², (rows, columns)."""
         return as_float(self.factor * self.sigma)
 
 
@@ -133,7 +134,7 @@ def assess(
     limit: FloatArray,
     width: float,
 ) -> Risk:
-    """Return how far the flux of a scene may be off.
+    """Return the uncertainty of the flux in a scene.
 
     Parameters
     ----------
@@ -144,11 +145,11 @@ def assess(
     groups
         Cluster of each mirror, 0 to G − 1, (H,).
     probability
-        That the limit holds in all cells at once, 0.5 to 0.9999.
+        Probability that the limit holds in all cells at once, 0.5 to 0.9999.
     limit
         W/m², (rows, columns).
     width
-        Standard deviation of a usual beam, in cells: neighbours within it are off together.
+        Standard deviation of a typical beam, in cells; errors of cells this close are correlated.
     """
     flux = engine.maps[0]
     pointing = engine.scene.mirrors.pointing
@@ -173,13 +174,13 @@ def assess(
 def gains(engine: FieldFlux, risk: Risk, prices: FloatArray) -> FloatArray:
     r"""Return the power that a perfect calibration of each mirror would add, W, (H,).
 
-    To first order, for the room that its own error takes under the limit:
+    To first order, from the margin under the limit that the mirror's own error takes up:
     $k \sum_c λ_c \, g_{ic}^\mathsf{T} Σ_i g_{ic} / 2 σ_c$.
 
     Parameters
     ----------
     engine, risk
-        Flux, and how far it may be off.
+        Flux, and its uncertainty.
     prices
         Of the cells, $λ_c$, W per W/m², (rows, columns).
     """
@@ -192,7 +193,7 @@ def gains(engine: FieldFlux, risk: Risk, prices: FloatArray) -> FloatArray:
 
 
 def _alike(rng: np.random.Generator, cells: FloatArray, width: float) -> FloatArray:
-    """Return DRAWS maps of normal numbers that are alike within a width, (D, C).
+    """Return DRAWS maps of normal random numbers that are correlated within a width, (D, C).
 
     Cells (C, 2): row and column. A sum of waves whose lengths have the spectrum of a Gaussian.
     """

@@ -1,4 +1,4 @@
-"""Files of aims, for people and for control systems."""
+"""Aim files, for people and for control systems."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ from heliotrope.files import write_text
 
 
 def write_aims(path: str | Path, plan: AimPlan) -> None:
-    """Write a table (CSV) of aims, a line for each heliostat; those defocused have no aim."""
+    """Write a CSV table of aims, one line per heliostat; defocused heliostats have no aim."""
     text = io.StringIO(newline="")
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(

@@ -1,4 +1,4 @@
-r"""The aims of most power under a flux limit, by Lagrangian decomposition.
+r"""Aims that maximise power under a flux limit, by Lagrangian decomposition.
 
 With $x_{ia}$ = 1 if mirror i takes candidate a, of power $p_{ia}$ and flux $f_{iac}$ in cell c:
 
@@ -10,8 +10,9 @@ $$D(λ) = \sum_c λ_c L_c + \sum_i \max(0, \max_a (p_{ia} - \sum_c λ_c f_{iac})
 
 is at least the optimum. The prices come from an augmented Lagrangian: mirror after mirror takes its
 best candidate at prices $\max(0, λ_c + ρ_c (F_c - L_c))$, and after each sweep these become the
-multipliers (Hestenes and Powell, 1969). They are first found on one mirror in ten. What is left
-above the limit is taken back mirror by mirror, and what is left below it is filled.
+multipliers (Hestenes and Powell, 1969). The prices are first found with one mirror in ten. Finally,
+remaining excess over the limit is removed mirror by mirror, and remaining room below the limit is
+filled.
 """
 
 from collections.abc import Callable
@@ -24,15 +25,16 @@ from heliotrope.aims.candidates import Candidates, spans_of
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics.shading import IntArray
 
-#: Change of a cell's price over its area for a flux twice the limit.
+#: Change of a cell's price, divided by its area, for a flux of twice the limit.
 STEEP = 10.0
-#: Fields of more mirrors are first solved for one in SAMPLE, with so many sweeps.
+#: Fields with more mirrors than this are first solved for one mirror in SAMPLE, with this many
+#: sweeps.
 LARGE, SAMPLE, COARSE = 2_000, 10, 20
-#: Sweeps over all mirrors at most, and the gap at which they end.
+#: Maximum number of sweeps over all mirrors, and the gap at which they end.
 SWEEPS, GAP = 8, 1e-3
-#: Sweeps between two looks at the gap.
+#: Sweeps between two checks of the gap.
 BETWEEN = 2
-#: Fines for what is above the limit, over the area of a cell, one after the other.
+#: Successive penalties for excess over the limit, divided by the area of a cell.
 FINES = (3.0, 30.0, 300.0, 1e4, 1e6, 1e9)
 
 Step = Callable[[int, int], None]
@@ -49,11 +51,11 @@ class Choice:
     prices
         Multipliers of the cells, W per W/m², (columns, rows).
     flux
-        W/m², (columns, rows), as the candidates' images have it.
+        W/m², (columns, rows), the sum of the candidates' images.
     power
         W.
     bound
-        No choice of candidates under this limit has more power, W.
+        Upper bound on the power of any choice of candidates under this limit, W.
     """
 
     choice: IntArray
@@ -64,7 +66,7 @@ class Choice:
 
     @property
     def gap(self) -> float:
-        """Share of its power that a better choice could add at most."""
+        """Upper bound on what a better choice could add, as a share of the power."""
         return self.bound / self.power - 1.0 if self.power > 0.0 else np.inf
 
 
@@ -90,7 +92,7 @@ def optimise(
     gap: float = GAP,
     progress: Step | None = None,
 ) -> Choice:
-    """Return the choice of most power whose flux is nowhere above a cap.
+    """Return the choice with the most power whose flux exceeds the cap nowhere.
 
     Parameters
     ----------
@@ -99,15 +101,16 @@ def optimise(
     cap
         W/m², above 0, (columns, rows).
     start
-        Begin with the prices and the choice of an earlier one.
+        An earlier choice, whose prices and candidates are the starting point.
     keep
-        Whether every mirror must send its light to the receiver; then the cap may be passed.
+        Whether every mirror must send its light to the receiver; the flux may then exceed the cap.
     sweeps
-        Over all mirrors, at most; with 0 the start's choice is only brought under the cap.
+        Maximum number of sweeps over all mirrors; with 0 the starting choice is only brought under
+        the cap.
     gap
-        At which the sweeps end.
+        Gap at which the sweeps end.
     progress
-        Called with the sweeps done and those of all.
+        Called with the number of sweeps done and their total number.
     """
     rng, everyone = np.random.default_rng(0), np.arange(len(field.weight))
     idle = -1e300 if keep else 0.0
@@ -150,7 +153,7 @@ def _sweep(
     order: IntArray,
     idle: float,
 ) -> FloatArray:
-    """Let mirrors choose in an order, and return the new prices."""
+    """Let mirrors choose in the given order, and return the new prices."""
     flux = field.flux(choice, order)
     steep = STEEP * field.images.area / cap
     now = np.maximum(prices + steep * (flux - cap), 0.0)
@@ -169,9 +172,9 @@ def _settled(
     least: float,
     idle: float,
 ) -> Choice:
-    """Return a choice that keeps the cap."""
+    """Return a choice that respects the cap."""
     mine, flux = choice.copy(), field.flux(choice)
-    # Those that give least for their prices leave first.
+    # The mirrors that yield least for their price leave first.
     rows = np.arange(len(mine))
     paid = np.where(mine >= 0, field.power[rows, np.maximum(mine, 0)], 0.0)
     order = np.argsort(paid, kind="stable")

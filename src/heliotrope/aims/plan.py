@@ -1,4 +1,4 @@
-"""Aims of a plant's heliostats under a flux limit, and strategies beside them."""
+"""Aims of a plant's heliostats under a flux limit, and other strategies for comparison."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from heliotrope.values import Card, Value, amount
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AimPlan(Value, Framed):
-    """Aims of N heliostats, and the flux that they bring.
+    """Aims of N heliostats, and the resulting flux.
 
     Attributes
     ----------
@@ -37,9 +37,9 @@ class AimPlan(Value, Framed):
     out_of_reach
         Heliostats that cannot reach the receiver, (N,).
     unlimited
-        Power with every heliostat at the receiver's middle, W.
+        Power with every heliostat aimed at the middle of the receiver, W.
     scene
-        All that was computed, for a `start`.
+        All computed results, for use as a ``start``.
     """
 
     strategy: Strategy
@@ -67,7 +67,7 @@ class AimPlan(Value, Framed):
 
     @property
     def lost(self) -> float:
-        """Power that the limit costs, or the strategy, W."""
+        """Power lost to the limit or to the strategy, W."""
         return self.unlimited - self.power
 
     @property
@@ -77,17 +77,17 @@ class AimPlan(Value, Framed):
 
     @property
     def excess(self) -> float:
-        """Greatest of the flux' quantile over the limit, less 1; 0 or less: the limit holds."""
+        """Greatest ratio of the flux quantile to the limit, less 1; 0 or less: the limit holds."""
         return self.scene.excess
 
     @property
     def quantile(self) -> FloatArray:
-        """Flux that is passed nowhere with the chosen probability, W/m², (rows, columns)."""
+        """Flux that no cell exceeds, with the chosen probability, W/m², (rows, columns)."""
         return self.scene.quantile
 
     @property
     def limit(self) -> FloatArray:
-        """What each cell may get, less the margin, W/m², (rows, columns)."""
+        """Allowable flux in each cell, less the margin, W/m², (rows, columns)."""
         return self.scene.limit
 
     @property
@@ -138,33 +138,31 @@ def plan_aims(
     light: FieldOptics | None = None,
     **changes: Any,
 ) -> AimPlan:
-    """Return aims of most expected power that keep the flux under a limit.
+    """Return the aims with the most expected power that keep the flux under a limit.
 
     Parameters
     ----------
     plant
         As calibrated.
     time, sun
-        One of them, as for `heliotrope.optics.field_flux`.
+        Exactly one of the two, as for `heliotrope.optics.field_flux`.
     receiver
         Name; "": the plant's first.
     limit
         W/m²: a number, a map, or a `FluxLimit`.
     strategy
-        "optimal"; or "middle", "spread" or "image-size" to compare with, which take no heed of the
-        limit.
+        "optimal"; or "middle", "spread" or "image-size" for comparison, which ignore the limit.
     probability
-        That the limit holds in all cells at once, 0.5 to 0.9999.
+        Probability that the limit holds in all cells at once, 0.5 to 0.9999.
     shared
-        Errors that mirrors have in common; None: none. Each mirror's own are ``error`` of the
-        light.
+        Errors that mirrors share; None: none. Each mirror's own error is ``error`` of the light.
     keep
         Whether no heliostat may be defocused.
     start
-        A plan of the same plant and receiver at another sun, irradiance or limit, which is where
-        the search begins.
+        A plan of the same plant and receiver for another sun position, irradiance or limit, from
+        which the search begins.
     progress
-        Called with the work done and all of it.
+        Called with the amount of work done and the total.
     light, **changes
         As for `heliotrope.optics.field_flux`.
 
@@ -204,7 +202,7 @@ def plan_aims(
 
 
 def compare_aims(plans: Mapping[Any, AimPlan]) -> list[dict[str, Any]]:
-    """Return one row for each plan: power, peak, quantile over limit, defocused, gap."""
+    """Return one table row for each plan: power, peak, quantile over limit, defocused, gap."""
     return [
         {
             "strategy": name,

@@ -1,11 +1,12 @@
-"""From the aims that heliostats have to better ones: a few moves at a time, none above the limit.
+"""Moves heliostats from their present aims to better ones, a few at a time, within the limit.
 
-Heliostats that have an aim count as if they shone, so that any of them may join at any time: fewer
-beams never bring more light to a cell. Each step moves a few heliostats. While they move, each may
-be anywhere on its way, so a step is taken only if the light of all others, with the greatest that
-each moving beam brings to a cell anywhere on its way, stays within what errors leave of the limit;
-a cell that is above it already must not get more. Heliostats that take most light from the fullest
-cells move first. Where no move is possible, some heliostats rest, and come back at other aims.
+Every heliostat that has an aim counts as shining, so that any of them may join at any time. This is
+safe because fewer beams never bring more light to a cell. Each step moves a few heliostats. A
+moving heliostat may be anywhere on its path. A step is therefore taken only if the light of all
+other heliostats, plus the most that each moving beam brings to a cell anywhere on its path, stays
+below the limit less the margin for errors. A cell that is already above this must not get more
+light. The heliostats whose moves relieve the fullest cells most go first. If no move is possible,
+some heliostats rest and return later at other aims.
 """
 
 from dataclasses import dataclass, replace
@@ -22,24 +23,25 @@ from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics.receiver_flux import FieldFlux, Images
 from heliotrope.optics.scene import Scene
 
-#: Aims nearer to each other than this are one, m.
+#: Aims closer together than this count as the same, m.
 ALIKE = 0.05
-#: Places on a beam's way at which its image is computed, at most; one for each of its widths.
+#: Maximum number of positions on a beam's path at which its image is computed; one per beam width.
 PLACES = 9
-#: A new set of aims is gone to if it has more power by this share, or the old one is above.
+#: New aims are adopted if they add this share of power, or if the old aims exceed the limit.
 BETTER = 5e-3
-#: Excess over the limit that counts as none, and the fullness from which a cell binds.
+#: Excess over the limit that counts as zero, and the share of the limit from which a cell binds.
 HOLDS, BINDS = 3e-3, 0.99
-#: Heliostats whose moves are looked at in one round, at most.
+#: Maximum number of heliostats whose moves are examined in one round.
 LOOKED = 400
-#: Share of the field that the safe spread keeps, from one try to the next.
+#: Share of the field that the safe spread keeps from one attempt to the next.
 THINNER = 0.85
 #: Age at which images are computed anew, s.
 FRESH = 600.0
 
 Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
-#: A mirror's image before a move, the greatest on its way, and after it, (columns, rows).
+#: A mirror's image before a move, its cell-wise maximum on the path, and its image after, (columns,
+#: rows).
 Way = tuple[FloatArray, FloatArray, FloatArray]
 
 
@@ -50,7 +52,7 @@ class Round:
     Attributes
     ----------
     scene
-        With one receiver; its aims and what is dark do not count.
+        Has one receiver; its aims and dark mirrors are ignored.
     demand
         The limit.
     at
@@ -58,16 +60,15 @@ class Round:
     aims
         Aims that the mirrors have been given, ENU m, (H, 3); NaN: none.
     free
-        Mirrors that may be given others, (H,).
+        Mirrors that may be given new aims, (H,).
     shining
         Mirrors whose beams are on the receiver, (H,).
     fixed
-        Where the beams of others are that stay, as a person has aimed them, ENU m, (H, 3); NaN:
-        none.
+        Positions of beams that an operator has aimed and that stay there, ENU m, (H, 3); NaN: none.
     spread
         Aims of the plant file, for the safe spread, ENU m, (H, 3).
     most, together
-        Shining mirrors that may move in this round, and at once.
+        Maximum numbers of shining mirrors that may move in this round, and at the same time.
     """
 
     scene: Scene
@@ -84,12 +85,12 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """Mirrors that get other aims at once.
+    """Mirrors that get new aims at the same time.
 
     Attributes
     ----------
     rows
-        Which, (K,).
+        Indices of the mirrors, (K,).
     aims
         ENU m, (K, 3); NaN: they rest.
     """
@@ -100,7 +101,7 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a round has found.
+    """Result of a round.
 
     Attributes
     ----------
@@ -109,14 +110,14 @@ class Answer:
     safe
         The safe spread: aims of the plant file for as many mirrors as hold the limit, (H, 3).
     flux, above, limit
-        Of the beams that shine now, what errors may add, and what is allowed less the margin,
-        W/m², (rows, columns).
+        Flux of the beams that shine now, what errors may add, and the limit less the margin, W/m²,
+        (rows, columns).
     planned
         Power of the best aims, W.
     power
-        Power of the aims that the mirrors have, W.
+        Power of the present aims, W.
     gap
-        Share of the planned power that still better aims could add at most.
+        Upper bound on what still better aims could add, as a share of the planned power.
     left
         Mirrors whose aims are not yet the best ones.
     """
@@ -133,7 +134,7 @@ class Answer:
 
     @property
     def excess(self) -> float:
-        """Greatest of the flux with its errors over the limit, less 1."""
+        """Greatest ratio of the flux, with its errors, to the limit, less 1."""
         return float(((self.flux + self.above) / self.limit).max()) - 1.0
 
     @property
@@ -142,24 +143,25 @@ class Answer:
         return int((self.flux + self.above > BINDS * self.limit).sum())
 
 
-#: The last aims of this process, with the time of their images and the mirrors that these show.
+#: The last aims computed in this process, with the time of their images and the mirrors in these
+#: images.
 _last: list[tuple[float, Mask, SceneAims]] = []
 
 
 def next_round(now: Round, **light: Any) -> Answer:
-    """Return the moves that bring the mirrors nearer to the aims of most power.
+    """Return the moves that bring the mirrors closer to the aims of maximum power.
 
     Parameters
     ----------
     now
-        The mirrors, the limit, and what they may do.
+        The mirrors, the limit, and the permitted moves.
     **light
         Arguments of `FieldFlux`.
 
     Raises
     ------
     InputError
-        If no aims hold the limit beside the beams that stay.
+        If no aims hold the limit together with the beams that stay.
     """
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
@@ -198,11 +200,11 @@ def steps(
 ) -> tuple[tuple[Move, ...], int]:
     """Return the moves towards wanted aims (H, 3), and how many mirrors remain.
 
-    ``cap`` is what the expected flux may be, W/m², (rows, columns).
+    ``cap`` is the allowable expected flux, W/m², (rows, columns).
     """
     given, goes = _given(now.aims), _given(wanted)
     if not given.any():
-        # None shines: they may have the best aims at once.
+        # No mirror shines, so all may take their best aims at once.
         return ((Move(np.flatnonzero(goes), wanted[goes]),) if goes.any() else ()), 0
     gone = given & ~now.free
     path = _Path(now, wanted, light)
@@ -225,7 +227,7 @@ def _rest(rows: Rows) -> Move:
 
 
 class _Path:
-    """Images of mirrors on their ways from aims that they have to wanted ones."""
+    """Images of mirrors on their paths from present to wanted aims."""
 
     def __init__(self, now: Round, wanted: FloatArray, light: dict[str, Any]) -> None:
         given, goes = _given(now.aims), _given(wanted)
@@ -245,14 +247,14 @@ class _Path:
         self.given, self.goes = given, goes
 
     def flux(self, which: Mask) -> FloatArray:
-        """Return the flux of mirrors at the aims that they have, (columns, rows)."""
+        """Return the flux of mirrors at their present aims, (columns, rows)."""
         total = np.zeros(self._images.shape[::-1])
         for row in np.flatnonzero(which):
             total += self.image(int(row), 0)
         return total
 
     def image(self, row: int, place: int) -> FloatArray:
-        """Return the image of a mirror at a place of its way, W/m², (columns, rows)."""
+        """Return the image of a mirror at a position on its path, W/m², (columns, rows)."""
         images = self._images
         rows, wide = images.shape
         j = row * images.looks + place % images.looks
@@ -267,7 +269,7 @@ class _Path:
         return out
 
     def most(self, row: int, *, shines: bool) -> Way:
-        """Return a mirror's image before, the greatest on its way, and after."""
+        """Return a mirror's image before, its maximum on the path, and its image after."""
         before = self.image(row, 0) if self.given[row] else np.zeros(self._images.shape[::-1])
         after = self.image(row, -1) if self.goes[row] else np.zeros_like(before)
         greatest = np.maximum(before, after)
@@ -278,7 +280,7 @@ class _Path:
 
 
 class _Walk:
-    """Moves one after the other, with the flux after each."""
+    """A sequence of moves, with the flux after each."""
 
     def __init__(self, path: _Path, flux: FloatArray, cap: FloatArray, now: Round) -> None:
         self._path, self._flux, self._cap, self._now = path, flux, cap, now
@@ -286,7 +288,7 @@ class _Walk:
         self._moved = 0
 
     def through(self, todo: Rows, wanted: FloatArray) -> list[Move]:
-        """Return the moves that are possible; where none is, some mirrors rest."""
+        """Return the possible moves; if there are none, some mirrors rest."""
         moves, shining = [], self._now.shining
         ways = {int(row): self._path.most(row, shines=bool(shining[row])) for row in todo[:LOOKED]}
         while ways:
@@ -307,7 +309,7 @@ class _Walk:
         return moves
 
     def _batch(self, ways: dict[int, Way]) -> list[int]:
-        """Return the mirrors that move next: those that relieve the fullest cells come first."""
+        """Return the mirrors that move next; those that relieve the fullest cells come first."""
         fullness = (self._flux / np.maximum(self._cap, 1.0)) ** 8
         gain = {row: float(((after - b) * fullness).sum()) for row, (b, _, after) in ways.items()}
         bound = self._flux.copy()
@@ -335,7 +337,7 @@ class _Walk:
         return stuck[: min(self._now.together, self._now.most - self._moved)]
 
     def relieved(self, rows: Rows) -> list[Move]:
-        """Return the mirrors that rest since cells are above the limit: the least that help."""
+        """Rest a few mirrors while cells are above the limit, the most effective first."""
         moves: list[Move] = []
         while len(rows):
             over = np.maximum(self._flux - (1.0 + HOLDS) * self._cap, 0.0)
@@ -354,7 +356,7 @@ class _Walk:
 
 
 def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
-    """Return the aims of most power, from those of this process before where they fit."""
+    """Return the aims of maximum power, starting from this process's earlier aims if they fit."""
     scene = replace(now.scene, dark=~now.free)
     at, start = now.at, None
     if _last:
@@ -396,7 +398,7 @@ def _safe(now: Round, room: FloatArray, light: dict[str, Any]) -> FloatArray:
 
 
 def _risk(engine: FieldFlux, demand: Demand, limit: FloatArray) -> Risk:
-    """Return how far the flux may be off."""
+    """Return the uncertainty of the flux."""
     mirrors, lit = engine.scene.mirrors, engine.leaving > 0.0
     if not lit.any() or not (mirrors.pointing.any() or demand.shared.any):
         return Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
@@ -409,7 +411,7 @@ def _risk(engine: FieldFlux, demand: Demand, limit: FloatArray) -> Risk:
 
 
 def _posed(scene: Scene, aims: FloatArray) -> Scene:
-    """Return the scene with its mirrors at aims (H, 3); those without one are dark."""
+    """Return the scene with its mirrors at aims (H, 3); mirrors without an aim are dark."""
     given = _given(aims)
     places = np.where(given[:, None], aims, middles(scene))
     return replace(scene, mirrors=scene.mirrors.toward(scene.sun, places), dark=~given)

@@ -1,9 +1,9 @@
-"""Aims of a scene under a flux limit: choice, true flux, error of the choice's images, again.
+"""Aims of a scene under a flux limit, by repeated choice and correction with the true flux.
 
-The optimiser adds images that were computed once, at a few places, and are moved by rows. The
-engine then computes the flux at the aims that were chosen, and the errors' quantile there; what
-this differs by is taken from the limit, and the choice is made again, until the engine's own flux
-with its quantile keeps the limit.
+The optimiser adds images that were computed once, at a few places, and are shifted by whole rows.
+The engine then computes the flux at the aims that were chosen, and its quantile under pointing
+errors. The difference is subtracted from the limit and the choice is repeated, until the quantile
+of the engine's own flux respects the limit.
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,15 +24,15 @@ from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import Scene
 from heliotrope.optics.shading import IntArray
 
-#: Choices at most; the limit is approached from this share below it.
+#: Maximum number of choices; the limit is approached from this share below it.
 ROUNDS, BELOW = 16, 5e-4
-#: Rounds after which no cell gets room back, and no mirror moves that need not.
+#: Rounds after which no cell regains room, and no mirror moves unnecessarily.
 FREE = 3
-#: What is missing then is taken from the limit so many times over.
+#: From then on the remaining excess times this factor is subtracted from the limit.
 BEYOND = 1.5
-#: What errors leave of the limit at least, for the next choice; excess that counts as none.
+#: Least share of the limit left to the next choice after errors; excess that counts as zero.
 LEAST, HOLDS = 0.02, 1e-3
-#: Sweeps of all choices but the first.
+#: Sweeps of every choice after the first.
 AGAIN = 2
 #: A cell binds if its quantile is within this share of the limit.
 BINDS = 0.01
@@ -40,16 +40,16 @@ BINDS = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Demand:
-    """What the aims of a scene must keep.
+    """Requirements that the aims of a scene must meet.
 
     Attributes
     ----------
     limit
         Flux limit.
     probability
-        That it holds in all cells at once.
+        Probability that the limit holds in all cells at once.
     shared
-        Errors that mirrors share; each mirror's own are its ``pointing``.
+        Errors that mirrors share; each mirror's own error is its ``pointing``.
     groups
         Cluster of each mirror, 0 to G − 1, (H,); None: one cluster.
     pole
@@ -81,17 +81,17 @@ class SceneAims:
     engine
         Flux at these aims; defocused mirrors are dark.
     field, choice
-        The candidates, and which each mirror takes.
+        The candidates, and the one that each mirror takes.
     aims
         ENU m, (H, 3); those of defocused mirrors are at half height.
     defocused
         (H,).
     limit
-        What each cell may get, less the margin, W/m², (rows, columns).
+        Allowable flux in each cell, less the margin, W/m², (rows, columns).
     risk
-        How far the flux may be off.
+        Uncertainty of the flux.
     light
-        Arguments of `FieldFlux` beside the scene.
+        Arguments of `FieldFlux` other than the scene.
     """
 
     engine: FieldFlux
@@ -105,17 +105,17 @@ class SceneAims:
 
     @property
     def quantile(self) -> FloatArray:
-        """Flux that is passed nowhere with the chosen probability, W/m², (rows, columns)."""
+        """Flux that no cell exceeds, with the chosen probability, W/m², (rows, columns)."""
         return as_float(self.engine.maps[0] + self.risk.above)
 
     @property
     def excess(self) -> float:
-        """Greatest of the quantile over the limit, less 1; 0 or less: the limit holds."""
+        """Greatest ratio of the quantile to the limit, less 1; 0 or less: the limit holds."""
         return float((self.quantile / self.limit).max()) - 1.0
 
     @cached_property
     def gain(self) -> FloatArray:
-        """What a perfect calibration of each mirror would add to the power, W, (H,)."""
+        """Power that a perfect calibration of each mirror would add, W, (H,)."""
         return gains(self.engine, self.risk, self.choice.prices.T)
 
     @property
@@ -133,21 +133,21 @@ def aim_scene(
     progress: Step | None = None,
     **light: Any,
 ) -> SceneAims:
-    """Return aims of most power under a flux limit, or those of another strategy.
+    """Return the aims of maximum power under a flux limit, or those of another strategy.
 
     Parameters
     ----------
     scene
-        With one receiver; its aims do not count.
+        Has one receiver; its aims are ignored.
     demand
-        The limit, and with which certainty it must hold.
+        The limit, and the probability with which it must hold.
     strategy
-        One of `heliotrope.aims.STRATEGIES`; all but "optimal" take no heed of the limit.
+        One of `heliotrope.aims.STRATEGIES`; all but "optimal" ignore the limit.
     start
         Aims of the same mirrors and receiver at another sun, irradiance or limit, or with other
         mirrors in ``dark``: their images are used again, which takes a fraction of the time.
     progress
-        Called with the work done and all of it.
+        Called with the amount of work done and the total.
     **light
         Arguments of `FieldFlux`.
 
@@ -184,7 +184,7 @@ def _held(
     light: dict[str, Any],
 ) -> SceneAims:
     aimed_at = (1.0 - BELOW) * limit
-    # What the engine with its quantile has more than the images' sum.
+    # Difference between the engine's flux quantile and the sum of the images.
     more = np.zeros_like(limit)
     choice = None if start is None else start.choice
     if start is not None:
@@ -204,7 +204,7 @@ def _held(
         if best.excess <= 0.0 and (k + 1 >= FREE or best.excess > -BINDS):
             break
         new = trial.quantile - choice.flux.T
-        # From then on no cell gets room back, so that the rounds end.
+        # From then on no cell regains room, so that the rounds come to an end.
         more = new if k < FREE else more + BEYOND * np.maximum(new - more, 0.0)
     assert best is not None
     if best.excess > HOLDS:
@@ -213,7 +213,7 @@ def _held(
 
 
 def _rank(trial: SceneAims) -> tuple[bool, float]:
-    """Return the sort key of aims: power where they hold the limit, else the excess."""
+    """Return the sort key of aims: the power if they hold the limit, otherwise the excess."""
     holds = trial.excess <= 0.0
     return holds, trial.engine.powers[0] if holds else -trial.excess
 
@@ -233,14 +233,15 @@ def _posed(scene: Scene, aims: FloatArray, off: npt.NDArray[np.bool_] | None) ->
 
 
 def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
-    """Return earlier candidates in the present light."""
+    """Return earlier candidates rescaled to the present light."""
     if len(scene.mirrors) != len(start.aims):
         raise InputError(
             f"aims: the start has {len(start.aims)} mirrors, the scene {len(scene.mirrors)}; begin "
             "without it"
         )
     before, now = start.engine.leaving, base.leaving
-    # A defocused mirror sends nothing now or then; the field's light stands for its own.
+    # A mirror that is defocused now or was then has no light of its own to compare; use the
+    # field's.
     usual = now.sum() / max(float(before[now > 0.0].sum()), 1e-300)
     ratio = np.where(before > 0.0, now / np.where(before > 0.0, before, 1.0), usual)
     if scene.dark is not None:

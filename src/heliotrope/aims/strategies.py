@@ -1,4 +1,4 @@
-"""Aims that need no optimiser, to compare with: the middle, a spread, image-size priority."""
+"""Aims without an optimiser, for comparison: the middle, a spread, image-size priority."""
 
 from typing import Literal
 
@@ -11,7 +11,7 @@ from heliotrope.optics.scene import Scene
 from heliotrope.optics.shading import IntArray
 from heliotrope.optics.surfaces import Plate
 
-#: Beams of "spread" and "image-size" keep so many standard deviations within the edge.
+#: Beams of "spread" and "image-size" stay this many standard deviations within the edge.
 INSIDE = 2.0
 Strategy = Literal["middle", "spread", "image-size", "optimal"]
 #: Names, in the order of a comparison.

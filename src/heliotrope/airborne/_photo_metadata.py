@@ -53,7 +53,7 @@ class Metadata:
 
     @property
     def angles_deg(self) -> tuple[float, float, float]:
-        """Yaw, pitch and roll."""
+        """Yaw, pitch and roll in degrees."""
         return self.yaw_deg, self.pitch_deg, self.roll_deg
 
 
@@ -69,7 +69,7 @@ def read_metadata(path: str | Path) -> Metadata:
 
     file = Path(path)
     try:
-        # Not Image.open: its limit of pixels is one for the whole process.
+        # Not Image.open, because its pixel limit applies to the whole process.
         with file.open("rb") as stream, jpeg_factory(stream) as image:
             size, packet, exif = image.size, image.info.get("xmp", b""), image.getexif()
             tags = dict(exif.get_ifd(_EXIF_IFD))
@@ -95,7 +95,7 @@ def read_metadata(path: str | Path) -> Metadata:
         size=(int(size[0]), int(size[1])),
         time=_time(values, tags),
         latitude_deg=number("GpsLatitude"),
-        # The firmware of some drones misspells it.
+        # The firmware of some drones misspells this name.
         longitude_deg=number("GpsLongitude", "GpsLongtitude"),
         altitude=number("AbsoluteAltitude"),
         yaw_deg=number("GimbalYawDegree"),

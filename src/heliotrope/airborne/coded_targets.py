@@ -14,7 +14,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 
-#: Numbers that a target may have, and cells across the black square.
+#: Number of different targets, and cells across the black square.
 NUMBERS, CELLS = 250, 6
 #: White margin of the sheet, cells.
 MARGIN = 1
@@ -22,7 +22,7 @@ MARGIN = 1
 
 @dataclass(frozen=True)
 class CodedTarget:
-    """A target where it lies.
+    """A target and its position.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ def square_target(
 
 
 def target_sheet(number: int, side_mm: float) -> str:
-    """Return a sheet to print, as SVG in millimetres: the black square has the given side."""
+    """Return a printable sheet as SVG in millimetres, whose black square has the given side."""
     cell = side_mm / CELLS
     whole = side_mm + 2 * MARGIN * cell
     rows, columns = np.nonzero(white_cells(number))

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
 #: Suffix of the files.
 SUFFIX = ".h5"
-# Most cells along an edge of a facet, and points for each cell: a mean of few points is noisy.
+# Maximum number of cells along an edge of a facet, and points per cell, because a mean of few
+# points is noisy.
 _CELLS, _POINTS = 64, 4
-# Least share of the points that must lie on their facet; others are at its rim.
+# Minimum share of the points that must lie on their facet; the others are at its rim.
 _ON_FACET = 0.5
 _WHAT = "a deflectometry file in PAINT's form (.h5)"
 
@@ -92,7 +93,7 @@ def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, Float
 
     both = []
     for name in ("surface_points", "surface_normals"):
-        # A link to another file, or data outside this one, would read what nobody named.
+        # A link to another file, or external data, would read files that the user did not name.
         linked = root.get(f"{facet}/{name}", getlink=True)
         data = root[f"{facet}/{name}"] if isinstance(linked, h5py.HardLink) else None
         if not isinstance(data, h5py.Dataset) or data.external or data.is_virtual:

@@ -41,7 +41,7 @@ IntArray = npt.NDArray[np.intp]
 _CELLS = 4
 # Nodes processed together: tens of megabytes.
 _BLOCK = 400_000
-# How much g may differ from its bilinear form, as a share of its range in the cell.
+# Allowed difference of g from its bilinear form, as a share of its range in the cell.
 _MARGIN = 0.05
 _ITERATIONS = 30
 
@@ -367,7 +367,7 @@ def orientation(mechanism: Mechanism, counts: npt.ArrayLike) -> tuple[FloatArray
         Counts of the drives, (..., D).
     """
     frame = mirror_frame(mechanism.normal)
-    # A mechanism turns any direction fixed to the mirror as it turns the normal.
+    # A mechanism rotates any direction fixed to the mirror in the same way as the normal.
     right = replace(mechanism, normal=frame[..., 0]).pose(counts)
     pose = mechanism.pose(counts)
     up = np.cross(pose.normal, right.normal)
@@ -398,8 +398,8 @@ def reflection_points(
 ) -> ReflectionPoints:
     """Return all points of a mirror that show the lamp to the camera, for P positions.
 
-    A facet may show it nowhere, once or several times. The points are exact to 1e-9 m. Where a
-    whole patch lights up, at its centre of curvature, there is no single point, and it is left
+    A facet may show it nowhere, once or several times. The points are exact to 1e-9 m. If a whole
+    patch lights up, at its centre of curvature, there is no single point, and the patch is left
     out. Obstruction by other mirrors and facets is not considered.
 
     Parameters
@@ -478,7 +478,7 @@ def _candidates(
             total[k] += path[k] * scale
     axes = shape.axes[which]
     u, v, w = (sum(total[i] * axes[:, k, i] for i in range(3)) for k in range(3))
-    # Nothing is seen from behind the facet: NaN compares false below.
+    # Nothing is visible from behind the facet; the NaN compares false below.
     ahead = np.where(w > 0.0, w, np.nan)
     maybe = np.ones((len(camera), facets, rows - 1, columns - 1), dtype=np.bool_)
     corners = []
@@ -550,7 +550,7 @@ def _newton(
         step = np.where(usable[:, None], step, 0.0)
         good = usable & (np.abs(step) < 1e-10).all(axis=-1)
         share = step / patch.size
-        # Beyond the next cell the function is a different one.
+        # Beyond the next cell a different function applies.
         share /= np.maximum(1.0, np.abs(share).max(axis=-1, keepdims=True, initial=0.0))
         st = st + share
         if good.all():

@@ -18,7 +18,7 @@ from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 _COLUMNS = ("facet", "row", "column", "slope_u_mrad", "slope_v_mrad")
-#: A larger deviation must be in another unit, rad.
+#: A larger deviation is probably in another unit, rad.
 LARGEST = 0.1
 # Largest share of a facet's map that may be missing; it is filled from the nearest cell.
 _MOST_HOLES = 0.5
@@ -137,7 +137,7 @@ def smooth_slopes(
     slope = np.zeros((len(shape), cells, cells, 2))
     for k, (half_width, half_height) in enumerate(shape.half_size):
         step = np.array([2.0 * half_height, 2.0 * half_width]) / cells
-        # A border as wide as the filter makes the edges as rough as the middle.
+        # A border as wide as the filter makes the edges as rough as the interior.
         border = [int(np.ceil(3.0 * length / s)) for s in step]
         size = [cells + 2 * b for b in border]
         high = gaussian_filter(generator.standard_normal(size), length / step, mode="wrap")

@@ -17,11 +17,12 @@ Mask = npt.NDArray[np.bool_]
 
 #: Mirrors with a shorter side are not measured, px.
 SMALLEST = 12.0
-#: Fewer reflections of a mirror give no meaningful standard deviation.
+#: With fewer reflections of a mirror, the standard deviation is meaningless.
 FEWEST = 5
-#: A spot is not searched this close to an edge, px: half its width, and the edge's own error.
+#: Spots closer to an edge than this are not searched for, px: half the spot width, plus the error
+#: of the edge.
 MARGIN = 2
-#: If more than this share of mirrors is hidden by more than `_TOUCHED`, their pictures merge.
+#: If more than this share of the mirrors is hidden by more than `_TOUCHED`, their images merge.
 _MERGED, _TOUCHED = 0.1, 0.02
 #: Fractional bits of polygons' corners.
 _BITS = 4
@@ -61,7 +62,7 @@ def draw_labels(
 
 @dataclass(frozen=True)
 class Visibility:
-    """How well a camera sees N mirrors from one place.
+    """How well a camera sees N mirrors from one position.
 
     Attributes
     ----------

@@ -25,17 +25,18 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.sun import Site
 from heliotrope.values import amount
 
-#: The sky turns by this, rad/s (a mean solar day: the sun).
+#: Rotation rate of the sky, rad/s (of the sun, in a mean solar day).
 RATE = 2.0 * np.pi / 86400.0
-#: Trials reach this far, in steps of this, s: all zones of the Earth.
+#: Range and step of the trial offsets, s: all time zones of the Earth.
 REACH, STEP = 14 * 3600.0, 3600.0
-#: An error of the clock is stated from this many standard deviations on.
+#: A clock error is reported from this many standard deviations on.
 CLEAR = 3.0
-#: Mirrors and sightings of each for the test: those with the most; fewer for the first search.
+#: Number of heliostats (those with the most sightings) and of sightings of each in the test; fewer
+#: in the first search.
 MIRRORS, MOST, FIRST = 10, 60, 20
-#: Fewest sightings of a mirror that say something about the clock.
+#: Minimum number of sightings of a heliostat that say something about the clock.
 FEWEST = 8
-#: Most steps from a start.
+#: Maximum number of steps from a start.
 ROUNDS = 8
 #: Weight of the stated sigma in the estimate of the noise, degrees of freedom.
 FREEDOM = 5.0
@@ -142,7 +143,7 @@ class _Step:
 def _settled(
     mechanism: Mechanism, sightings: Sightings, model: tuple[str, ...], site: Site, shift: float
 ) -> _Step:
-    """Return the shift at which the sightings ask for no other, from a start."""
+    """Return the shift at which the sightings require no further shift, from a start."""
     for _ in range(ROUNDS):
         step = _step(mechanism, sightings, model, site, shift)
         done = abs(step.shift - shift) < 0.1 * step.sigma
@@ -157,8 +158,9 @@ def _step(
 ) -> _Step:
     """Return one Gauss-Newton step.
 
-    With H, B and Z the normal matrices of a mirror's own parameters, of their coupling with the
-    shift and of the shift, the mirror reveals Z - B^T H^-1 B of the shift (as in `fit.common`).
+    With H, B and Z the normal matrices of a heliostat's own parameters, of their coupling with the
+    shift and of the shift, the heliostat provides the information Z - B^T H^-1 B on the shift (as
+    in `fit.common`).
     """
     moved = later(sightings, site, shift)
     fitted = fit(mechanism, moved, model, adapt_scale=False)
@@ -184,7 +186,7 @@ def _step(
         (pulled, weight * (by_shift * line.residual).sum(axis=1)),
     ):
         np.add.at(total, row, term)
-    # The fit has ended: the parameters ask for no change of their own.
+    # The fit has converged, so the parameters alone require no change.
     information = revealed - (coupling * np.linalg.solve(normal, coupling[..., None])[..., 0]).sum(
         1
     )
@@ -193,14 +195,14 @@ def _step(
     known = float(information.sum())
     change, variance = -float(pulled.sum()) / known, 1.0 / known
     if count > 2:
-        # Where mirrors disagree by more than their noise, their scatter is the uncertainty.
+        # If heliostats disagree by more than their noise, their scatter is the uncertainty.
         away = -pulled / information - change
         variance *= max(1.0, float((information * away**2).sum()) / (count - 1))
     return _Step(shift + change, float(np.sqrt(variance)))
 
 
 def _noise(fitted: FieldFit) -> FloatArray:
-    """Return the variance of each mirror's sightings in units of their sigma, (N,)."""
+    """Return the variance of each heliostat's sightings in units of their sigma, (N,)."""
     square = (fitted.lengths * fitted.scale[fitted.rows]) ** 2
     robust = CAUCHY_WIDTH**2 * np.log1p(square / CAUCHY_WIDTH**2)
     count = len(fitted.scale)
@@ -210,10 +212,10 @@ def _noise(fitted: FieldFit) -> FloatArray:
 
 
 def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
-    """Return sightings of the sun with the suns as they stood ``shift`` s later.
+    """Return sightings of the sun with the sun positions of ``shift`` s later.
 
-    Where a time is known and the given sun stood there, that is the sun of the other time; else the
-    given sun is turned about the pole.
+    If the time is known and matches the stated sun vector, the sun position is computed for the
+    shifted time; otherwise the stated vector is rotated about the pole.
     """
     latitude = np.radians(site.latitude_deg)
     turn = rotation(np.array([0.0, np.cos(latitude), np.sin(latitude)]), -RATE * shift)
@@ -222,7 +224,7 @@ def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
     agree = angle_between(sightings.source[rows], solar.vector(sightings.time[rows], site)) < MOVED
     rows = rows[agree]
     source[rows] = solar.vector(sightings.time[rows] + shift, site)
-    # A sun sensor looks at the sun too.
+    # A sun sensor also faces the sun.
     far = sightings.destination_at_infinity[:, None]
     return replace(
         sightings, source=source, destination=np.where(far, source, sightings.destination)
@@ -230,7 +232,7 @@ def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
 
 
 def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings:
-    """Return at most so many sightings of each of some mirrors, spread over theirs."""
+    """Return at most a given number of sightings per heliostat, spread over all its sightings."""
     rows, place = [], []
     for k, row in enumerate(chosen):
         mine = np.flatnonzero(suns.heliostat == row)

@@ -24,7 +24,7 @@ Field: TypeAlias = Mechanism | Heliostat | Heliostats | Plant
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """The place of heliostats that are learnt: what a forecast needs besides them.
+    """The surroundings of learnt heliostats, which a forecast needs in addition.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Members:
     names
         (N,); () if unknown.
     single
-        Whether one was given without a batch axis.
+        Whether a single heliostat was passed without a batch axis.
     around
         Their surroundings.
     """
@@ -68,10 +68,10 @@ class Members:
         Raises
         ------
         InputError
-            If a sighting is of a heliostat that is not there, or sightings with names meet
-            another number of heliostats without.
+            If a sighting refers to a heliostat that does not exist, or sightings with names are
+            matched with a different number of heliostats without names.
         UnknownNameError
-            If a sighting names a heliostat that is not there.
+            If a sighting names a heliostat that does not exist.
         """
         count, drives = len(self.mechanism), len(self.mechanism.driven)
         if not isinstance(sightings, Sightings):

@@ -16,12 +16,12 @@ from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.optics.mirror_surface import equal_facets
 from heliotrope.optics.obstruction import Neighbours, centroid_shift, nearest
 
-#: The focal length of a mirror whose facets are not known is that of its distance to the target,
+#: A mirror with unknown facets is assumed to have its distance to the target as focal length, to
 #: within this share.
 _FOCAL = 0.25
-#: Part of a shift that stays unknown, as the neighbours need not look where they are assumed to.
+#: Share of a shift that remains uncertain, because the neighbours may not point where assumed.
 UNKNOWN = 0.25
-#: A destination is on a target if it is this near to its plane, m.
+#: A destination is on a target if it is this close to the target's plane, m.
 _ON_PLANE = 0.1
 
 
@@ -34,7 +34,8 @@ class Unobstructed:
     sightings
         The sightings with corrected destinations and the uncertainty of the correction.
     shift
-        What was taken off, right and up on the target, m, (M, 2); 0 where nothing hides.
+        The shift that was removed, right and up on the target, m, (M, 2); 0 if nothing hides the
+        mirror.
     hidden
         Share of the mirror that neighbours hid, (M,).
     """
@@ -55,7 +56,7 @@ class Unobstructed:
         )
 
     def summary(self) -> dict[str, float]:
-        """Return the numbers of sightings and of corrected ones, and their shifts."""
+        """Return the numbers of sightings and of corrected sightings, and their shifts."""
         moved = self.hidden > 0.0
         size = 1e3 * np.linalg.norm(self.shift, axis=1)[moved]
         return {
@@ -74,19 +75,19 @@ def unobstructed(
     Parameters
     ----------
     heliostats
-        All mirrors that may hide one another; rows as those of the sightings.
+        All heliostats that may hide one another; the sightings refer to them by index.
     targets
         Sightings of the sun's beam on one of them are corrected; others stay as they are.
     sightings
         The sightings.
     aim
-        Where the neighbours look, ENU metres, (3,), unless they have aims of their own.
+        Aim point of neighbours without their own aims, ENU metres, (3,).
 
     Notes
     -----
-    The canting of mirrors whose facets are not known is assumed to be for the target. Their shift
-    is uncertain by what it changes with focal lengths a quarter longer and shorter, and every
-    shift by a quarter of itself.
+    The canting of mirrors whose facets are not known is assumed to be for the target. The
+    uncertainty of their shift includes its change with focal lengths a quarter longer and shorter;
+    every shift is also uncertain by a quarter of itself.
     """
     place = heliostats.position
     own = np.full_like(place, np.nan) if heliostats.aim is None else heliostats.aim
@@ -121,7 +122,7 @@ def unobstructed(
 
 
 def _under(targets: tuple[Target, ...], point: FloatArray) -> Target | None:
-    """Return the target that a point is on, None if it is on none."""
+    """Return the target on which a point lies; None if it lies on no target."""
     for target in targets:
         across = np.abs(target.plane_coordinates(point) - target.plane_coordinates(target.center))
         off = abs(float((point - target.center) @ target.normal))
@@ -156,7 +157,7 @@ def shift_of(
     neighbours
         Mirrors beside it.
     unknown
-        Part of the shift that stays unknown.
+        Share of the shift that remains uncertain.
 
     Returns
     -------

@@ -25,31 +25,34 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.sun import Site
 
-#: Years with sightings, Unix seconds: no heliostat is older, and later ones are typing errors.
+#: Period of possible sightings, Unix seconds: no heliostat is older, and later times are typing
+#: errors.
 EARLIEST, LATEST = 0.0, datetime(2100, 1, 1, tzinfo=UTC).timestamp()
 YEAR = "the year is out of range, 1970 to 2099: correct the time"
 #: A time may be this far ahead of the computer's clock, which may be slow itself, s.
 AHEAD = 366 * 86400.0
-#: Lowest elevation of the sun's centre with a beam: its radius, and the dip of the horizon, rad.
+#: Lowest elevation of the sun's centre at which there is a beam: solar radius plus horizon dip,
+#: rad.
 LOWEST = float(np.radians(-0.5))
-#: Largest angle between a given sun and the sun at the given time, rad: four minutes.
+#: Largest angle between a stated sun vector and the sun at the stated time, rad: four minutes.
 MOVED = float(np.radians(1.0))
-#: Largest angle of incidence, rad: beyond it the mirror is seen edge-on.
+#: Largest angle of incidence, rad; beyond it the mirror is seen edge-on.
 EDGE_ON = float(np.radians(89.0))
 #: Angle beyond a stop, or behind a mirror, that uncalibrated zeros may explain, rad.
 PLAY = float(np.radians(5.0))
 #: A destination may lie off its surface, m, and beyond its border by this share of its size.
 OFF, BEYOND = 0.5, 0.5
-#: A point nearer to the mirror than this lies on the mirror itself, m.
+#: A point closer to the mirror than this lies on the mirror itself, m.
 NEAREST = 0.5
-#: Sightings with the same counts and the same point are one reading if their suns differ by less
-#: than this, rad: a minute. The centroids of two photographs differ in their last digit.
+#: Sightings with the same counts and the same point are one reading if their sun vectors differ by
+#: less than this, rad: a minute. The centroids of two photographs differ in their last digit.
 SAME = float(np.radians(0.25))
-#: A beam at one point in this many sightings or more, of different suns, was not measured.
+#: A beam at the same point in this many sightings or more, at different sun positions, was not
+#: measured.
 REPEATED = 3
 
 Rows = npt.NDArray[np.bool_]
-#: A reason for all refused rows, or one for each of them.
+#: One reason for all refused rows, or one reason per row.
 Texts = str | Sequence[str]
 
 
@@ -80,8 +83,7 @@ def judge(
 ) -> Judgement:
     """Return the reasons why some of the sightings are impossible.
 
-    A sighting gets the first reason that applies. The more of the optional arguments are given, the
-    more is checked.
+    A sighting gets the first reason that applies. Each optional argument enables further checks.
 
     Parameters
     ----------
@@ -130,7 +132,7 @@ def judge(
 def judge_in(
     plant: Plant, sightings: Sightings, kinds: Sequence[str] = (), now: float | None = None
 ) -> Judgement:
-    """Return the judgement by all that a plant knows; rows are those of its heliostats."""
+    """Return the judgement with everything that a plant knows; rows are those of its heliostats."""
     return judge(
         sightings,
         mechanism=plant.nominal if len(plant.groups) == 1 else None,
@@ -142,7 +144,7 @@ def judge_in(
 
 
 def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:
-    """Give rows their reason, one text for all of them or one for each, where they have none."""
+    """Assign a reason, common or per row, to the rows that have none yet."""
     places = np.flatnonzero(rows)
     row_texts = [texts] * len(places) if isinstance(texts, str) else texts
     for i, text in zip(places, row_texts, strict=True):
@@ -150,7 +152,7 @@ def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:
 
 
 def _impossible(sightings: Sightings, now: float | None) -> Iterator[tuple[Rows, Texts]]:
-    """Yield the sightings that are impossible for any mirror anywhere."""
+    """Yield the sightings that are impossible for any heliostat anywhere."""
     time = sightings.time
     out = (time < EARLIEST) | (time > LATEST)
     yield out, YEAR
@@ -170,8 +172,8 @@ def _impossible(sightings: Sightings, now: float | None) -> Iterator[tuple[Rows,
 def copies(sightings: Sightings) -> Rows:
     """Return a mask of the sightings that repeat an earlier one, (M,).
 
-    Mirror, counts and destination are the same to the last digit, and so is the source; a sun may
-    have moved by less than `SAME`.
+    Heliostat, counts, destination and source are the same to the last digit, except that the sun
+    may have moved by less than `SAME`.
     """
     again = np.zeros(len(sightings), np.bool_)
     if not len(sightings):
@@ -180,7 +182,7 @@ def copies(sightings: Sightings) -> Rows:
     _, group, count = np.unique(table, axis=0, return_inverse=True, return_counts=True)
     rows = np.flatnonzero(count[group] > 1)
     while len(rows):
-        # The first of each group that is left, and those that repeat it.
+        # The first remaining sighting of each group, and the sightings that repeat it.
         _, first, of_group = np.unique(group[rows], return_index=True, return_inverse=True)
         lead = rows[first[of_group]]
         gap = np.linalg.norm(sightings.source[rows] - sightings.source[lead], axis=1)
@@ -191,7 +193,7 @@ def copies(sightings: Sightings) -> Rows:
 
 
 def _repeated(sightings: Sightings, photographed: Rows, reasons: Mapping[int, str]) -> Rows:
-    """Return the sightings by a camera of mirrors whose beam never moved, though they did."""
+    """Return the camera sightings of heliostats that moved although their beam never did."""
     rows = photographed & ~np.isin(np.arange(len(sightings)), list(reasons))
     mirror = sightings.heliostat[rows]
     if not len(mirror):
@@ -210,7 +212,7 @@ def _repeated(sightings: Sightings, photographed: Rows, reasons: Mapping[int, st
 def _contradicted(
     sightings: Sightings, site: Site, reasons: Mapping[int, str]
 ) -> tuple[Rows, Texts, str]:
-    """Return the suns that are wrong for their time; a note where most of a mirror's are."""
+    """Return the sun vectors that are wrong for their time; a note if most of a heliostat's are."""
     able = sightings.source_at_infinity & np.isfinite(sightings.time)
     able[list(reasons)] = False
     if not able.any():
@@ -269,7 +271,7 @@ def _off_target(
 def _beyond_machine(
     sightings: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
 ) -> Iterator[tuple[Rows, Texts]]:
-    """Yield the sightings that are beyond their mirror's abilities."""
+    """Yield the sightings that are beyond their heliostat's abilities."""
     mirrors = mechanism[sightings.heliostat]
     pose = mirrors.pose(sightings.counts)
     near = np.zeros(len(sightings), np.bool_)
@@ -286,7 +288,7 @@ def _beyond_machine(
         edge = ~near & ~(size > 2.0 * np.cos(EDGE_ON))
         miss = angle_between(pose.normal, total / np.maximum(size, 1e-9)[:, None])
     yield edge, f"the beam passes the mirror edge-on, {np.degrees(EDGE_ON):.0f}° from its normal"
-    # Only a nominal mechanism that holds for most of a mirror's sightings judges the others.
+    # A nominal mechanism judges sightings only if it holds for most sightings of its heliostat.
     good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(sightings)), list(reasons)))
     holds = np.zeros(len(mechanism), np.bool_)
     for row in np.unique(sightings.heliostat[good]):
@@ -315,9 +317,9 @@ def _beyond_machine(
 def _reach(
     mirrors: Mechanism, counts: FloatArray, drive: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
-    """Return the values of a drive, its limits with play, the most a zero explains, and the unit.
+    """Return a drive's values, its limits with tolerance, the most a zero explains, and the unit.
 
-    All (M,), in counts where the drive has limits of counts, else in degrees.
+    All have shape (M,), in counts if the drive has count limits, otherwise in degrees.
     """
     table = mirrors.drives.table[:, drive]
     low, high = (table[:, SLOTS[name]] for name in ("min_count", "max_count"))

@@ -37,7 +37,7 @@ class Provenance(StrEnum):
     CAMERA = "camera"
     DRONE = "drone"
     TABLE = "table"
-    #: Without sightings: a person has set the values.
+    #: Without sightings: an operator has set the values.
     PERSON = "person"
 
 
@@ -52,15 +52,16 @@ class CalibrationOutcome(StrEnum):
     IMPLAUSIBLE = "implausible"
     POOR_FIT = "poor_fit"
     NO_BETTER = "no_better"
-    #: A photograph did not confirm the new parameters; the old ones are back.
+    #: A photograph did not confirm the new parameters; the old ones have been restored.
     NOT_VERIFIED = "not_verified"
-    #: In a joint visit no beam was proven to be its own.
+    #: In a joint visit, no beam was identified as this heliostat's.
     NOT_PROVEN = "not_proven"
     REFUSED = "refused"
-    #: An order that the mirror had not caused took it out of the visit: a person's, an emergency.
+    #: An order that the heliostat had not caused, such as an operator's or an emergency, took it
+    #: out of the visit.
     TAKEN_OUT = "taken_out"
     ERROR = "error"
-    #: Unchanged for a reason that was not kept.
+    #: Unchanged for a reason that was not recorded.
     UNCHANGED = "unchanged"
 
     @property
@@ -102,7 +103,7 @@ class HeliostatCalibration(Value, Framed):
     outcome
         How the fit ended.
     sightings, left_out
-        Numbers of the sightings used, (M,), and of those left out of the fit, as given by the
+        Numbers of the sightings used, (M,), and of those left out of the fit, as assigned by the
         store; 0 for a sighting that no store keeps.
     residual_before, residual_after
         Beam error of each sighting used, to the right of and above the destination as seen from
@@ -120,8 +121,9 @@ class HeliostatCalibration(Value, Framed):
     version
         1, 2, ... for each heliostat; 0 before it is numbered.
     growth
-        How the covariance grows after the fit. It belongs to the group: a fit gives the default of
-        its kind, the plant's beliefs what is known of the group, and no store keeps it here.
+        How the covariance grows after the fit. The growth belongs to the group: a fit sets the
+        default of its kind, the plant's beliefs set what is known of the group, and no store keeps
+        it here.
 
     Raises
     ------
@@ -296,7 +298,7 @@ class HeliostatCalibration(Value, Framed):
 
     @property
     def heliostats(self) -> tuple[str, ...]:
-        """The name, as `Mechanism.with_calibration` and others take it."""
+        """The name, in the form that `Mechanism.with_calibration` and others take."""
         return (self.heliostat,)
 
     @property
@@ -318,7 +320,7 @@ class HeliostatCalibration(Value, Framed):
         return self.growth.grown(self.covariance, self.names, days)
 
     def growing(self, growth: Growth) -> Self:
-        """Return the same calibration, whose covariance grows otherwise from its fit on."""
+        """Return the same calibration with another growth of its covariance after the fit."""
         other = copy(self)
         object.__setattr__(other, "growth", growth)
         return other
@@ -331,7 +333,7 @@ class HeliostatCalibration(Value, Framed):
 def covariances_at(records: Sequence[HeliostatCalibration], time: float) -> FloatArray:
     """Return the covariances of K records at a POSIX time, (K, P, P).
 
-    The records have the same parameters and one growth, as those of a group have.
+    The records must have the same parameters and the same growth, as in a group.
     """
     first, days = records[0], np.array([(time - record.at) / DAY for record in records])
     whole = np.stack([record.covariance for record in records])

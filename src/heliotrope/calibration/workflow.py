@@ -40,9 +40,9 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.mechanism.chain import Mechanism
 
-#: How the sequential split learns on.
+#: Learners that the sequential split may use after training.
 Learner = Literal["stream", "batch"]
-#: Called with (name of the step, done, all).
+#: Function called with (name of the step, done, total).
 Steps = Callable[[str, int, int], None]
 
 
@@ -177,11 +177,12 @@ class ModelChoice:
     Attributes
     ----------
     parameters
-        To be fitted.
+        Parameters to be fitted.
     mechanism
-        Nominal, (N,), with the ratios of the periodic errors that were found and are part of it.
+        Nominal mechanisms, (N,), with the ratios of the periodic errors that were found and
+        included.
     scores
-        All models compared; empty if the sightings are too few.
+        All models compared; empty if there are too few sightings.
     periodic
         The best periodic error of each drive whose ratio is unknown, significant or not.
     """
@@ -192,7 +193,7 @@ class ModelChoice:
     periodic: tuple[PeriodicError, ...] = ()
 
     def describe(self) -> tuple[str, ...]:
-        """Return lines for people: the comparison, and the periodic errors that were found."""
+        """Return lines for display: the comparison, and the periodic errors that were found."""
         lines = tuple(f"{error}." for error in self.periodic if error.found)
         return (*models.describe(self.scores), *lines)
 
@@ -205,16 +206,16 @@ def find_model(
 ) -> ModelChoice:
     """Return the simplest model that explains the sightings.
 
-    The periodic error of a drive is among the candidates where the plant gives its ratio, or
-    where `search_periodic_errors` finds one in the residuals.
+    The periodic error of a drive is among the candidates if the plant specifies its ratio, or if
+    `search_periodic_errors` finds one in the residuals.
 
     Parameters
     ----------
     mechanism
         Nominal, (N,).
     sightings
-        M of these heliostats; with too few for a comparison the smallest model is returned
-        without scores.
+        M sightings of these heliostats; if there are too few for a comparison, the smallest model
+        is returned without scores.
     used
         Mask of the sightings to learn from, (M,).
     steps
@@ -367,7 +368,7 @@ def calibrate(
     model, split, seed, priors, runner, steps
         As for `evaluate`; the model is chosen once, from all sightings.
     fraction
-        Fraction to learn from in the test; 1: no test.
+        Training fraction in the test; 1: no test.
     """
     require("field", field, FieldSightings, "what read_field_sightings returns")
     require("fraction", fraction, numbers.Real, "a share from 0 to 1")
@@ -415,14 +416,14 @@ def calibrate(
 
 
 def clock_of(field: FieldSightings, learned: Learned) -> ClockCheck | None:
-    """Return the common error of the clock by the sightings of all mirrors that fit."""
+    """Return the common clock error from the sightings of all heliostats that fit."""
     rows = [misfit.row for misfit in learned.misfits]
     observed = field.sightings.take(~np.isin(field.sightings.heliostat, rows))
     return check_clock(learned.mechanism, observed, learned.model, field.plant.site)
 
 
 def _with_mechanism(plant: Plant, group: str, mechanism: Mechanism) -> Plant:
-    """Return the plant with these nominal mechanisms, with the ratios found, in a group."""
+    """Return the plant with these nominal mechanisms, including the ratios found, in a group."""
     if mechanism is plant.groups[group].mechanism:
         return plant
     changed = replace(plant.groups[group], mechanism=mechanism)

@@ -6,7 +6,7 @@ from typing import Literal
 from heliotrope.errors import InputError
 from heliotrope.field.flux_limit import FluxLimit
 
-#: Ways to choose aims.
+#: Strategies for choosing aims.
 AIM_STRATEGIES = ("spread", "limit")
 
 
@@ -17,29 +17,29 @@ class AimSettings:
     Attributes
     ----------
     strategy
-        "spread": the aims of the plant file, or the receiver's middle; "limit": those of most power
-        that keep the flux under a limit.
+        "spread": the aims of the plant file, or the receiver's middle; "limit": the aims of maximum
+        power that keep the flux under a limit.
     limit
         Allowable flux, with its margin; None with "spread".
     map
-        Name of the file that the limit was read from; "": the limit is a number.
+        Name of the file from which the limit was read; "": the limit is a number.
     probability
-        That the limit holds in all cells at once, 0.5 to 0.9999.
+        Probability that the limit holds in all cells at once, 0.5 to 0.9999.
     drift, clock, cluster
         Errors that heliostats share, as standard deviations: rad, s, rad; see
         `heliotrope.aims.SharedErrors`.
     dni
-        The limit must hold at this direct normal irradiance, W/m², although less is measured: a
-        cloud may leave at any moment.
+        The limit must hold at this direct normal irradiance, W/m², even if less is measured,
+        because a cloud may pass at any moment.
     moves
-        Tracking heliostats that get another aim, per minute at most.
+        Maximum number of tracking heliostats per minute that get a new aim.
     together
-        Heliostats that move at once at most.
+        Maximum number of heliostats that move at the same time.
     every
         Time between two computations, s.
     deadline
-        Age of the last good aims at which an alarm is raised, s; after five times that the field
-        goes to the safe spread.
+        Age of the last good aims at which an alarm is raised, s; after five times this age the
+        field goes to the safe spread.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which changes by a person need the approval of a second one."""
+"""Settings for changes that need the approval of a second engineer."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,20 @@ _SHORTEST, _LONGEST = 60.0, 604_800.0
 
 @dataclass(frozen=True)
 class ApprovalSettings:
-    """Second approvals of a plant.
+    """Second-approval settings of a plant.
 
     Attributes
     ----------
     parameters
-        Whether a change of a heliostat's error parameters by a person, or their roll-back, needs
-        the approval of a second engineer.
+        Whether a manual change or roll-back of a heliostat's error parameters needs the approval of
+        a second engineer.
     within
-        Time after which a change that nobody has approved ends by itself, s.
+        Time after which an unapproved change lapses, s.
 
     Raises
     ------
     InputError
-        A time that is not from 60 s to 7 days.
+        If the time is not between 60 s and 7 days.
     """
 
     parameters: bool = False
@@ -37,7 +37,7 @@ class ApprovalSettings:
 
     @property
     def document(self) -> dict[str, bool | float]:
-        """Its table in the plant file: what differs from the default."""
+        """The settings' table in the plant file, without default values."""
         default = ApprovalSettings()
         table: dict[str, bool | float] = {}
         if self.parameters:
@@ -48,7 +48,7 @@ class ApprovalSettings:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Its settings as numbers, by key, to compare one run with the next."""
+        """The settings as numbers, by key, for comparing one run with the next."""
         return {
             "approval.parameters": float(self.parameters),
             "approval.within_s": self.within,

@@ -22,8 +22,9 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
 
 #: Smallest depth in front of a camera at which a point counts as seen, m.
 _NEAREST = 1e-6
-#: Sides of the frame's border and steps along a ray at which a lens is checked for a fold, and how
-#: far the steps reach, in tangents of the angle to the farthest corner without distortion.
+#: Number of points along each side of the frame's border and of steps along a ray at which a lens
+#: is checked for folding; and the reach of the steps, in tangents of the angle to the farthest
+#: corner without distortion.
 _PER_SIDE, _STEPS, _FARTHEST = 4, 2000, 20.0
 
 
@@ -112,7 +113,7 @@ class Camera:
 def checked_pinhole(
     name: str, camera: Pinhole, smallest: int = 1
 ) -> tuple[tuple[int, int], FloatArray, FloatArray]:
-    """Return size, matrix and distortion of a camera if they are possible.
+    """Return the checked size, matrix and distortion of a camera.
 
     Raises
     ------
@@ -140,7 +141,7 @@ def checked_pinhole(
 def checked_pose(
     name: str, position: npt.ArrayLike, R_enu_camera: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Return position (3,) and rotation (3, 3) of a camera if they are possible.
+    """Return the checked position (3,) and rotation (3, 3) of a camera.
 
     Raises
     ------
@@ -157,7 +158,7 @@ def checked_pose(
 
 
 def check_unfolded(name: str, camera: Pinhole) -> None:
-    """Refuse a lens whose polynomial folds inside the frame: pixels there have two rays, or none.
+    """Reject a lens whose polynomial folds inside the frame, where a pixel has two rays or none.
 
     From the principal point outwards, along rays to the frame's border, the lens must map
     neighbours to neighbours (the determinant of its Jacobian stays above 0) until it has left the
@@ -166,7 +167,7 @@ def check_unfolded(name: str, camera: Pinhole) -> None:
     Raises
     ------
     InputError
-        If it folds before; the message names the smallest radius at which it does, px.
+        If the lens folds before that; the message states the smallest radius at which it folds, px.
     """
     if not camera.distortion.any():
         return
@@ -197,7 +198,7 @@ def check_unfolded(name: str, camera: Pinhole) -> None:
 
 
 def _stretch(distortion: FloatArray, plane: FloatArray) -> FloatArray:
-    """Return the determinant of the distortion's Jacobian at normalised places (..., 2)."""
+    """Return the determinant of the distortion's Jacobian at normalised coordinates (..., 2)."""
     x, y = plane[..., 0], plane[..., 1]
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
@@ -212,7 +213,7 @@ def _stretch(distortion: FloatArray, plane: FloatArray) -> FloatArray:
 
 
 def local_pixels(camera: Pinhole, local: npt.ArrayLike, reach: float = np.inf) -> FloatArray:
-    """Return the pixels (..., 2) at which points in camera axes (..., 3) are seen.
+    """Return the pixels (..., 2) at which points in camera axes (..., 3) appear.
 
     Parameters
     ----------
@@ -250,16 +251,16 @@ def _corner_tangent(camera: Pinhole) -> float:
 def distort(
     camera: Pinhole, plane: npt.ArrayLike, distortion: Sequence[Any] | None = None
 ) -> FloatArray:
-    """Return the pixels (..., 2) of normalised places x/z, y/z (..., 2), after Brown and Conrady.
+    """Return the pixels (..., 2) of normalised coordinates x/z, y/z (..., 2) (Brown and Conrady).
 
     Parameters
     ----------
     camera
         Matrix and distortion.
     plane
-        Places without distortion.
+        Coordinates without distortion.
     distortion
-        k1, k2, p1, p2, k3 instead of the camera's, each broadcast with the places.
+        k1, k2, p1, p2, k3 instead of the camera's, each broadcast with the coordinates.
     """
     place, matrix = as_float(plane), camera.matrix
     x, y = place[..., 0], place[..., 1]
@@ -284,7 +285,7 @@ def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:
 
 
 def undistort(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:
-    """Return the normalised places x/z, y/z (..., 2) of pixels (..., 2), without distortion."""
+    """Return the undistorted normalised coordinates x/z, y/z (..., 2) of pixels (..., 2)."""
     import cv2
 
     array = as_float(pixels)
@@ -298,13 +299,13 @@ def undistort(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:
 
 
 def local_rays(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:
-    """Return the unit directions, camera axes (..., 3), that pixels (..., 2) look along."""
+    """Return the unit viewing directions of pixels (..., 2) in camera axes, (..., 3)."""
     plane = undistort(camera, pixels)
     return normalize(np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1))
 
 
 def rays(camera: Camera, pixels: npt.ArrayLike) -> FloatArray:
-    """Return the unit directions, ENU (..., 3), that pixels (..., 2) look along.
+    """Return the unit viewing directions of pixels (..., 2) in ENU, (..., 3).
 
     Raises
     ------
@@ -316,9 +317,9 @@ def rays(camera: Camera, pixels: npt.ArrayLike) -> FloatArray:
 
 
 def look_at(position: npt.ArrayLike, point: npt.ArrayLike) -> FloatArray:
-    """Return R_enu_camera (3, 3) of a camera at ``position`` that looks at ``point``, level.
+    """Return R_enu_camera (3, 3) of a level camera at ``position`` that looks at ``point``.
 
-    Straight down or up, the camera's right is east.
+    If it looks straight down or up, the camera's right is east.
     """
     forward = normalize(as_float(point) - as_float(position), "line of sight")
     right = np.cross(forward, [0.0, 0.0, 1.0])

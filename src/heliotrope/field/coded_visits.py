@@ -18,7 +18,7 @@ class Setting:
     Attributes
     ----------
     text
-        Its meaning, for people.
+        Its meaning, for display.
     low, high
         Its limits, in its unit.
     unit
@@ -35,7 +35,7 @@ class Setting:
 
     @property
     def scale(self) -> float:
-        """Its unit in the program's own, radians and seconds."""
+        """Its unit expressed in the program's own units, radians and seconds."""
         return 1e-3 if self.unit == "mrad" else 1.0
 
     def key(self, name: str) -> str:
@@ -66,10 +66,10 @@ def _number(default: float, *given: Any, **named: Any) -> Any:
 class CodedSettings:
     """Settings of all coded visits, to targets and to a receiver.
 
-    Angles are in radians and times in seconds; `settings` has the meaning of each number.
+    Angles are in radians and times in seconds; `settings` describes each number.
     """
 
-    #: Name of the visits, for people.
+    #: Name of the visits, for display.
     kind: ClassVar[str]
 
     most: int

@@ -19,7 +19,7 @@ from heliotrope.sun import Site
 
 #: Centres of the six groups of three, metres east and north of the tower.
 _PODS = ((-19.0, -24.0), (0.0, -24.0), (19.2, -24.0), (-19.0, -34.0), (0.0, -34.0), (19.2, -34.0))
-#: From the centre of a group to its heliostats, m: a triangle with its point to the north.
+#: Offsets from the centre of a group to its heliostats, m: a triangle that points north.
 _RADIUS = 3.2
 _PIVOT_HEIGHT = 1.2
 

@@ -1,4 +1,4 @@
-"""How much flux a receiver may get: a number, or a map on any grid of cells."""
+"""The allowable flux on a receiver: a number, or a map on any grid of cells."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,21 +11,21 @@ from heliotrope.files import write_text
 from heliotrope.files.text import read_text
 from heliotrope.geometry import FloatArray, as_float
 
-#: Most flux that a limit may name, W/m²; the sun's own surface has 6.3e7.
+#: Largest flux that a limit may state, W/m²; the sun's own surface emits 6.3e7.
 _MOST = 6.4e7
 
 
 @dataclass(frozen=True, eq=False)
 class FluxLimit:
-    """The flux that a receiver may get.
+    """The allowable flux on a receiver.
 
     Attributes
     ----------
     flux
-        W/m²: a number, or a map over the receiver, (rows, columns), lowest row first and columns
-        as those of its cells; any number of either.
+        W/m²: a number, or a map over the receiver, (rows, columns), with the lowest row first and
+        columns ordered like those of its cells; rows and columns may be any number.
     margin
-        Share of it that is kept for the model's own error, 0 to 0.5.
+        Share of the flux that is reserved for the model's own error, 0 to 0.5.
     """
 
     flux: float | FloatArray
@@ -55,7 +55,7 @@ class FluxLimit:
     def on(self, rows: int, columns: int) -> FloatArray:
         """Return the allowable flux of each cell, less the margin, W/m², (rows, columns).
 
-        A cell gets the least of the map's cells that it overlaps, so that a finer grid never
+        A cell gets the smallest value of the map cells that it overlaps, so that a finer grid never
         allows more.
         """
         flux = as_float(self.flux)
@@ -67,7 +67,7 @@ class FluxLimit:
 
 
 def _least(flux: FloatArray, axis: int, count: int) -> FloatArray:
-    """Return the least over what each of ``count`` equal parts of an axis overlaps."""
+    """Return the minimum over the cells that each of ``count`` equal parts of an axis overlaps."""
     given = flux.shape[axis]
     parts = np.arange(count)
     first = parts * given // count
@@ -79,20 +79,21 @@ def _least(flux: FloatArray, axis: int, count: int) -> FloatArray:
 
 
 def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
-    """Return the limit of a file of numbers (CSV), W/m², a line for each row of cells.
+    """Return the limit in a CSV file of numbers, W/m², one line per row of cells.
 
     Parameters
     ----------
     path
-        File without a header, highest row of cells first, as one looks at the receiver. The columns
-        go as those of the receiver: to the right, or clockwise around a cylinder from the north.
+        File without a header, with the highest row of cells first, as seen in front of the
+        receiver. The columns are ordered like those of the receiver: to the right, or clockwise
+        around a cylinder from the north.
     margin
-        As of `FluxLimit`.
+        As for `FluxLimit`.
 
     Raises
     ------
     FormatError
-        If it is no table of numbers, or its lines differ in length.
+        If the file is not a table of numbers, or its lines differ in length.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path, "a flux limit").splitlines(), start=1):
@@ -115,6 +116,6 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
 
 
 def write_limit(path: str | Path, limit: FluxLimit) -> None:
-    """Write a limit's map as `read_limit` reads it; the margin is not written."""
+    """Write a limit's map in the format of `read_limit`; the margin is not written."""
     flux = np.atleast_2d(as_float(limit.flux))[::-1]
     write_text(path, "".join(",".join(repr(float(x)) for x in row) + "\n" for row in flux))

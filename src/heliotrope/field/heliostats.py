@@ -131,7 +131,7 @@ class Heliostats(Value, Framed):
         return self.labelled()
 
     def labelled(self) -> Labelled:
-        """Return the arrays with their axes, as a frame of one heliostat uses them too."""
+        """Return the arrays with their axes; the frame of one heliostat uses them too."""
         row = ("heliostat",)
         variables = {
             "position": Variable((*row, "axis"), self.position, "m"),
@@ -267,12 +267,12 @@ class Heliostats(Value, Framed):
 
 
 def rows_in(calibration: Calibrated, names: tuple[str, ...]) -> npt.NDArray[np.intp]:
-    """Return the row of each of N heliostats in a calibration; −1 if it is not there.
+    """Return the row of each of N heliostats in a calibration; −1 if it is absent.
 
     Raises
     ------
     InputError
-        If it is no calibration, or has neither names nor as many rows.
+        If it is not a calibration, or has neither names nor as many rows as there are heliostats.
     UnknownNameError
         If it names none of the heliostats.
     """

@@ -10,17 +10,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Colours of Okabe and Ito, told apart by the colour-blind too; neighbouring clusters differ.
+#: Colours of Okabe and Ito, which colour-blind readers can distinguish too; neighbouring clusters
+#: differ.
 _COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-#: Side of the part that is drawn to scale, in diagonals of a mirror.
+#: Side of the detail that is drawn to scale, in mirror diagonals.
 _PART = 14.0
 
 
 def picture(plant: Plant) -> "Figure":
     """Return the picture of a plant: heliostats by cluster, targets, cameras, receiver.
 
-    On the right some mirrors near the tower are drawn to scale, each lying flat, with the circle
-    in which it turns.
+    On the right some mirrors near the tower are drawn to scale, each lying flat, with its turning
+    circle.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -36,7 +37,7 @@ def picture(plant: Plant) -> "Figure":
 
 
 def _numbers(plant: Plant) -> np.ndarray:
-    """Number of the cluster of each heliostat."""
+    """Cluster number of each heliostat."""
     names = [c for g in plant.groups.values() for c in (g.cluster or ("",) * len(g))]
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     return np.array([order[name] for name in names])
@@ -69,11 +70,11 @@ def _part(ax: "Axes", plant: Plant) -> None:
     height = np.concatenate([g.height for g in plant.groups.values()])
     place, diagonal = plant.position[:, :2], np.hypot(width, height)
     side = _PART * float(diagonal.max())
-    # Nearest to the tower, and near the axis of the field if it has one.
+    # The heliostat nearest to the tower, and close to the axis of the field if it has one.
     east, north = place.mean(axis=0)
     off = np.abs(place[:, 0] * north - place[:, 1] * east) / max(np.hypot(east, north), 1.0)
     middle = place[int(np.argmin(np.linalg.norm(place, axis=1) + off))]
-    # Outwards from the nearest mirror, so that the part is full of them.
+    # Shift the detail outwards from the nearest mirror, so that mirrors fill it.
     middle = middle * (1.0 + 0.35 * side / max(float(np.linalg.norm(middle)), 1e-9))
     rows = np.flatnonzero((np.abs(place - middle) <= 0.5 * side).all(axis=1))
     cluster = _numbers(plant)

@@ -7,13 +7,13 @@ from heliotrope.field.marks import Mark
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, as_float, direction, normalize
 
-#: Size and strokes of the marks, and how far they stand inside the border, as shares of the side.
+#: Size and stroke width of the marks, and their distance from the border, as shares of the side.
 _MARK, _STROKE, _INSET = 0.075, 0.015, 0.0375
-#: Share of a frame's lesser side that a target takes up.
+#: Share of a frame's shorter side that a target fills.
 _FILL = 0.7
-#: Of a camera's frames, pixels.
+#: Size of a camera's frames, pixels.
 _SIZE = (1600, 1200)
-#: Kind, place (right, up) and quarter turns of each mark.
+#: Kind, position (right, up) and quarter turns of each mark.
 _MARKS = {
     "upper_left": ("corner", -1, 1, 0), "upper_right": ("corner", 1, 1, -1),
     "lower_right": ("corner", 1, -1, 2), "lower_left": ("corner", -1, -1, 1),
@@ -23,7 +23,7 @@ _MARKS = {
 
 
 def square_target(name: str, center: FloatArray, side: float, facing: float) -> Target:
-    """Return an upright square with eight marks, whose front looks to azimuth ``facing``, rad."""
+    """Return an upright square with eight marks, whose front faces azimuth ``facing``, rad."""
     right = direction(facing - 0.5 * np.pi, 0.0)
     up = np.array([0.0, 0.0, 1.0])
     half, inset = 0.5 * side, (0.5 - _INSET) * side
@@ -53,7 +53,7 @@ def watching_camera(target: Target, name: str, away: float, height: float, aside
     Parameters
     ----------
     target
-        The target that it looks at.
+        The target that the camera observes.
     name
         Name of the camera.
     away, aside
@@ -75,7 +75,7 @@ def watching_camera(target: Target, name: str, away: float, height: float, aside
 
 
 def aperture(name: str, center: FloatArray, side: float, facing: float, down: float) -> Receiver:
-    """Return the square aperture of a cavity that looks to azimuth ``facing`` and down, rad."""
+    """Return the square aperture of a cavity that faces azimuth ``facing`` and down, rad."""
     normal = direction(facing, -down)
     right = direction(facing - 0.5 * np.pi, 0.0)
     corners = _corners(center, 0.5 * side * right, 0.5 * side * np.cross(normal, right))
@@ -83,7 +83,7 @@ def aperture(name: str, center: FloatArray, side: float, facing: float, down: fl
 
 
 def cylinder(name: str, center: FloatArray, diameter: float, height: float) -> Receiver:
-    """Return a cylinder that takes light from all around."""
+    """Return a cylinder that receives light from all sides."""
     return Receiver(
         name,
         "external_cylinder",

@@ -31,27 +31,27 @@ from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.machine import AxisLimits, Machine, spread_machines
 from heliotrope.sun import Site
 
-#: Heliostats of one cluster controller, at most.
+#: Maximum number of heliostats per cluster controller.
 CLUSTER = 32
-#: Heliostats of a triangle.
+#: Number of heliostats in a triangle.
 PACK = 6
 #: Share of the ground that the mirrors of Malan's twin field cover.
 PACKING = 0.5
-#: Most heliostats that are laid out.
+#: Maximum number of heliostats in a layout.
 MOST = 1_000_000
-#: Clear of mirrors around masts and cameras, m.
+#: Radius around masts and cameras that is kept free of mirrors, m.
 FREE = 6.0
-#: Steps of a turn of a joint; steps/s of its motor.
+#: Steps per turn of a joint; speed of its motor, steps/s.
 _STEPS, _RATE = 400_000, 8000.0
 #: Final approach from below, steps; angles by which both axes turn away at a defocus, rad;
 #: elevation at stow, and the lowest at which a mirror is turned away there, rad.
 _BACKLASH, _DEFOCUS, _STOW = 40, (0.1, 0.05), float(np.radians(88.0))
 _LOWEST_STOW, _STOW_STEP = float(np.radians(45.0)), float(np.radians(1.0))
-#: Largest declination of the sun, and its lowest place, refracted, rad; width of a beam with the
-#: errors of a mirror, rad, and room about what it may not light, m.
+#: Largest declination of the sun, and its lowest refracted elevation, rad; width of a beam
+#: including the errors of a mirror, rad; and clearance around anything that it must not light, m.
 _TROPIC, _SUNRISE = float(np.radians(23.45)), float(np.radians(-0.6))
 _SPREAD, _ROOM = float(np.radians(1.5)), 0.5
-#: Distance of the standby point from the receiver: in widths of the receiver, and at least, m.
+#: Distance of the standby point from the receiver, in widths of the receiver, and its minimum, m.
 _ASIDE, _LEAST_ASIDE = 3.0, 8.0
 _SITE = Site(-28.5, 21.2, 830.0, name="Northern Cape")
 
@@ -136,7 +136,7 @@ class Ground:
         return float(np.arctan2(self.tower_height, radius))
 
     def bearings(self, radius: float, pitch: float, shift: float = 0.0) -> FloatArray:
-        """Azimuths of places ``pitch`` m apart on an arc, the middle of which is free to shift."""
+        """Azimuths of positions ``pitch`` m apart on an arc whose middle is free to shift."""
         # The chord is shorter than the arc.
         step = 2.0 * np.arcsin(min(1.0, 0.5 * pitch / radius))
         if self.half_angle >= np.pi - 1e-9:
@@ -148,7 +148,7 @@ class Ground:
         return np.asarray(self.bearing + around[np.abs(around) * step <= self.half_angle] * step)
 
     def clear(self, places: FloatArray) -> np.ndarray:
-        """Return the mask of places (N, 2) outside all circles that are kept free, (N,)."""
+        """Return the mask of positions (N, 2) that are outside all free circles, (N,)."""
         kept = np.ones(len(places), dtype=np.bool_)
         for east, north, radius in self.free:
             kept &= np.hypot(places[:, 0] - east, places[:, 1] - north) > radius
@@ -175,13 +175,13 @@ class Places:
 
 
 def radial_staggered(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
-    """Return mirrors on rings around the tower, each before a gap of the ring in front.
+    """Return heliostats on rings around the tower, each behind a gap in the ring in front.
 
     A zone begins as densely as mirrors can turn: ``reach`` apart along the ring and √3/2 of that
-    between rings (Collado & Guallar 2012, Renewable Energy 46). Azimuths are the same throughout
-    a zone, so that its mirrors spread with the radius; when there is room for two where one
-    stood, a new zone begins. Rings are at least h / (2 sin θ) apart, θ the receiver's elevation:
-    a mirror then looks over the one two rings in front.
+    between rings (Collado & Guallar 2012, Renewable Energy 46). Azimuths are constant within a
+    zone, so that its heliostats spread out with the radius. Where there is room for two in place of
+    one, a new zone begins. Rings are at least h / (2 sin θ) apart, θ the receiver's elevation: a
+    heliostat then sees over the heliostat two rings in front.
 
     Names: ring and number, "R012-034".
     """
@@ -193,7 +193,7 @@ def radial_staggered(count: int, mirror: HeliostatSize, ground: Ground) -> Place
     shift = 0.0
     while len(names) < count:
         if radius >= 2.0 * zone:
-            # One ring of the next zone is as far out as if it began alone.
+            # The first ring of the next zone is as far out as if the zone stood alone.
             zone, shift = radius, 0.0
         around = ground.bearings(zone, pitch, shift)
         flat = radius * np.stack([np.sin(around), np.cos(around)], axis=-1)
@@ -216,12 +216,12 @@ def _ring_step(radius: float, zone: float, mirror: HeliostatSize, ground: Ground
 
 
 def rows(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
-    """Return mirrors in straight rows east to west, in two fields north and south of the tower.
+    """Return heliostats in straight east-west rows, in two fields north and south of the tower.
 
     Each field is twice as wide as it is deep. Rows are ``reach`` apart near the tower and
-    h / sin θ further out, θ the receiver's elevation, so that a mirror looks over the row in
-    front; every other row is shifted by half a place. The bearing and angle of the ground are
-    not used.
+    h / sin θ further out, θ the receiver's elevation, so that a heliostat sees over the row in
+    front; every other row is shifted by half a pitch. The bearing and angle of the ground are not
+    used.
 
     Names: field, row and number, "N012-034".
     """
@@ -234,11 +234,11 @@ def rows(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
 
 
 def twin_field(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
-    """Return Malan's twin field: two fields alike, each evenly dense, on both sides of the tower.
+    """Return Malan's twin field: two equal fields of uniform density on both sides of the tower.
 
-    Mirrors cover the share ``PACKING`` of the ground of a field, his 0.5 (3.2.1), or less where
-    the clearance asks for it: 0.47 with the default mirror, 0.5 up to a clearance of 0.19 m. Every
-    other row is shifted by half a place, so that neighbours form equal triangles. A field is twice
+    Mirrors cover the share ``PACKING`` of the ground of a field, his 0.5 (3.2.1), or less where the
+    clearance requires it: 0.47 with the default mirror, 0.5 up to a clearance of 0.19 m. Every
+    other row is shifted by half a pitch, so that neighbours form equal triangles. A field is twice
     as wide as it is deep; that, the stagger and the names, those of `rows`, are ours.
     """
     even = np.sqrt(2.0 / np.sqrt(3.0) * mirror.width * mirror.height / PACKING)
@@ -252,9 +252,9 @@ def _two_fields(count: int, ground: Ground, pitch: float, step: Callable[[float]
     Parameters
     ----------
     count
-        Heliostats of both fields.
+        Number of heliostats in both fields.
     ground
-        Its nearest distance and its masts.
+        Nearest distance to the tower, and the masts.
     pitch
         Distance between neighbours in a row, m.
     step
@@ -294,12 +294,12 @@ def _row_length(count: int, nearest: float, pitch: float, step: Callable[[float]
 def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
     """Return Malan's triangles of six mirrors on arcs around the tower.
 
-    A triangle has a mirror at each corner and at the middle of each side. On an arc triangles
-    with their point to the tower and away from it alternate, a way for a person between two.
-    Arcs are apart by a road, which is as broad as a mirror reaches, or h / sin θ where that is
-    more (θ the receiver's elevation), so that triangles look over those in front.
+    A triangle has a mirror at each corner and at the middle of each side. On an arc, triangles that
+    point to the tower and away from it alternate, with a footpath between each two. Arcs are
+    separated by a road as wide as the reach of a mirror, or by h / sin θ if that is more (θ the
+    receiver's elevation), so that triangles see over those in front.
 
-    Names: triangle and place in it, "P0001A" to "P0001F".
+    Names: triangle and position in it, "P0001A" to "P0001F".
     """
     _check_count(count)
     step = mirror.reach
@@ -307,7 +307,7 @@ def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
     parts: list[FloatArray] = []
     made, radius = 0, ground.nearest
     while made * PACK < count:
-        # The inner corners come closest on a curved arc.
+        # On a curved arc, the inner corners are closest together.
         around = ground.bearings(radius, 2.0 * step + 0.5)
         middle = radius + depth
         packs = _triangles(around, middle, step)
@@ -317,16 +317,17 @@ def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
         parts.append(packs.reshape(-1, 2))
         made += len(packs)
         road = max(step, mirror.height / np.sin(ground.elevation(radius)))
-        # The outer corners of a triangle are further out than its side.
+        # The outer corners of a triangle lie further out than its side.
         radius = float(np.hypot(radius + 2.0 * depth, step)) + road
     names = [f"P{pack:04d}{'ABCDEF'[k]}" for pack in range(1, made + 1) for k in range(PACK)]
     return _places(names[:count], [np.concatenate(parts)[:count]])
 
 
 def _triangles(around: FloatArray, radius: float, step: float) -> FloatArray:
-    """Triangles at azimuths (n,) on an arc, (n, 6, 2); those with odd number turned about."""
+    """Triangles at azimuths (n,) on an arc, (n, 6, 2); those with odd numbers are reversed."""
     depth = 0.5 * np.sqrt(3.0) * step
-    # Right of the bearing and outwards, from the middle of the triangle's height.
+    # Coordinates to the right of the bearing and outwards, from the middle of the triangle's
+    # height.
     own = np.array(
         [
             [0.0, -depth],
@@ -389,14 +390,14 @@ TWO_SIDED = ("rows", "twin-field")
 
 
 def clusters(count: int, size: int = CLUSTER) -> tuple[str, ...]:
-    """Return the cluster of each heliostat in the order of their places, from "C001" on."""
+    """Return the cluster of each heliostat in the order of their positions, from "C001" on."""
     return tuple(f"C{1 + i // size:03d}" for i in range(count))
 
 
 def stepped(position: FloatArray, mirror: HeliostatSize) -> Mechanism:
     """Return azimuth-elevation mechanisms on stepper motors at positions (N, 3).
 
-    400,000 steps to a turn of a joint (15.7 µrad each), 8000 steps/s: 7.2 °/s. Stops at ±200° of
+    400,000 steps per turn of a joint (15.7 µrad each), 8000 steps/s: 7.2 °/s. Stops at ±200° of
     azimuth, where 0 is north, and at -3.6° and 93.6° of elevation.
     """
     gear = {"microsteps": 4, "speed": _RATE}
@@ -412,11 +413,11 @@ def stepped(position: FloatArray, mirror: HeliostatSize) -> Mechanism:
 
 
 def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
-    """Return limits and resting places of azimuth-elevation mechanisms that are all alike.
+    """Return limits and rest positions of identical azimuth-elevation mechanisms.
 
-    Limits are the stops of the drives, the rate is that of the drives, and the acceleration
-    reaches it in half a second. At stow the azimuth is in the middle of its stops and the mirror
-    looks up; `unlit_machines` turns those whose beams would pass the receiver or a target. The
+    The limits are the drives' stops, the rate is that of the drives, and the acceleration reaches
+    this rate in half a second. At stow the azimuth is midway between its stops and the mirror faces
+    up; `unlit_machines` turns the heliostats whose beams would pass the receiver or a target. The
     standby point is beside the receiver, at the height of its centre.
 
     Parameters
@@ -424,7 +425,7 @@ def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
     mechanism
         Nominal, (N,); its drives have a speed and stops.
     receiver
-        Receiver of the beams in operation.
+        Receiver at which the beams aim in operation.
     """
     drives = Drive(np.reshape(mechanism.drives.table, (-1, 2, slot.DRIVE_SLOTS))[0])
     ends = [drives.counts(drives.table[:, end]) for end in (slot.MIN_ANGLE, slot.MAX_ANGLE)]
@@ -448,12 +449,12 @@ def unlit_machines(
     things: Sequence[tuple[FloatArray, float]],
     latitude: float,
 ) -> tuple[Machine, ...]:
-    """Return the machines with stow positions from which beams light nothing in a year.
+    """Return the machines with stow positions from which no beam lights anything all year.
 
-    A mirror that looks up keeps its stow position, unless some sun would send its beam to one of
-    the things. Then it is turned away from them, and tilted no further than that takes: the sun
-    that would do so is below the horizon. Where even 45° do not help, all of the group accept it
-    (`Machine.stow_lights`).
+    A mirror that faces up keeps its stow position, unless some sun position would send its beam to
+    one of the things. It is then turned away from the things, and tilted just far enough that the
+    sun would have to be below the horizon to light them. If even 45° is not enough, the whole group
+    accepts it (`Machine.stow_lights`).
 
     Parameters
     ----------
@@ -485,10 +486,10 @@ def _lights(
     things: Sequence[tuple[FloatArray, float]],
     latitude: float,
 ) -> npt.NDArray[np.bool_]:
-    """Return whether some sun of the year sends the beams of standing mirrors to things, (N,).
+    """Return whether any sun position of the year sends stationary beams to things, (N,).
 
-    All suns from which a beam comes within reach of a thing are in a cone; it may hold a sun if it
-    reaches above the horizon and between the tropics.
+    All sun positions from which a beam comes within reach of a thing lie in a cone; the sun may be
+    in this cone if it reaches above the horizon and between the tropics.
     """
     normal, vertex = pose
     pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
@@ -506,14 +507,14 @@ def _lights(
 def malan_plant(heliostats: int = 10_000) -> Plant:
     """Return a plant of the size of Malan's: 5 MWe, 10,000 heliostats of 5 m² in 313 clusters.
 
-    Triangles of six south of the tower; a cavity 80 m above the pivots; two calibration targets
-    of 12 m on masts 45 m east and west of it, off the way that beams take up the tower, each with
-    a camera. Place, tower, receiver, targets and gears are ours.
+    Triangles of six south of the tower; a cavity 80 m above the pivots; two calibration targets of
+    12 m on masts 45 m east and west of it, clear of the path that beams take up the tower, each
+    with a camera. Site, tower, receiver, targets and gears are ours.
 
     Parameters
     ----------
     heliostats
-        Fewer make a smaller plant of the same kind, around the same tower.
+        Number of heliostats; fewer make a smaller plant of the same kind around the same tower.
     """
     return lay_out("six-packs", heliostats, tower_height=80.0, name="5 MWe")
 
@@ -612,7 +613,7 @@ def _middle(
     aside, up, away = 45.0 * share, 36.0 * share, 150.0 * share
     right = direction(facing - 0.5 * np.pi, 0.0)
     base = np.array([0.0, 0.0, pivot])
-    # As seen by someone who faces the tower. Each of two fields has its own target.
+    # As seen by an observer who faces the tower. Each of two fields has its own target.
     sides = {"left": (-1.0, facing), "right": (1.0, facing + np.pi if both else facing)}
     targets, cameras = [], []
     for name, (side, front) in sides.items():

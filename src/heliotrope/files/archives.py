@@ -13,11 +13,12 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError
 from heliotrope.files.limits import EXPANDED, MEMBERS, MIB, check_count, check_file
 
-# The record at the end of an archive: 22 bytes and a comment of up to 65,535.
+# The record at the end of an archive: 22 bytes and a comment of up to 65,535 bytes.
 _TAIL, _END, _END_64 = 22 + 65_535, b"PK\5\6", b"PK\6\7"
 #: Longest table of contents, bytes.
 _CONTENTS = 512 * MEMBERS
-#: What `zipfile` raises for a damaged archive; the last two for unknown versions and encryption.
+#: Exceptions that `zipfile` raises for a damaged archive; the last two are for unknown versions and
+#: encryption.
 _DAMAGED = (zipfile.BadZipFile, OSError, ValueError, EOFError, NotImplementedError, RuntimeError)
 
 
@@ -33,15 +34,15 @@ def read_members(
     what
         Kind of file expected, as an error names it.
     names
-        Members that must be in it; without them all are read.
+        Members that it must contain; if none are named, all are read.
     most
         Largest size of all members once expanded, bytes.
 
     Raises
     ------
     FormatError
-        As `check_file`; if it is no such archive, a member is missing, or it has more members
-        or expands to more than the limits.
+        As `check_file`; or if the file is not such an archive, lacks a member, or exceeds the
+        limits on members or expanded size.
     """
     file = check_file(path, what, binary=True)
     _check_contents(file, what)
@@ -73,15 +74,15 @@ def read_members(
 def _expanded(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
     """Return a member, expanded to no more than the size that its entry states."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        # Their decompressors have no limit of what they give at once.
+        # Their decompressors cannot limit how much they return at once.
         raise zipfile.BadZipFile(f"{entry.filename}: its compression is neither none nor deflate")
     with archive.open(entry) as stream:
-        # `ZipFile.read` would expand all before it cuts.
+        # `ZipFile.read` would expand everything before it truncates.
         return stream.read(entry.file_size + 1)
 
 
 def _check_contents(file: Path, what: str) -> None:
-    """Refuse a table of contents that would take much memory by itself."""
+    """Reject a table of contents that would itself take much memory."""
     with file.open("rb") as stream:
         stream.seek(-min(_TAIL, file.stat().st_size), io.SEEK_END)
         tail = stream.read()
@@ -109,12 +110,12 @@ def read_arrays(
     what
         Kind of file expected, as an error names it.
     names
-        Arrays that must be in it; without them all are read.
+        Arrays that it must contain; if none are named, all are read.
 
     Raises
     ------
     FormatError
-        As `read_members`, or if a member is no array of numbers or texts.
+        As `read_members`, or if a member is not an array of numbers or texts.
     """
     members = read_members(path, what, [f"{name}.npy" for name in names])
     arrays = {}

@@ -1,4 +1,4 @@
-"""Tables cell by cell: a row that cannot be used is left out and named in one line."""
+"""Tables cell by cell: a row that cannot be used is left out and reported in one line."""
 
 import csv
 import io
@@ -43,7 +43,7 @@ SEPARATORS = "\t;,|"
 _SEP_LINE = re.compile(r'"?sep=(.)"?[ ;,\t]*\n', re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?", re.ASCII)
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[,.' \u00a0\u202f]\d{3})+(?:[,.]\d*)?", re.ASCII)
-#: Unknown names of a table for which close ones are suggested.
+#: Maximum number of unknown names in a table for which close names are suggested.
 _SUGGESTIONS = 20
 _TRUE, _FALSE = ("true", "t", "1", "1.0"), ("false", "f", "0", "0.0")
 
@@ -90,7 +90,7 @@ class Rows:
         for i, (column, reason) in sorted(self.reasons.items()):
             parts = [f"{self.path.name}: {self.places[i]}", self._heliostat(i)]
             parts.append(f"column {column}: {reason}" if column else reason)
-            # A quoted cell may hold line breaks; a message is one line.
+            # A quoted cell may contain line breaks, but a message is one line.
             lines.append(" ".join(", ".join(filter(None, parts)).split()))
         return lines
 
@@ -106,7 +106,7 @@ class Rows:
         return errors
 
     def refuse_bad(self) -> None:
-        """Raise the first of `problems`, if there is one."""
+        """Raise the first of the `problems`, if any."""
         for problem in self.problems:
             raise problem
 
@@ -144,7 +144,7 @@ class Rows:
                 )
 
     def refuse(self, i: "int | np.integer[Any]", column: str, reason: str) -> None:
-        """Leave a row out; only the first reason is kept."""
+        """Leave out a row; only the first reason is kept."""
         self.reasons.setdefault(int(i), (column, reason))
 
     def texts(self, column: str) -> list[str]:
@@ -285,12 +285,12 @@ def read_cells(
     try:
         for row in reader:
             cells = [cell.strip() for cell in row]
-            # A quoted cell may span several lines; the row is named by its first.
+            # A quoted cell may span several lines; the first line identifies the row.
             if any(cells):
                 if not table:
                     advice = "remove those that are not needed"
                     check_count(path, len(cells), COLUMNS, "columns", advice, f"line {before + 1}")
-                    # A short row is filled up to the columns of the header.
+                    # A short row is padded to the number of header columns.
                     check_count(path, lines * len(cells), CELLS, "cells", "divide the table")
                 table.append(cells)
                 places.append(f"line {before + 1}")
@@ -308,7 +308,7 @@ def _separator(line: str, separators: str) -> str:
     counts = {separator: bare.count(separator) for separator in separators}
     if counts.get(";") and all(piece.count(",") < 2 for piece in bare.split(";")):
         return ";"
-    # Blanks separate only where nothing else does.
+    # Blanks are separators only if nothing else is.
     blanks = counts.pop(" ", 0)
     best = max(counts, key=lambda separator: counts[separator])
     return best if counts[best] else " " if blanks else ","
@@ -340,7 +340,7 @@ def rows_under(
     table: list[list[str]],
     known: Iterable[str] = (),
 ) -> Rows:
-    """Return rows from the place and cells of a header, and those of the rows below the header.
+    """Return rows from the places and cells of a header and of the rows below it.
 
     Raises
     ------
@@ -357,7 +357,7 @@ def rows_under(
             raise FormatError(path, f"{problem}; name each column once", place)
         taken.add(name)
     rows = Rows(path, places, {}, place)
-    # Empty columns at the end; in a single row a further cell has moved all others.
+    # Empty columns at the end are allowed; an extra cell in a single row has shifted all others.
     widths = {len(cells) for cells in table}
     allowed = {len(names), len(header[1]), *(widths if len(widths) == 1 else ())}
     for i, cells in enumerate(table):
@@ -386,7 +386,7 @@ def read_parquet(path: Path, what: str) -> Rows:
         with pq.ParquetFile(path) as file:
             _check_parquet(path, file.metadata)
             texts = [field.name for field in file.schema_arrow if pa.types.is_string(field.type)]
-        # As a dictionary a text that recurs is in memory once.
+        # In a dictionary, a recurring text is in memory only once.
         with pq.ParquetFile(path, read_dictionary=texts) as file:
             table = file.read()
         names = [_tidy(name) for name in table.column_names]
@@ -401,7 +401,7 @@ def read_parquet(path: Path, what: str) -> Rows:
 
 
 def _check_parquet(path: Path, about: "pq.FileMetaData") -> None:
-    """Refuse a file whose stated columns, cells or expanded size are beyond the limits."""
+    """Reject a file whose stated columns, cells or expanded size exceed the limits."""
     check_count(path, about.num_columns, COLUMNS, "columns", "remove those that are not needed")
     check_count(path, about.num_rows * about.num_columns, PARQUET_CELLS, "cells", "divide it")
     size = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
@@ -451,7 +451,8 @@ def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArra
     for i in np.flatnonzero(indices < 0):
         name = rows.heliostat[i]
         if name not in reasons:
-            # Close names are looked for among all names: seconds in a table of another field.
+            # Close names are searched for among all names, which takes seconds for a table of
+            # another field.
             reasons[name] = (
                 str(UnknownNameError("heliostat", name, names))
                 if len(reasons) <= _SUGGESTIONS
@@ -467,7 +468,7 @@ def alike(name: str) -> str:
 
 
 def _tidy(name: str) -> str:
-    """Return the name of a column in one line that a message can show."""
+    """Return the name of a column as one line for a message."""
     return " ".join(name.split())[:60]
 
 
@@ -477,22 +478,22 @@ def _empty(cell: Any) -> bool:
 
 
 def check_names(what: str, names: Iterable[str]) -> None:
-    """Refuse empty names, and names that are alike.
+    """Reject empty names, and names that count as the same.
 
     Parameters
     ----------
     what
-        Kind of thing that has them, for the message.
+        Kind of thing that bears the names, for the message.
     names
         Its names.
 
     Raises
     ------
     InputError
-        For the first of them.
+        For the first such name.
     """
     listed = list(names)
-    # All at once: a field of 100,000 is checked each time that it is copied.
+    # Checked all at once, because a field of 100,000 heliostats is checked each time it is copied.
     text = unicodedata.normalize("NFKC", "\n".join(listed)).casefold()
     forms = re.sub(r"[^\S\n]+", "", text).split("\n") if listed else []
     if len(forms) == len(listed) == len(set(forms)) and all(forms):
@@ -509,7 +510,7 @@ def check_names(what: str, names: Iterable[str]) -> None:
 
 
 def _numbers(cells: Cells) -> FloatArray:
-    """Return numbers; NaN where a cell holds none."""
+    """Return numbers; NaN where a cell is not a number."""
     if isinstance(cells, np.ndarray):
         return cells.copy()
     try:

@@ -14,7 +14,7 @@ from typing import Protocol
 
 from heliotrope.errors import HeliotropeError
 
-#: Largest number of pieces of work that may wait.
+#: Largest number of pending jobs.
 MOST = 1000
 
 Work = Callable[[], object]
@@ -22,11 +22,11 @@ Then = Callable[[Exception | None], None]
 
 
 class DiskBusyError(HeliotropeError):
-    """Too much work waits for the disk."""
+    """Too many jobs are waiting for the disk."""
 
 
 class Disk(Protocol):
-    """A place where work is done that waits for a disk."""
+    """Executor of jobs that wait for a disk."""
 
     def do(self, work: Work, then: Then) -> None:
         """Do work after all earlier work; call ``then`` in the loop with its error, or None.
@@ -39,19 +39,19 @@ class Disk(Protocol):
         ...
 
     def close(self) -> None:
-        """Do the work that waits, if the disk allows it soon, and end."""
+        """Finish the pending work if the disk allows it soon, and end."""
         ...
 
 
 class AtOnce:
-    """Work is done where it is given."""
+    """Does work immediately, in the caller."""
 
     def do(self, work: Work, then: Then) -> None:
         """Do work now; see `Disk.do`."""
         then(_error_of(work))
 
     def close(self) -> None:
-        """Do nothing: nothing waits."""
+        """Do nothing, because no work is pending."""
 
 
 class DiskThread:
@@ -60,7 +60,7 @@ class DiskThread:
     Parameters
     ----------
     most
-        Largest number of pieces of work that may wait.
+        Largest number of pending jobs.
     """
 
     def __init__(self, most: int = MOST) -> None:
@@ -83,7 +83,7 @@ class DiskThread:
         self._waiting.put(run)
 
     def close(self, timeout: float = 10.0) -> None:
-        """Do the work that waits, for ``timeout`` s at most, and end the thread."""
+        """Finish the pending work within ``timeout`` s, and end the thread."""
         self._waiting.put(None)
         self._thread.join(timeout)
 

@@ -22,14 +22,14 @@ def read_toml(path: str | Path, what: str) -> dict[str, Any]:
     Raises
     ------
     FormatError
-        If it cannot be read, is not TOML, or beyond the limits of `heliotrope.files.limits`.
+        If it cannot be read, is not TOML, or exceeds the limits of `heliotrope.files.limits`.
     """
     text = read_text(path, what, TOML_SIZE)
     check_toml(path, text)
     try:
         return tomllib.loads(text)
     except ValueError as error:
-        # Not a TOMLDecodeError: an integer of thousands of digits.
+        # An integer of thousands of digits does not raise a TOMLDecodeError.
         other = instead(text[:4096].encode(), what, "TOML")
         raise FormatError(path, other or f"not valid TOML: {str(error)[:200]}") from None
 
@@ -73,9 +73,9 @@ def read_document(
 
 
 def _missing(errors: Sequence[Any]) -> tuple[str, tuple[Any, ...]]:
-    """Return one line on all keys that the table of the first error lacks, and the table.
+    """Return one line on all keys that are missing in the table of the first error, and the table.
 
-    empty if the first error is another one.
+    empty if the first error is of another kind.
     """
     if errors[0]["type"] != "missing":
         return "", ()

@@ -30,7 +30,7 @@ def render(package: str, name: str, **values: object) -> "Markup":
     name
         File name of the template.
     values
-        Variables of the template; an undefined one is an error.
+        Variables of the template; an undefined variable is an error.
     """
     from markupsafe import Markup
 
@@ -52,10 +52,10 @@ def _environment(package: str) -> "Environment":
 
 
 def as_written(figure: "Figure") -> None:
-    """Let a figure show its texts as they are: a name with "$" is no formula.
+    """Let a figure show its texts literally, so that a name with "$" is not taken for a formula.
 
-    As one it may be unreadable, and end the whole report. Only the powers of ten on logarithmic
-    axes are formulas.
+    As a formula it may be unreadable, and abort the whole report. Only the powers of ten on
+    logarithmic axes are formulas.
     """
     from matplotlib.text import Text
 

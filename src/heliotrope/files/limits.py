@@ -19,25 +19,26 @@ MIB = 2**20
 SIZE_LIMIT = 64 * MIB
 #: Largest TOML file, bytes; its parser takes 200 bytes of memory for each byte.
 TOML_SIZE = 2 * MIB
-#: Most levels of a document in XML, JSON or TOML.
+#: Maximum nesting depth of an XML, JSON or TOML document.
 DEPTH = 64
-#: Most parts of a dotted TOML key; the time and memory of its parser grow with their square.
+#: Maximum number of parts in a dotted TOML key; the parser's time and memory grow with their
+#: square.
 DOTTED_PARTS = 16
-#: Most elements and attributes of an XML document.
+#: Maximum number of elements and attributes in an XML document.
 XML_PARTS = 3_000_000
 #: Longest XML tag with its attributes, bytes.
 XML_TAG = MIB
-#: Most values of a JSON document, counted by its commas and brackets.
+#: Maximum number of values in a JSON document, counted by commas and brackets.
 JSON_VALUES = 2_000_000
-#: Most rows, columns and cells of a table in CSV.
+#: Maximum numbers of rows, columns and cells in a CSV table.
 ROWS, COLUMNS, CELLS = 1_000_000, 1_000, 10_000_000
-#: Largest Parquet file, its size once expanded, bytes, and most of its cells.
+#: Largest Parquet file and its largest expanded size, bytes, and the maximum number of cells.
 PARQUET_SIZE, PARQUET_EXPANDED, PARQUET_CELLS = 256 * MIB, 512 * MIB, 50_000_000
-#: Most bytes of an archive's members (.npz, .kmz) once they are expanded, and most members.
+#: Largest expanded size of an archive's members (.npz, .kmz), bytes, and maximum number of members.
 EXPANDED, MEMBERS = 256 * MIB, 256
-#: Most pixels of an image: of a camera at a target, and of a drone's.
+#: Maximum number of pixels in an image from a target camera, and from a drone.
 PIXELS, PHOTOGRAPH_PIXELS = 64_000_000, 160_000_000
-#: Most entries of a folder of images.
+#: Maximum number of entries in an image folder.
 ENTRIES = 1_000_000
 
 

@@ -10,7 +10,7 @@ from typing import BinaryIO
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.limits import SIZE_LIMIT, check_count, check_file
 
-#: A character of more than one byte in UTF-8, and bytes that no text has.
+#: A character of several bytes in UTF-8, and bytes that occur in no text.
 _UTF_8 = re.compile(rb"[\xc2-\xdf][\x80-\xbf]|[\xe0-\xef][\x80-\xbf]{2}|[\xf0-\xf4][\x80-\xbf]{3}")
 _CONTROLS = re.compile(rb"[\x00-\x08\x0e-\x1f\x7f]")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -53,7 +53,7 @@ def _decoded(content: bytes, spreadsheet: bool) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        # A file that is UTF-8 but for some bytes is damaged.
+        # A file that is UTF-8 except for some bytes is damaged.
         if not spreadsheet or _UTF_8.search(content) or _CONTROLS.search(content):
             raise
     return content.decode("cp1252")
@@ -92,7 +92,7 @@ def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
     """
     file = Path(path)
     if file.exists() and not (file.is_file() or file.is_dir()):
-        # To replace it would take it from every program, as root even /dev/null.
+        # Replacing a device would remove it for every program, and as root even /dev/null.
         raise InputError(f"{file}: this is a device or a pipe, not a file; give a file")
     beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:

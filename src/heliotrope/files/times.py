@@ -76,7 +76,7 @@ def format_time(seconds: float) -> str:
         stamp = (_EPOCH + timedelta(seconds=whole)).replace(tzinfo=None).isoformat()
     except OverflowError:
         raise InputError(f"time {seconds} s since 1970 lies outside the years 1 to 9999") from None
-    # repr is the shortest text that gives the same double; its decimals are kept exactly.
+    # repr is the shortest text that yields the same double; its decimals are kept exactly.
     decimals = f"{Decimal(repr(float(seconds))):f}".partition(".")[2].rstrip("0")
     if decimals and seconds < 0.0:
         # Below the epoch the time of day still counts upwards.

@@ -80,7 +80,7 @@ def read_xml(path: str | Path, what: str) -> Document:
     content = read_bytes(file)
     tags = content.count(b"<")
     check_count(file, tags, 2 * XML_PARTS, "tags", f"divide it; it should be {what}")
-    # The attributes of a tag are in memory as a whole before they can be counted.
+    # All attributes of a tag are in memory before they can be counted.
     if (tag := _LONG_TAG.search(content)) is not None:
         line = content.count(b"\n", 0, tag.start()) + 1
         raise FormatError(
@@ -99,13 +99,13 @@ def read_xml(path: str | Path, what: str) -> Document:
 
 
 class _Builder:
-    """The tree of a document, built while it is parsed and bounded on the way."""
+    """The tree of a document, built and checked against the limits during parsing."""
 
     def __init__(self, file: Path) -> None:
         self.root = XmlElement("")
         self.parser = expat.ParserCreate(namespace_separator="}")
         self.parser.ordered_attributes = True
-        # Nothing is expanded or fetched: a file may come from anywhere.
+        # Nothing is expanded or fetched, because a file may come from anywhere.
         self.parser.StartDoctypeDeclHandler = self._refuse_type
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end

@@ -67,7 +67,7 @@ class _Sheet:
         return np.round(16.0 * np.clip(place, -1e5, 1e5)).astype(np.int32)
 
     def frame_pixels(self, face: LookedAt, plane: FloatArray) -> FloatArray:
-        """Return frame pixels of places in a face's plane; a crop has no view."""
+        """Return frame pixels of positions in a face's plane; a crop has no view."""
         picture = face.picture
         if picture.view is not None:
             return picture.view.to_pixels(plane)
@@ -135,7 +135,7 @@ class _Sheet:
 
         lines = []
         present = [r for r in photograph.readings if r.found.found]
-        # A camera sees few of a plant's targets: absent ones matter only if all are absent.
+        # A camera sees few of a plant's targets, so absent targets matter only if all are absent.
         for reading in present or photograph.readings:
             colour = GOOD if reading.good else BAD
             lines += [(line, colour) for line in _said(reading)]

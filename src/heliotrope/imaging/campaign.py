@@ -42,12 +42,12 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 Origin = tuple[float, float, float]
 
-#: With fewer photographs another process costs more than it gains.
+#: With fewer photographs, a further process costs more than it gains.
 FEWEST_FOR_PROCESSES = 8
 #: Greatest angular speed of the sun, rad/s.
 _SUN_RATE = 7.292e-5
-#: Standard deviation of a beam caused by air and mirror, rad. One photograph cannot show it;
-#: repeated sightings do.
+#: Standard deviation of a beam caused by atmosphere and heliostat, rad. A single photograph cannot
+#: show it, but repeated sightings do.
 BEAM_SIGMA = 1e-4
 
 
@@ -68,7 +68,7 @@ class Job:
     crop
         Whether each picture shows exactly one target: that of its log entry, or ``target``.
     target
-        Target whose reading counts if the log names none; "" accepts any valid reading.
+        Target whose reading counts if the log names no target; "" accepts any valid reading.
     annotated
         Folder for annotated pictures, or None.
     without
@@ -153,9 +153,9 @@ def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
     path
         An image.
     job
-        How to read it.
+        How to evaluate it.
     entry
-        Its entry in the log: above all its target.
+        Its entry in the log, in particular its target.
     """
     try:
         frame = read_image(path)
@@ -180,7 +180,7 @@ def look(
     frame, path
         The photograph and its name.
     job
-        How to read it.
+        How to evaluate it.
     entry
         Its entry in the log.
     previous
@@ -189,8 +189,8 @@ def look(
     Raises
     ------
     InputError
-        If its target is needed and not known, or two are named, or the annotated picture cannot be
-        written.
+        If its target is needed but unknown, if two targets are named, or if the annotated picture
+        cannot be written.
     """
     recorded = "" if entry is None else entry.target
     if recorded and job.target and recorded != job.target:
@@ -397,7 +397,7 @@ def _on_cluster(
 ) -> Iterator[tuple[int, Outcome]]:
     from distributed import as_completed as completed
 
-    # The job may hold an empty frame: send it once.
+    # The job may contain an empty frame, so send it only once.
     shared = client.scatter(job, broadcast=True)  # type: ignore[no-untyped-call]
     futures = {
         client.submit(process, path.resolve(), shared, entry, pure=False): k
@@ -417,7 +417,7 @@ def entries_of(paths: Sequence[Path], log: Log | None, heliostat: str = "") -> l
     log
         Searched first.
     heliostat
-        Heliostat whose beams they show, where nothing else says it.
+        Heliostat whose beams the photographs show, if nothing else specifies it.
 
     Raises
     ------

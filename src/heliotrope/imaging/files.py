@@ -42,7 +42,7 @@ from heliotrope.imaging.frame import Frame, Pixels
 
 #: Suffixes that `find_images` looks for; `read_image` goes by the content instead.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-#: Suffixes of pictures that `read_image` refuses: in a folder they are named.
+#: Suffixes of pictures that `read_image` refuses; such files in a folder are reported by name.
 OTHER_SUFFIXES = (".gif", ".heic", ".heif", ".avif", ".jp2", ".fits")
 #: Default limit of `read_image`, pixels.
 LIMIT = PIXELS
@@ -50,7 +50,7 @@ LIMIT = PIXELS
 SMALLEST = 16
 
 _KINDS = "PNG, JPEG, TIFF, BMP or WebP"
-# The openers themselves, not Image.open: its limit of pixels is one for the whole process.
+# The openers themselves, not Image.open, whose pixel limit applies to the whole process.
 _OPENERS: dict[bytes, tuple[str, Callable[[io.BytesIO], ImageFile.ImageFile]]] = {
     b"\x89PNG\r\n\x1a\n": ("PNG", PngImagePlugin.PngImageFile),
     b"\xff\xd8\xff": ("JPEG", JpegImagePlugin.jpeg_factory),
@@ -70,7 +70,7 @@ _OTHERS = {
     b"II+\0": "a BigTIFF",
     b"MM\0+": "a BigTIFF",
 }
-#: What Pillow raises for damaged files; it also warns of some damage.
+#: What Pillow raises for damaged files; it also issues warnings about some damage.
 _FAULTS = (
     SyntaxError,
     OSError,
@@ -310,7 +310,7 @@ def _png(image: ImageFile.ImageFile, data: bytes) -> _Container:
             with suppress(ValueError, struct.error):
                 y, mo, d, h, mi, sec = struct.unpack(">HBBBBB", body)
                 changed = datetime(y, mo, d, h, mi, sec, tzinfo=UTC)
-    # verify() uses the image up.
+    # verify() leaves the image unusable.
     again = PngImagePlugin.PngImageFile(io.BytesIO(data))
     return _Container("PNG", again, data, exif, texts, changed)
 
@@ -374,7 +374,7 @@ def _decode(file: Path, container: _Container) -> Pixels:
         raise _damaged(file, kind, len(data), error) from None
     if kind == "JPEG" and _is_torn(pixels, data):
         raise FormatError(file, "this JPEG is damaged: part of its scan is missing; copy it again")
-    # Pillow and OpenCV both turn a TIFF by its orientation; this turns it back.
+    # Pillow and OpenCV both rotate a TIFF according to its orientation; this reverses the rotation.
     pixels = _turned_back(pixels, orientation)
     if pixels.shape[1::-1] != size and pixels.shape[:2] != size:
         raise FormatError(
@@ -429,8 +429,8 @@ def _deep_colour(file: Path, container: _Container) -> Pixels:
 
     data = container.data
     if container.kind == "PNG":
-        # libpng complains on standard error of profiles and texts: it gets none. Bit 5 of the
-        # first letter marks a chunk that is not needed for decoding.
+        # libpng writes complaints about profiles and texts to standard error, so it gets none. Bit
+        # 5 of the first letter marks a chunk that is not needed for decoding.
         data = data[:8] + b"".join(w for kind, _, w in _chunks(data) if not kind[0] & 0x20)
     how = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), how)
@@ -457,8 +457,8 @@ def _is_torn(pixels: Pixels, data: bytes) -> bool:
     """Return whether the scan of a JPEG ends before its picture does.
 
     libjpeg then fills the rest with one value, and its warning does not reach Pillow's callers.
-    Where a scene truly is of one value, as at night, every block takes the same bits, so the scan
-    ends in bits that repeat. This does not hold with restart markers (DRI) or progressive scans
+    If a scene truly has only one value, as at night, every block is coded in the same bits, so the
+    scan ends in repeating bits. This does not hold with restart markers (DRI) or progressive scans
     (SOF2), which are not judged.
     """
     last = pixels[-8:, -128:]
@@ -615,7 +615,7 @@ def write_image(image: Frame | Pixels, path: str | Path, *, quality: int = 95) -
 def encode_image(
     image: Frame | Pixels, suffix: str, quality: int = 95, name: str = "image"
 ) -> bytes:
-    """Return the bytes of an image file, as `write_image` writes them; ``name`` is for errors.
+    """Return the bytes of an image file as `write_image` writes them; errors quote ``name``.
 
     Raises
     ------

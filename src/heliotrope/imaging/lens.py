@@ -261,7 +261,7 @@ _FRONTAL = (
 def _without_outliers(
     size: tuple[int, int], points: FloatArray, boards: Sequence[Chessboard]
 ) -> list[Chessboard]:
-    """Leave out boards whose residuals are far above the others', the worst first."""
+    """Leave out boards with far larger residuals than the others, the worst first."""
     kept = list(boards)
     while sum(board.used for board in kept) > 3:
         # With all terms, so that no board is blamed for distortion.
@@ -276,7 +276,7 @@ def _without_outliers(
 
 
 def _check_lens(lens: Lens, normals: FloatArray) -> None:
-    """Refuse a lens that the boards do not determine."""
+    """Reject a lens that the boards do not determine."""
     f, sigma = lens.matrix[0, 0], lens.sigma[0]
     if sigma > FOCAL_LIMIT * f or sigma == 0.0:
         raise InputError(_FRONTAL.format(f"the focal length of {f:.0f} px ± {sigma:.0f} px"))

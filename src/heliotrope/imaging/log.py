@@ -1,4 +1,4 @@
-"""Facts about a photograph besides its pixels: heliostat, motors, target, time or sun vector."""
+"""Facts about a photograph other than its pixels: heliostat, motors, target, time or sun vector."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -70,7 +70,7 @@ class Log:
 
 
 def _short(path: Path) -> tuple[str, str]:
-    """Return the shorter names of a photograph, under which a log may have it."""
+    """Return the shorter names under which a log may list a photograph."""
     return path.stem, _number(path)
 
 

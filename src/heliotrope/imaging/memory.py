@@ -36,7 +36,7 @@ class Memory:
 
     @property
     def models(self) -> Mapping[str, EmptyTarget]:
-        """By the names of their targets, for `heliotrope.imaging.photograph.PhotographSettings`."""
+        """Models by target name, for `heliotrope.imaging.photograph.PhotographSettings`."""
         return self._models
 
     def learn(self, faces: Iterable[LookedAt]) -> None:
@@ -87,7 +87,7 @@ class Memory:
             model.save(place / f"{name}.npz")
 
 
-#: Least share of a face's paint without beams for learning.
+#: Least beam-free share of a face's paint for learning.
 _LEAST_FREE = 0.3
 
 

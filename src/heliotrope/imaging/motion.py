@@ -233,7 +233,7 @@ def _cells(image: _Image) -> _Image:
 
 
 def _expected(first: _View, second: _View) -> tuple[_Image, float]:
-    """Return the first frame in the light of the second, and the ratio of brightness.
+    """Return the first frame at the brightness of the second, and the brightness ratio.
 
     Gain, its slopes across the frame and the offset are fitted with Tukey's weights. Without
     contrast, offset and gain cannot be separated, and the offset is left out.
@@ -324,8 +324,8 @@ def _moved(image: _Image, x: float, y: float) -> _Image:
 
     if x == 0.0 and y == 0.0:
         return image
-    # The cubic kernel of Keys (1981, a = -0.5) at the exact place. OpenCV's warp would round the
-    # place to 1/32 px, which errs by 3 digits at an edge of 200 digits.
+    # The cubic kernel of Keys (1981, a = -0.5) at the exact position. OpenCV's warp would round the
+    # position to 1/32 px, which errs by 3 digits at an edge of 200 digits.
     whole = [math.floor(x), math.floor(y)]
     kernels = []
     for part in (x - whole[0], y - whole[1]):
@@ -446,7 +446,7 @@ def _difference(
         expected, bright = _moved(expected, *shift), _moved(bright, *shift)
     expected = np.minimum(expected, np.float32(1.0))
     d = second.image - expected
-    # Partly saturated places show only that they are bright.
+    # Partly saturated pixels show only that they are bright.
     level = np.minimum(expected, second.image)
     blind = np.maximum(bright, second.image) > _PARTLY
     blind &= level > (_PARTLY - 0.1) * min(1.0, ratio)
@@ -534,7 +534,7 @@ def _threshold(places: float, settings: MotionSettings) -> float:
     """Return the significance, of either sign, that noise exceeds at the accepted rate."""
     from scipy.special import ndtri
 
-    # Smoothing leaves about one independent place in four pixels of a scale.
+    # Smoothing leaves about one independent position per four pixels of a scale.
     independent = sum(max(1.0, places / 4.0**scale / 4.0) for scale in range(_SCALES))
     return _MARGIN * float(-ndtri(settings.false_alarms / (2.0 * independent)))
 

@@ -123,9 +123,9 @@ def glb(
 ) -> bytes:
     """Return a binary glTF 2.0 file of a heliostat that moves through joint angles.
 
-    Foundation, primary bone, secondary bone and mirror are nodes, each the child of the one
-    before; the two axes are animated as rotations. Blender and every glTF viewer show it. glTF's
-    y axis is up: the root turns ENU.
+    Foundation, primary bone, secondary bone and mirror are nodes, each the child of the previous
+    node; the two axes are animated as rotations. Blender and every glTF viewer can show the file.
+    In glTF the y axis points up, so the root node rotates ENU.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def _plate(corners: FloatArray) -> tuple[FloatArray, npt.NDArray[np.uint32]]:
 
 
 class _Gltf:
-    """The parts of a glTF document with its one buffer."""
+    """The parts of a glTF document with a single buffer."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
@@ -288,7 +288,7 @@ class _Gltf:
         return self._add("nodes", made)
 
     def root(self, children: list[int]) -> None:
-        """Add the root, which turns ENU to glTF's y up, and the scene."""
+        """Add the scene and its root node, which rotates ENU into glTF's y-up frame."""
         half = np.sqrt(0.5)
         number = self.node("heliostat", None, children=children)
         self._document["nodes"][number]["rotation"] = [-half, 0.0, 0.0, half]
@@ -308,7 +308,7 @@ class _Gltf:
         self._document["animations"] = [{"name": "day", "samplers": samplers, "channels": channels}]
 
     def data(self) -> bytes:
-        """Return the file."""
+        """Return the bytes of the file."""
         self._document["buffers"] = [{"byteLength": len(self._bytes)}]
         text = json.dumps(self._document, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)

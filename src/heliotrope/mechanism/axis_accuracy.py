@@ -17,13 +17,13 @@ class AxisAccuracy:
     Attributes
     ----------
     gamma_0, alpha_0
-        Mean of measured minus computed, the estimates of ``azimuth_zero`` and
+        Mean of measured minus computed angles, the estimates of ``azimuth_zero`` and
         ``elevation_zero``.
     sigma_gamma, sigma_alpha
         Standard deviation about the mean.
     sigma_normal
-        Standard deviation of the normal in two dimensions (a tracking error): a turn
-        of the azimuth axis moves the normal by cos α times as much.
+        Standard deviation of the normal in two dimensions (a tracking error): a rotation about the
+        azimuth axis moves the normal by cos α times the angle.
     """
 
     gamma_0: FloatArray
@@ -93,7 +93,7 @@ def axis_accuracy(
 def _circular(
     difference: FloatArray, weight: FloatArray, name: str
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the weighted mean of angles along the last axis, and what remains."""
+    """Return the weighted mean of angles along the last axis, and the deviations from the mean."""
     middle = np.arctan2(
         (weight * np.sin(difference)).sum(axis=-1, keepdims=True),
         (weight * np.cos(difference)).sum(axis=-1, keepdims=True),

@@ -39,17 +39,17 @@ DRIVE_NUMBERS = (
 _ENDS = ("primary", "secondary")
 #: Items that belong to the local controller itself: the plant neither pushes nor compares them.
 OWN = frozenset({"address", "key_id", "edition", "bus_keys"})
-#: Items that a local controller accepts at stow, at standby and defocused too; the others only
-#: locked, at rest, in FAULT, or before it is configured.
+#: Items that a local controller also accepts at stow, at standby and when defocused; it accepts
+#: other items only when locked, at rest, in FAULT, or before it is configured.
 CALIBRATION_ITEMS = frozenset({"armature", "biases", "location", "defocus"})
-#: Items by which a local controller turns an aim into step counts.
+#: Items with which a local controller converts an aim into step counts.
 POSE_ITEMS = frozenset({"armature", "biases", "drive_primary", "drive_secondary"})
 
 
 def drive_numbers(drive: Drive) -> tuple[int, tuple[float, ...], float]:
     """Return kind, ten numbers and bias (rad) of one drive, as `lcu.drives.Drive` takes them.
 
-    A phase of the sag is absorbed by the other numbers.
+    The other numbers absorb a phase of the sag.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def items_of(mechanism: Mechanism, machine: Machine | None = None) -> dict[str, 
     mechanism
         Calibrated, batch shape (), with two drives.
     machine
-        Its limits and resting places; None: only the items that calibration changes.
+        Its limits and rest positions; None: only the items that calibration changes.
 
     Raises
     ------
@@ -105,16 +105,16 @@ Tables = tuple[FloatArray, FloatArray]
 
 
 def tables_with(items: Mapping[str, bytes], armature: FloatArray, table: FloatArray) -> Tables:
-    """Return the armature (18,) and the drives (2, 19) of a mechanism once items are stored.
+    """Return the armature (18,) and the drives (2, 19) of a mechanism after items are stored.
 
     The inverse of `items_of`, as far as the pose is concerned.
 
     Parameters
     ----------
     items
-        Bytes by name; items beside `POSE_ITEMS` change nothing here.
+        Bytes by name; items other than `POSE_ITEMS` have no effect here.
     armature, table
-        The tables before, (18,) and (2, 19).
+        The tables before the change, (18,) and (2, 19).
     """
     rows = table.copy()
     biases = None if "biases" not in items else struct.unpack(CODES_OF["biases"], items["biases"])
@@ -163,14 +163,14 @@ def packed(name: str, values: tuple[object, ...]) -> bytes:
         data = struct.pack(CODES_OF[name], *values)
     except struct.error as error:
         raise InputError(f"{name}: {values} cannot be stored: {error}") from None
-    # Finite and in range, as the local controller itself will judge it.
+    # Check that values are finite and in range, as the local controller itself will.
     if name not in OWN and not Config().take(name, data):
         raise InputError(f"{name}: a local controller refuses {values}; see lcu.config for ranges")
     return data
 
 
 def checksums(items: Mapping[str, bytes]) -> dict[str, int]:
-    """Return the CRC-32 of each item, as `lcu.journal.Journal.checksum` gives it."""
+    """Return the CRC-32 of each item, as `lcu.journal.Journal.checksum` computes it."""
     return {name: crc32(data) for name, data in items.items()}
 
 
@@ -194,8 +194,8 @@ class Wanted:
     items
         Bytes by heliostat and item.
     missing
-        Names of items that differed in the last comparison, or are wanted otherwise since, by
-        heliostat.
+        Names of items that differed in the last comparison or whose wanted value has changed since,
+        by heliostat.
     """
 
     items: dict[str, dict[str, bytes]] = field(default_factory=dict)
@@ -221,7 +221,7 @@ class Wanted:
     def set(self, heliostat: str, items: Mapping[str, bytes]) -> None:
         """Add to the wanted items of a heliostat; see `check`.
 
-        Items that were wanted otherwise before count as missing until a comparison finds them.
+        Items whose wanted value changes count as missing until a comparison finds the new value.
         """
         self.check(heliostat, items)
         before = self.items.get(heliostat, {})
@@ -231,7 +231,7 @@ class Wanted:
             self.missing[heliostat] = tuple(sorted(changed.union(self.missing.get(heliostat, ()))))
 
     def rest(self, heliostat: str, point: tuple[float, ...]) -> None:
-        """Want the standby point that a heliostat was given, if one is wanted at all."""
+        """Set the wanted standby point to the one that a heliostat received, if any is wanted."""
         items = self.items.get(heliostat, {})
         if "standby" in items:
             items["standby"] = packed("standby", point)

@@ -1,7 +1,7 @@
 """Motion of local controllers: the safe path to standby, and the end position of a DEFOCUS.
 
-The same rules as `lcu.motion`, written over arrays for the plant and the simulation; the boards run
-the scalar code.
+The rules are those of `lcu.motion`, written for arrays for use by the plant and the simulation; the
+boards run the scalar code.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,9 +29,10 @@ def safe_paths(
     Parameters
     ----------
     corners
-        Points that the plant file gives each of N heliostats; (): it finds its own.
+        Points that the plant file specifies for each of N heliostats; (): each heliostat finds its
+        own path.
     position, origin, standby
-        Places of the heliostats, origins of their beams, and standby points, ENU, m, (N, 3).
+        Positions of the heliostats, origins of their beams, and standby points, ENU, m, (N, 3).
 
     Returns
     -------
@@ -95,9 +96,10 @@ def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, Rows]:
 def end_down_the_path(
     pose: Pose, path: FloatArray, place: Rows, begin: FloatArray, defocus: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where DEFOCUS ends on the safe path, below a place on it: `Motion._turn`.
+    """Return where on the safe path a DEFOCUS ends, below a point on that path: `Motion._turn`.
 
-    A mirror goes back down until an axis has turned by its angle or the ground is reached.
+    A heliostat moves back down until an axis has turned by its angle or the beam reaches the
+    ground.
 
     Parameters
     ----------
@@ -106,13 +108,14 @@ def end_down_the_path(
     path
         Safe paths, (K, P, 3), m.
     place
-        Points below each heliostat, (K,); 0: it does not go back.
+        Number of path points below each heliostat's beam, (K,); 0: it does not move back.
     begin, defocus
         Present angles, and the turns of the axes, rad, (K, 2).
 
     Returns
     -------
-    Points (K, 3) and angles (K, 2); NaN where there is none, and the mirror turns by its angles.
+    Points (K, 3) and angles (K, 2); NaN where there is none and the heliostat turns by its angles
+    instead.
     """
     points, angles = np.full((len(place), 3), np.nan), np.full((len(place), 2), np.nan)
     place, left = place.copy(), np.arange(len(place))
@@ -129,17 +132,17 @@ def end_down_the_path(
 
 
 def offsets(pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArray) -> FloatArray:
-    """Return by how much the axes turn where DEFOCUS does not go down the path: `Motion._turn`.
+    """Return the turns of the axes where DEFOCUS does not follow the path: `Motion._turn`.
 
-    From an aim, the axes turn away from standby. A mirror that is held turns off its aim.
+    From an aim, the axes turn away from standby. A heliostat that is held turns away from its aim.
 
     Parameters
     ----------
     pose, begin, defocus
         As for `end_down_the_path`.
     points
-        Standby point of a mirror that tracks or searches, of every other its aim, m, (K, 3);
-        NaN: none.
+        Standby point of a heliostat that tracks or searches, otherwise its aim, m, (K, 3); NaN:
+        none.
     """
     off, known = np.full_like(begin, np.nan), np.flatnonzero(np.isfinite(points).all(axis=-1))
     if known.size:
@@ -149,7 +152,7 @@ def offsets(pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArr
 
 
 def turned(begin: FloatArray, offset: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return angles turned by an offset, the other way where a stop is near: `Motion._away`.
+    """Return angles turned by an offset, in reverse where a stop is near: `Motion._away`.
 
     Parameters
     ----------

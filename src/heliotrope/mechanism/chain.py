@@ -22,7 +22,7 @@ from heliotrope.mechanism.parameters import Parameter
 from heliotrope.parallel import run_blocks
 from heliotrope.values import Card, Value, card_of_arrays, dots, span
 
-#: Largest deviation of a length, m: millimetres are mostly larger; and of a ratio.
+#: Largest deviation of a length, m (a larger number is probably in millimetres), and of a ratio.
 _FARTHEST, _LARGEST = 1000.0, 1e6
 #: Valid index of a mechanism.
 Index = (
@@ -110,7 +110,7 @@ class Jacobian(Value, Framed):
 
 @runtime_checkable
 class Calibrated(Protocol):
-    """Parameter deviations from a nominal mechanism: from a fit, a record or a file."""
+    """Parameter deviations from a nominal mechanism, taken from a fit, a record or a file."""
 
     @property
     def parameters(self) -> Mapping[str, npt.ArrayLike]:
@@ -122,12 +122,12 @@ class Calibrated(Protocol):
 
 
 def check_calibration(calibration: object) -> None:
-    """Refuse what holds no deviations of parameters.
+    """Raise an error if a value holds no parameter deviations.
 
     Raises
     ------
     InputError
-        If it is neither a fit nor a record.
+        If the value is neither a fit nor a record.
     """
     if not isinstance(calibration, Calibrated):
         raise InputError(
@@ -370,7 +370,7 @@ class Mechanism(Value, Framed):
         row = self.parameter(name)
         if row.unit != "rad":
             return _FARTHEST if row.unit == "m" else _LARGEST
-        # No pedestal leans by a right angle; the zero of a drive may be off by a turn.
+        # No pedestal leans by a right angle, but the zero of a drive may be off by a full turn.
         return 0.5 * np.pi if row.code[0] == slot.MOVES_JOINT else TAU
 
     def _deviation(self, name: str, value: npt.ArrayLike) -> FloatArray:

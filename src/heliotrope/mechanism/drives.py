@@ -210,7 +210,7 @@ _STOPS = ("min_angle", "max_angle")
 
 
 def _number(value: npt.ArrayLike, name: str) -> FloatArray:
-    """Return a number of a drive; an angle must be one in radians, a stop may be infinite."""
+    """Return a checked drive constant; angles must be in radians, stops may be infinite."""
     if name in _ANGLES:
         return as_angles(value, f"drive: {name}", MOST_TURNS)
     number = as_numbers(value, f"drive: {name}")
@@ -282,7 +282,7 @@ def _check_triangles(jacks: FloatArray) -> None:
 
 
 def _check_monotone(t: FloatArray) -> None:
-    """Refuse periodic terms so large that one angle belongs to several counts."""
+    """Reject periodic terms so large that several counts produce the same angle."""
     rotary = t[..., slot.KIND] == slot.ROTARY
     worm = np.hypot(t[..., slot.WORM_COS], t[..., slot.WORM_SIN]) * np.abs(t[..., slot.WORM_RATIO])
     swing = (worm + np.abs(t[..., slot.SAG])) / np.abs(1.0 + t[..., slot.SCALE])

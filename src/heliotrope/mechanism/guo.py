@@ -40,13 +40,13 @@ from heliotrope.geometry import (
 #: A demanded normal counts as reached within this angle, rad; rounding leaves 1e-15.
 REACHED = 1e-12
 
-#: Least |cos μ cos τ₁|. Below it rounding alone moves α by 1e-7 rad.
+#: Least |cos μ cos τ₁|. Below this value, rounding alone moves α by 1e-7 rad.
 LEAST_COSINE = 1e-9
 
-#: Steps from (5) to the exact offset: one does at field distances, six up to h = 0.99.
+#: Iterations from (5) to the exact offset: one suffices at field distances, six up to h = 0.99.
 _NEWTON_STEPS = 6
 
-#: Malan's names of the parameters that his model shares with ours.
+#: Malan's names for the parameters that his model shares with ours.
 MALAN_NAMES = {
     "eptN": "tilt_north",
     "eptE": "tilt_east",
@@ -144,9 +144,8 @@ class GuoTracking:
     normal
         The demanded unit normals in ENU, shape (..., 3).
     residual, reachable
-        Angle from the demanded normal to the one that the positions give, rad, the
-        larger of the two branches (a tracking error), and whether it is no more than
-        `REACHED`, shape (...).
+        Angle between the demanded normal and the normal at the drive positions, rad, the larger of
+        the two branches (a tracking error); and whether this is at most `REACHED`, shape (...).
     """
 
     alpha: FloatArray
@@ -222,7 +221,7 @@ def _offset_slope(
     """Return q = tan τ / sin θ for h = offset / distance.
 
     The triangle of pivot, vertex and target gives sin 2τ = h sin(θ + τ), and divided by
-    cos τ: 2 sin τ = h (sin θ + cos θ tan τ). Guo's (5) puts sin τ for tan τ.
+    cos τ: 2 sin τ = h (sin θ + cos θ tan τ). Guo's (5) replaces tan τ by sin τ.
     """
     p = h / (2.0 - h * cos_theta)
     q = p / np.sqrt(1.0 - (p * sin_theta) ** 2)
@@ -264,8 +263,8 @@ def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
     """Return the drive positions at which the mirror has a given normal, on both branches.
 
     A normal in a dead cone, closer than |μ − τ₁| to the azimuth axis or than |μ + τ₁| to
-    its foot, gets the nearest pose and its residual. Where every azimuth serves (the
-    normal along the azimuth axis) the azimuth joint is at 0.
+    its foot, yields the nearest pose and its residual. If the normal lies along the azimuth axis,
+    so that any azimuth will do, the azimuth joint is at 0.
 
     Accuracy: the residual is below 1e-14 rad everywhere, at the keyhole too, where α by
     arcsin would leave 1e-8 rad. Source: the part of Guo (1)-(28) that leads from the
@@ -316,8 +315,8 @@ def _co_elevation(c: FloatArray, tau_1: FloatArray, mu: FloatArray) -> FloatArra
 
     sin α = (cos ζ − sin μ sin τ₁) / (cos μ cos τ₁), ζ the angle from the azimuth axis.
     Then tan²(β/2) = (1 − sin α) / (1 + sin α), where both differences are products:
-    cos(μ − τ₁) − cos ζ above and cos(μ + τ₁) + cos ζ below. Where a product is negative
-    the normal lies in a dead cone; its clamp gives the nearest pose.
+    cos(μ − τ₁) − cos ζ above and cos(μ + τ₁) + cos ζ below. Where a product is negative, the normal
+    lies in a dead cone; clamping the product yields the nearest pose.
     """
     zeta = np.arctan2(np.hypot(c[..., 0], c[..., 1]), c[..., 2])
     near, far = 0.5 * (mu - tau_1), 0.5 * (mu + tau_1)
@@ -334,7 +333,7 @@ def _azimuth(c: FloatArray, beta: FloatArray, tau_1: FloatArray, mu: FloatArray)
     y = np.cos(mu) * np.sin(beta)
     east = c[..., 0] * y - c[..., 1] * x
     north = c[..., 1] * y + c[..., 0] * x
-    # atan2 of zeros is ±π where their signs say so.
+    # atan2 of two zeros may be ±π, depending on their signs.
     free = (east == 0.0) & (north == 0.0)
     return as_float(np.where(free, 0.0, np.arctan2(east, north)))
 
@@ -364,9 +363,9 @@ def track(
 
 
 def regularise(parameters: GuoParameters) -> GuoParameters:
-    """Return the same machine with its parameters in their natural ranges.
+    """Return the same mechanism with its parameters in their natural ranges.
 
-    A fit may stop at any of the equivalent sets. This one has ψ_t in [0, π/2] (in
+    A fit may end at any of the equivalent parameter sets. The returned set has ψ_t in [0, π/2] (in
     (π/2, π] only if the azimuth axis points below the horizon, which no relation can
     raise), ψ_a in [0, 2π), γ₀ in [−π, π), τ₁ and α₀ in [−π/2, π/2]; ψ_a is 0 where there
     is no tilt. μ lies in [−π/2, π/2] as well unless cos τ₁ cos μ cos α₀ < 0: no relation

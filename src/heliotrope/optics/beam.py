@@ -86,7 +86,7 @@ def checked(name: str, value: npt.ArrayLike, unit: str, *, positive: bool = Fals
 
 @dataclass(frozen=True)
 class MirrorOptics:
-    """The properties of N mirrors that shape their beams.
+    """The properties of N mirrors that determine the shape of their beams.
 
     Attributes
     ----------
@@ -364,7 +364,7 @@ class ExpectedError:
 
     @property
     def ellipse(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The 90 % ellipse: semi-axes (rad, the longer first) and angle of the longer axis, (M,).
+        """The 90 % ellipse: semi-axes (rad, longer first) and angle of the longer axis, (M,).
 
         The angle is counterclockwise from the right, rad.
         """
@@ -379,7 +379,7 @@ class ExpectedError:
 def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:
     """Return the common area of two disks with radii r and s and centres d apart."""
     small = np.minimum(r, s)
-    # For concentric disks the branch of one inside the other counts.
+    # Concentric disks are handled by the case of one disk inside the other.
     safe = np.maximum(d, 1e-9)
     a = np.clip((d * d + r * r - s * s) / (2.0 * safe * r), -1.0, 1.0)
     b = np.clip((d * d + s * s - r * r) / (2.0 * safe * s), -1.0, 1.0)
@@ -390,7 +390,7 @@ def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:
 
 
 def reaches(reach: npt.ArrayLike, count: int) -> FloatArray:
-    """Return the reach of each beam, m, (count,), from one number or one for each beam."""
+    """Return the reach of each beam, m, (count,), from one number or from one number per beam."""
     lengths = as_float(reach)
     if not (np.isfinite(lengths) & (lengths > 0.0)).all() or lengths.shape not in (
         (),

@@ -26,8 +26,8 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, tangent_axes
 from heliotrope.optics.beam import NOMINAL_DNI, SUN_RADIUS, Beams, crossing
 
-#: Retinal irradiance times subtended angle that burns, W/m² · rad (0.118 W/cm² · rad), and the
-#: angle above which the irradiance alone counts, rad (1 W/cm² there).
+#: Retinal irradiance times subtended angle that causes a burn, W/m² · rad (0.118 W/cm² · rad), and
+#: the angle above which the irradiance alone counts, rad (1 W/cm² there).
 BURN, WIDE = 1180.0, 0.118
 #: Retinal irradiance that leaves an after-image at 1 rad, W/m² (3.59e-5 W/cm²), and the power
 #: of the angle by which the threshold falls.
@@ -38,7 +38,7 @@ SMALLEST = 1e-6
 
 @dataclass(frozen=True)
 class Eye:
-    """An eye: pupil (m; daylight adapted), focal length (m), transmittance of the ocular media."""
+    """An eye: pupil (m; daylight-adapted), focal length (m), transmittance of the ocular media."""
 
     pupil: float = 2e-3
     focal_length: float = 17e-3
@@ -182,7 +182,7 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
     room = np.cumsum(np.take_along_axis(size, order, axis=-1), axis=-1)
     corner_light, corner_room = _corner(light, room)
     every_light = np.concatenate([light, corner_light[..., None]], axis=-1)
-    # No source is wider than the half space; a smaller angle errs to the safe side.
+    # No source is wider than the half-space; a smaller angle errs on the safe side.
     angle = np.minimum(np.sqrt(np.concatenate([room, corner_room[..., None]], axis=-1)), math.pi)
     dark = angle == 0.0
     combined = glare_of_one(every_light, np.where(dark, 1.0, angle), eye)
@@ -196,7 +196,7 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
 
 
 def _corner(light: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return g and W where ω passes 0.118 rad; 0 and 0 where it does not."""
+    """Return g and W where ω passes 0.118 rad, or 0 and 0 if it does not."""
     wide = WIDE * WIDE
     before = np.concatenate([np.zeros((*room.shape[:-1], 1)), room[..., :-1]], axis=-1)
     below = np.concatenate([np.zeros((*light.shape[:-1], 1)), light[..., :-1]], axis=-1)
@@ -230,11 +230,11 @@ def safe_range(
     reflectivity: float = 1.0,
     eye: Eye = DAYLIGHT,
 ) -> tuple[float, float]:
-    """Return the range of distances along one beam where a look into it may burn, m.
+    """Return the range of distances along one beam at which a look into it may cause a burn, m.
 
-    The range is (0, 0) if the beam burns nowhere. On the axis the ratio to the threshold is K ω
-    with K = ρ DNI d² τ / (4 β² f² · 0.118 W/cm²) while ω < 0.118 rad, and ω = 2 min(R / x, β / |1 −
-    x/b|); the threshold is reached where ω = 1 / K.
+    The range is (0, 0) if the beam causes burns nowhere. On the axis the ratio to the threshold is
+    K ω with K = ρ DNI d² τ / (4 β² f² · 0.118 W/cm²) while ω < 0.118 rad, and ω = 2 min(R / x, β /
+    |1 − x/b|); the threshold is reached where ω = 1 / K.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def safe_range(
     dni, reflectivity
         W/m²; 0 to 1.
     eye
-        The eye that looks.
+        The observer's eye.
     """
     _irradiance(dni)
     if not (area > 0.0 and math.isfinite(area) and focus > 0.0 and 0.0 < reflectivity <= 1.0):
@@ -301,7 +301,7 @@ def glare_map(
     dni: float = NOMINAL_DNI,
     eye: Eye = DAYLIGHT,
 ) -> GlareMap:
-    """Return the hazards on a square about a standby point.
+    """Return the hazards on a square around a standby point.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def glare_map(
     dni
         W/m².
     eye
-        The eye that looks.
+        The observer's eye.
     """
     middle = as_vectors(center, "center")
     if not (math.isfinite(size) and size > 0.0 and cells >= 2):
@@ -347,7 +347,7 @@ def safe_distance(
     dni: float = NOMINAL_DNI,
     eye: Eye = DAYLIGHT,
 ) -> float:
-    """Return the radius about a standby point beyond which no beam axis reaches ``limit``.
+    """Return the radius around a standby point beyond which no beam axis reaches ``limit``.
 
     The axes of all beams are sampled on both sides of the point, where a beam is strongest. Points
     between the axes are not sampled; `glare_map` covers them.
@@ -365,7 +365,7 @@ def safe_distance(
     dni
         W/m².
     eye
-        The eye that looks.
+        The observer's eye.
 
     Returns
     -------

@@ -33,9 +33,9 @@ from heliotrope.optics.beam import (
     reaches,
 )
 
-#: Smallest turn of a beam that `sweep` resolves, rad: half of the sun's disk.
+#: Smallest rotation of a beam that `sweep` resolves, rad: half of the sun's disk.
 RESOLUTION = SUN_RADIUS
-#: Turn of the line of sight between two waypoints of a safe way, rad.
+#: Rotation of the line of sight between two waypoints of a safe path, rad.
 WAY_STEP = 0.02
 
 
@@ -50,7 +50,7 @@ def clearance(points: npt.ArrayLike, volumes: Sequence[Volume]) -> FloatArray:
 
 
 def bounds(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:
-    """Return balls about volumes: centres, ENU, m, (V, 3), and radii, m, (V,)."""
+    """Return bounding spheres of volumes: centres, ENU, m, (V, 3), and radii, m, (V,)."""
     table, _ = _packed(volumes)
     return table[:, 1:4].copy(), table[:, 4].copy()
 
@@ -112,7 +112,7 @@ def _strongest(
     """Return the largest irradiance on the axis between two distances (N, V), W/m²."""
     area, focus = mirrors.area[:, None], mirrors.focus[:, None]
     radius = np.sqrt(area / np.pi)
-    # 1 / (1 − x/b) grows up to here; beyond, everything falls.
+    # 1 / (1 − x/b) grows up to this point; beyond it, all factors fall.
     peak = radius / (SUN_RADIUS + radius / focus)
     at = np.maximum(np.clip(peak, first, np.fmax(first, last)), 1e-6)
     strength = dni * mirrors.reflectivity[:, None] * concentration(at, area, focus)
@@ -271,9 +271,10 @@ class Way:
 
     @property
     def back(self) -> FloatArray:
-        """The same poses in reverse, rad, (M, 2): down, away, elevation, azimuth last.
+        """The same poses in reverse, rad, (M, 2): down, outwards, elevation, then azimuth.
 
-        They are proven for the sun position of the check only; hours later a new path is needed.
+        The poses are proven clear only for the sun position of the check; hours later a new path is
+        needed.
         """
         return self.path[::-1]
 
@@ -376,7 +377,7 @@ def _verified(
     drives: Drive | None,
     reach: float,
 ) -> Way:
-    """Return the way over the given aims with its check."""
+    """Return the path over the given aims, with its keep-out check."""
     poses, status = _angles(armature, stow, aims, sun, drives)
     path = np.stack([stow, np.array([poses[0, 0], stow[1]]), *poses])
     motion = sweep(armature, path, sun, mirrors, volumes, reach=reach)
@@ -404,12 +405,12 @@ def _angles(
     sun: npt.ArrayLike,
     drives: Drive | None,
 ) -> tuple[FloatArray, npt.NDArray[np.int8]]:
-    """Return joint angles (K, 2) for the aims, each the nearest to the one before, and status."""
+    """Return joint angles (K, 2) for the aims, each nearest to its predecessor, and the status."""
     s = normalize(sun, "sun")
     tracking = track(armature, s, aims, drives=drives)
     angles, status, before = np.empty((len(aims), 2)), np.empty(len(aims), np.int8), stow
     for k in range(len(aims)):
-        # A whole turn of a joint is the same pose; without drives nothing stops it.
+        # A whole turn of a joint leads to the same pose; without drives, no stop prevents it.
         options = tracking.angles[k]
         if drives is None:
             options = before + (options - before + np.pi) % (2.0 * np.pi) - np.pi
@@ -422,7 +423,7 @@ def _angles(
 
 
 def _packed(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:
-    """Return the rows (V, SIZE) and corners (C, 2) that the kernels read of volumes."""
+    """Return the volumes as rows (V, SIZE) and corners (C, 2) for the kernels."""
     table = np.zeros((len(volumes), kernels.SIZE))
     corners: list[FloatArray] = []
     count = 0

@@ -25,11 +25,11 @@ from heliotrope.optics.mirror_surface import elements_of, equal_facets, mirror_a
 from heliotrope.optics.obstruction import Neighbours
 from heliotrope.optics.sun_shape import AUREOLE_RADIUS, PROFILES, sun_profile
 
-#: A Gaussian is drawn to this many σ; 4e-6 of a two-dimensional one lies beyond.
+#: A Gaussian is drawn to this many σ; 4e-6 of a two-dimensional Gaussian lies beyond.
 _REACH = 5.0
 #: Greatest number of samples along a side of a grid.
 _LARGEST = 4096
-#: Samples of several beams fall on one grid within this share of a step.
+#: Samples of several beams must coincide on one grid to within this share of a step.
 _ALIGNED = 1e-6
 
 
@@ -473,8 +473,8 @@ def _gather(
 
     per_rad, cosine = spread
     radius = AUREOLE_RADIUS if sun_shape == "buie" else SUN_RADIUS
-    # A slope error turns the ray by twice itself in the plane of incidence; across it the
-    # cosine of incidence comes in, because r = 2 (n·s) n − s.
+    # A slope error rotates the ray by twice its size in the plane of incidence. Across that plane
+    # it is multiplied by the cosine of incidence as well, because r = 2 (n·s) n − s.
     sigma = per_rad * (2.0 * slope_error * np.array([1.0, cosine]))
     covariance = sigma @ sigma.T
     sun_reach = radius * np.linalg.norm(per_rad, axis=1)
@@ -500,7 +500,7 @@ def _gather(
     )
     spectrum = rfft2(cloud) * rfft2(kernel) * np.exp(-2.0 * np.pi**2 * exponent)
     flux = np.maximum(irfft2(spectrum, s=(rows, columns)), 0.0)
-    flux[flux < 1e-9 * flux.max()] = 0.0  # what rounding left
+    flux[flux < 1e-9 * flux.max()] = 0.0  # rounding residue
     return Beam(flux, step, low).of_power(float(power.sum()))
 
 
@@ -512,10 +512,10 @@ def _sun_kernel(
     circumsolar: float,
     step: float,
 ) -> FloatArray:
-    """Return the sun's image by one ray, of sum 1, with its centre in the middle."""
+    """Return the sun's image from one ray, centred and with sum 1."""
     columns, rows = (np.ceil(reach / step).astype(int) + 1).tolist()
     value = _sun_cells(per_rad, (columns, rows), 1, shape, circumsolar, step)
-    # The limb is sharp, unlike the aureole: cells around the disk are means of 4 × 4 places.
+    # The limb is sharp, unlike the aureole: cells around the disk are means of 4 × 4 points.
     j, i = (np.ceil(reach * SUN_RADIUS / radius / step).astype(int) + 1).tolist()
     inner = _sun_cells(per_rad, (j, i), 4, shape, circumsolar, step)
     value[rows - i : rows + i + 1, columns - j : columns + j + 1] = inner
@@ -549,7 +549,7 @@ def deposit(places: FloatArray, weights: FloatArray, shape: tuple[int, int]) -> 
     for right in (0, 1):
         for up in (0, 1):
             part = weights * (a if right else 1.0 - a) * (b if up else 1.0 - b)
-            # The last column has no neighbour, but its share there is 0.
+            # The last column has no neighbour, but the share for that neighbour is 0.
             column = np.minimum(whole[:, 0] + right, shape[1] - 1)
             row = np.minimum(whole[:, 1] + up, shape[0] - 1)
             total += np.bincount(row * shape[1] + column, part, minlength=total.size)
@@ -564,7 +564,7 @@ def _centroid(flux: FloatArray, origin: FloatArray, step: float) -> FloatArray:
 
 
 def _axes(reach: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return columns and rows of a grid that is centred on a sample at 0, m."""
+    """Return columns and rows of a grid with its central sample at 0, m."""
     count = np.ceil(reach / step).astype(int)
     if count.max() > _LARGEST // 2:
         raise InputError(

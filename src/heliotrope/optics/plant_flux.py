@@ -31,18 +31,18 @@ from heliotrope.sun import Times, unix_seconds, vector
 from heliotrope.values import Card, Value, amount, span
 
 Progress = Callable[[int, int], None]
-#: Efficiencies of a mirror and of a field, in the order of the light path; shading and blocking are
-#: parts of "lit".
+#: Efficiencies of a heliostat and of a field, in the order of the light path; "lit" combines
+#: shading and blocking.
 EFFICIENCIES = ("cosine", "shading", "blocking", "lit", "mirror", "air", "intercept", "total")
 #: The sun's greatest declination, rad.
 _OBLIQUITY = np.radians(23.45)
-#: Apparent elevation below which a table over the year has no sun, rad.
+#: Apparent elevation below which a yearly table has no sun positions, rad.
 LOWEST = np.radians(2.0)
 
 
 @dataclass(frozen=True)
 class FieldOptics:
-    """What the light from a field depends on, besides plant and sun position.
+    """Everything that determines a field's light, apart from the plant and the sun position.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class FieldOptics:
     gaussians: int = 3
 
     def changed(self, changes: dict[str, Any]) -> "FieldOptics":
-        """Return the settings with other values.
+        """Return the settings with some values changed.
 
         Raises
         ------
@@ -110,7 +110,8 @@ class FieldOptics:
         error = as_float(self.error)
         if not (np.isfinite(error) & (error >= 0.0) & (error < 0.2)).all():
             raise InputError(f"flux: an error of {error.max():g} rad must be from 0 to 0.2 rad")
-        # Two axes of the normal share its variance, and the beam turns by twice the angle.
+        # The variance of the normal is split between two axes, and the beam turns by twice the
+        # angle.
         spread = np.broadcast_to(2.0 * error**2, (len(plant),))[:, None, None] * np.eye(2)
         scene = scene_of(
             plant,
@@ -145,7 +146,7 @@ class PlantFlux(Value, Framed):
     plant
         Name.
     names, position, aim
-        Of the heliostats; positions and aims in ENU m, (N, 3).
+        Names, positions and aims of the heliostats; positions and aims in ENU m, (N, 3).
     sun
         Unit vector, (3,).
     dni
@@ -153,7 +154,7 @@ class PlantFlux(Value, Framed):
     area
         Area of the mirrors, m², (N,).
     clean, reflectivity
-        Of each mirror, (N,).
+        Cleanliness and reflectivity of each mirror, (N,).
     efficiencies
         Efficiencies of each mirror, (N,); NaN for a mirror that cannot reach its aim.
     maps
@@ -253,12 +254,13 @@ class PlantFlux(Value, Framed):
 
 
 def field_efficiencies(shares: Efficiencies, area: FloatArray) -> dict[str, float]:
-    """Return the efficiencies of a field, each as a share of what the one before left.
+    """Return the efficiencies of a field, each as a share of what the previous one left.
 
     Parameters
     ----------
     shares
-        Of the mirrors, (N,); a mirror with NaN counts as dark, and its area counts.
+        Efficiencies of the mirrors, (N,); a mirror with NaN counts as dark, but its area is
+        included.
     area
         m², (N,).
     """
@@ -295,7 +297,7 @@ def field_flux(
     light: FieldOptics | None = None,
     **changes: Any,
 ) -> PlantFlux:
-    """Return the flux that each heliostat puts on the receivers, and the losses on the way.
+    """Return the flux from each heliostat on the receivers, and the losses along the light path.
 
     Parameters
     ----------
@@ -304,7 +306,8 @@ def field_flux(
     time
         One time; see `heliotrope.sun.Times`. Alternatively pass ``sun``.
     receiver
-        Name or names; "": all receivers of the plant. A beam counts where it lands first.
+        Name or names; "": all receivers of the plant. A beam counts on the first receiver that it
+        meets.
     sun
         Unit vector, (3,), instead of a time.
     aim

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: Colours of Okabe and Ito, which are distinguishable with colour blindness.
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#999999")
-#: Most names that are written beside the dots of a map.
+#: Maximum number of names written beside the dots of a map.
 _NAMED = 60
 
 
@@ -77,7 +77,7 @@ def _dates(times: Times) -> np.ndarray:
 
 
 def _date_axis(ax: "Axes") -> None:
-    """Write dates short: the day once, and not on every tick."""
+    """Write short dates, with the day only once instead of on every tick."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
     locator = AutoDateLocator(minticks=3, maxticks=8)  # type: ignore[no-untyped-call]
@@ -163,7 +163,7 @@ def residuals(
     beam
         Beam errors right and up, rad, (M, 2): ``BeamErrors.offset``, ``Prediction.plane``.
     label
-        What ``x`` is, with its unit.
+        Meaning of ``x``, with its unit.
     groups
         Points that are drawn in the same style; by default all points.
     ax
@@ -185,7 +185,7 @@ def residuals(
         ax.plot(place[mask], errors[mask, 1], "^", color=colour, ms=3, mfc="none", mew=0.7)
     good &= np.isfinite(errors).all(axis=1)
     if good.any():
-        # The limits leave outliers out of view, so that they do not flatten the rest.
+        # The limits exclude outliers from view, so that these do not compress the rest.
         limit = max(0.5, 1.3 * float(np.percentile(np.abs(errors[good]), 99)))
         ax.set_ylim(-limit, limit)
     if place.dtype.kind == "M":
@@ -205,7 +205,7 @@ def ellipses(
     title: str = "",
     ax: "Axes | None" = None,
 ) -> "Axes":
-    """Draw points on a target about its aim, with their 90 % ellipses.
+    """Draw points on a target relative to its aim, with their 90 % ellipses.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def field_map(
         One value per heliostat, (N,), in the unit of the label; the colour scale ends at the 95th
         percentile.
     label
-        What the values are, with their unit.
+        Meaning of the values, with their unit.
     names
         Labels beside the dots of at most 60 heliostats.
     targets
@@ -369,7 +369,7 @@ def year_map(
     rms
         Errors, rad, (D, H); NaN where there is no value.
     label
-        What the colours are.
+        Meaning of the colours.
     ax
         Axes to draw on; by default new axes.
 

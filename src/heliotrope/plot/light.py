@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 #: Colours of flux and of efficiency.
 _FLUX, _SHARE = "inferno", "cividis"
-#: Most heliostats that are drawn in three dimensions; of more, every second, third, … is left out.
+#: Maximum number of heliostats drawn in three dimensions; in larger fields only every second,
+#: third, … is drawn.
 _MOST = 4000
 
 
@@ -143,7 +144,7 @@ def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
 
 
 def aim_figure(plan: AimPlan) -> "Figure":
-    """Return one picture of a plan's flux, its quantile over the limit, and where it binds.
+    """Return a figure of a plan's flux, its quantile over the limit, and where the limit binds.
 
     Parameters
     ----------

@@ -74,7 +74,7 @@ def _combined(weights: tuple[float, ...], knots: tuple[Vector, ...], divisor: fl
 def fast_vector(utc_s: float, site: Site) -> FloatArray:
     """Return the unit vector to the apparent sun, ENU, (3,), from `vector_and_rate`."""
     direction, _ = vector_and_rate(utc_s, site)
-    # No cubic follows the jump below the horizon.
+    # No cubic can follow the jump below the horizon.
     return vector(utc_s, site) if direction[2] < 0.0 else np.array(direction)
 
 

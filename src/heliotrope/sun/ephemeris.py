@@ -45,10 +45,10 @@ _LOWEST_REFRACTED_DEG = -(0.26667 + _HORIZON_REFRACTION_DEG)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _DAY = 86400.0
 _FIRST_YEAR, _LAST_YEAR = -2000, 6000  # validity of SPA
-#: Times from here on are outside it, Unix seconds.
+#: Times from here on are outside SPA's validity, Unix seconds.
 END_OF_TIMES = float(np.datetime64(f"{_LAST_YEAR + 1}", "s").astype(np.int64))
 _FIRST_DELTA_T, _LAST_DELTA_T = -1999, 3000  # validity of pvlib's polynomials of ΔT
-# pvlib holds some twenty intermediate arrays at a time: 3 MB a chunk stay in the cache.
+# pvlib holds some twenty intermediate arrays at a time; at 3 MB per chunk they stay in the cache.
 _CHUNK = 16384
 
 

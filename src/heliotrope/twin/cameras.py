@@ -34,7 +34,7 @@ from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
 
 #: Share of a mirror's size in its exact beam.
 _FLAT = 0.7
-#: Pictures of exact beams: pixels across, brightness of the paint and of a sun, and its noise.
+#: Pictures of exact beams: pixels across, brightness of the paint and of one sun, and the noise.
 _ACROSS, _PAINT, _SUN, _GRAIN = 96, 0.05, 0.1, 0.0005
 
 
@@ -66,14 +66,14 @@ class FieldSnapshot:
 
 
 class ExactCamera:
-    """Gives true centroids of beams with noise, and no picture.
+    """Returns true beam centroids with noise, and no photograph.
 
     Parameters
     ----------
     sight
-        Mirrors and sun.
+        The true mirrors and the sun.
     covariance
-        Of a centroid in the plane of the target: a variance or (2, 2), m².
+        Covariance of a centroid in the plane of the target: a variance or (2, 2), m².
     seed
         Seed of the noise.
 
@@ -99,7 +99,7 @@ class ExactCamera:
             )
         self._sight = sight
         self._plane = plane
-        # Its root; a Cholesky factor would not exist for a covariance of 0.
+        # Matrix square root, because a covariance of 0 has no Cholesky factor.
         self._root = vectors * np.sqrt(values)
         self._chance = np.random.default_rng(seed)
         self._views: dict[str, CameraView] = {}
@@ -108,15 +108,15 @@ class ExactCamera:
         """Do nothing: this camera never fails."""
 
     def close(self) -> None:
-        """Do nothing: nothing runs."""
+        """Do nothing: this camera has no process to end."""
 
     def sees(self, target: str) -> bool:
-        """Return True: it looks at every target."""
+        """Return True: this camera covers every target."""
         del target
         return True
 
     def awake(self, target: str) -> bool:
-        """Return True: it never falls silent."""
+        """Return True: this camera never stops responding."""
         return self.sees(target)
 
     async def look(self, target: str) -> None:
@@ -127,7 +127,7 @@ class ExactCamera:
         return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
     def eye(self, target: str) -> Camera:
-        """Raise `UnknownNameError`: exact centroids come from no camera."""
+        """Raise `UnknownNameError`: exact centroids need no camera."""
         raise UnknownNameError("target with a camera that takes pictures", target, ())
 
     def frame(self, target: str) -> Frame:
@@ -138,7 +138,7 @@ class ExactCamera:
         """Do nothing: there are no pictures."""
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return where a heliostat's beam is on a target; NaN where it is far from it."""
+        """Return the position of a heliostat's beam on a target; NaN if the beam is far away."""
         at = await self._sight.exposure()
         mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
         sun = self._sight.sun()
@@ -160,7 +160,7 @@ class ExactCamera:
         return Exposed.read(light)
 
     async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on a target: each beam a Gaussian at its true place, with noise."""
+        """Return the light on a target: a Gaussian at each beam's true position, with noise."""
         del view
         at, sun = await self._sight.exposure(), self._sight.sun()
         corners = target.plane_coordinates(target.corners)
@@ -197,30 +197,31 @@ class ExactCamera:
 
 
 class RenderedCamera:
-    """Draws photographs and reads them.
+    """Renders photographs and evaluates them.
 
-    A photograph takes a second of a processor. With a ``worker`` it is drawn in a process of its
-    own and read by the worker, beside the event loop; without, at once, as virtual time needs it.
+    A photograph takes a second of CPU time. With a ``worker``, it is rendered in a separate process
+    and evaluated by the worker, outside the event loop. Without one, both happen at once in the
+    loop, as virtual time requires.
 
     Parameters
     ----------
     sight
-        Mirrors and sun.
+        The true mirrors and the sun.
     scenes
         One target each: camera, target with its marks, light, paint and sensor, without beams.
     optics
         Mirrors and light.
     settings
-        How photographs are read.
+        Settings for evaluating photographs.
     seed
         Seed of the sensor's noise.
     worker
-        Reads photographs; None: they are drawn and read in the event loop itself.
+        Evaluates photographs; None: they are rendered and evaluated in the event loop itself.
 
     Attributes
     ----------
     taken
-        Photographs so far, empty ones included.
+        Number of photographs so far, including empty ones.
     last
         The last frame, None before the first.
 
@@ -252,20 +253,20 @@ class RenderedCamera:
         self._chance = np.random.default_rng(seed)
         self._worker, self._drawer = worker or at_once, None if worker is None else Drawer()
         self._views, self._empty = Views(), dict[str, Frame]()
-        #: Frames, and cameras and targets as they are known; the scenes have the true ones.
+        #: Frames, and cameras and targets as the plant knows them; the scenes hold the true ones.
         self._frames = dict[str, Frame]()
         self._known = {name: (s.camera, s.targets[0]) for name, s in self._scenes.items()}
         self.taken = 0
         self.last: Frame | None = None
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
-        """Begin the process that draws; a simulated camera never falls silent."""
+        """Start the rendering process; a simulated camera never stops responding."""
         del on_alarm
         if self._drawer is not None:
             self._drawer.start()
 
     def close(self) -> None:
-        """End the process."""
+        """End the rendering process."""
         if self._drawer is not None:
             self._drawer.close()
 
@@ -278,11 +279,11 @@ class RenderedCamera:
         return self.sees(target)
 
     def view(self, target: str) -> CameraView:
-        """Return the last photograph of a target, for people."""
+        """Return the last photograph of a target, for display."""
         return self._views.view(target)
 
     def eye(self, target: str) -> Camera:
-        """Return the camera of a target, as it is known; see `plant.ports.Cameras`."""
+        """Return the camera of a target, as the plant knows it; see `plant.ports.Cameras`."""
         if target not in self._known:
             raise UnknownNameError("target with a camera", target, list(self._known))
         return self._known[target][0]
@@ -305,7 +306,7 @@ class RenderedCamera:
         self._settings = replace(self._settings, pictures=known)
 
     async def look(self, target: str) -> None:
-        """Photograph a target before a beam comes, as background for later photographs.
+        """Photograph a target before a beam arrives, as background for later photographs.
 
         Raises
         ------
@@ -327,7 +328,7 @@ class RenderedCamera:
         self._empty[target] = picture.frame
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return the beam seen on a target; the camera does not know its heliostat.
+        """Return the beam seen on a target; the camera does not know which heliostat it is from.
 
         Raises
         ------
@@ -361,7 +362,7 @@ class RenderedCamera:
         return Exposed(at, asyncio.create_task(read()))
 
     def beams(self, target: Target) -> tuple[Thrown, ...]:
-        """Return the beams on a target, and those beside it that a frame would show, now."""
+        """Return the present beams on a target, and those beside it that a frame would show."""
         return thrown(target, self._sight.mirrors(), self._sight.sun(), self._optics)
 
     def _known_of(self, name: str) -> tuple[Camera, Target]:
@@ -370,7 +371,7 @@ class RenderedCamera:
         return self._known[name]
 
     async def _expose(self, name: str) -> tuple[Exposure, float]:
-        """Expose a frame: return the light, and when it was exposed, monotonic s."""
+        """Expose a frame; return the light and the time of exposure, monotonic s."""
         at = await self._sight.exposure()
         scene = self._scenes[name]
         self.taken += 1
@@ -386,13 +387,13 @@ class RenderedCamera:
         return shown, at
 
     async def _drawn(self, shown: Exposure) -> Frame:
-        """Return the frame of an exposure."""
+        """Return the rendered frame of an exposure."""
         if self._drawer is None:
             return shown.draw()
         return await asyncio.to_thread(self._drawer.draw, shown)
 
     async def _take(self, name: str) -> tuple[Photograph, float]:
-        """Take a photograph; return it as read, and when it was exposed, monotonic s."""
+        """Take a photograph; return its evaluation and the time of exposure, monotonic s."""
         self._known_of(name)
         shown, at = await self._expose(name)
         (camera, target), settings = self._known[name], self._settings

@@ -24,10 +24,10 @@ from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.optics import Beam, reflected_beam
 from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
 
-#: Least share of a mirror that is left by its neighbours for a beam to be drawn, and the elements
-#: along a side of the mirror by which it is found.
+#: Least unshaded share of a mirror for which a beam is drawn, and the number of elements along a
+#: side of the mirror that determine this share.
 LEAST, _COARSE = 0.05, 6
-#: Step of the beams' grids, m; a beam is wider than ten of them.
+#: Step of the beams' grids, m; a beam is more than ten steps wide.
 _STEP = 0.04
 #: Brightest reading after exposure, as a share of full scale.
 PEAK = 0.7
@@ -62,9 +62,9 @@ class Exposure:
     Attributes
     ----------
     scene
-        Its targets, without beams.
+        The targets in the frame, without beams.
     mirrors, sun
-        True mirrors whose light may be on it, and the unit vector to the sun, (3,).
+        True mirrors whose light may be in the frame, and the unit vector to the sun, (3,).
     optics
         Mirrors and light.
     seed
@@ -82,7 +82,7 @@ class Exposure:
     time: datetime
 
     def draw(self) -> Frame:
-        """Return the frame; the brightest of paint and beams sets the exposure."""
+        """Return the frame; the brightest point of paint or beam sets the exposure."""
         light = []
         for target in self.scene.targets:
             beams = [spot.beam for spot in thrown(target, self.mirrors, self.sun, self.optics)]
@@ -93,14 +93,16 @@ class Exposure:
 
 
 class Drawer:
-    """A process that draws photographs; it may be asked by several threads.
+    """A process that renders photographs; several threads may use it.
 
-    It begins with the first photograph, or by `start`, and anew after one in which it died.
+    The process starts with the first photograph or with `start`, and restarts after a photograph
+    during which it died.
 
     Parameters
     ----------
     load
-        Called in it first, such as `twin.warm.drawing`; None: the first photograph takes longer.
+        Called first in the process, such as `twin.warm.drawing`; None: the first photograph takes
+        longer.
     """
 
     def __init__(self, load: Callable[[], None] | None = None) -> None:
@@ -110,19 +112,19 @@ class Drawer:
         self._line: Connection | None = None
 
     def start(self) -> None:
-        """Begin the process, which takes some seconds until its first photograph."""
+        """Start the process, which needs some seconds before its first photograph."""
         with self._mine:
             self._begun()
 
     def draw(self, exposure: Exposure) -> Frame:
-        """Return the frame of an exposure.
+        """Return the rendered frame of an exposure.
 
         Raises
         ------
         FetchError
             The process has died.
         InputError
-            As drawing raises it.
+            If rendering raises it.
         """
         with self._mine:
             line = self._begun()
@@ -153,7 +155,7 @@ class Drawer:
             self._line, far = context.Pipe()
             self._process = context.Process(target=_drawing, args=(far, self._load), daemon=True)
             self._process.start()
-            # The process alone holds its end now, so that its death is seen, and ours by it.
+            # Now only the process holds its end, so that each side notices when the other dies.
             far.close()
         return self._line
 
@@ -168,8 +170,8 @@ class Drawer:
 
 
 def _drawing(line: Connection, load: Callable[[], None] | None) -> None:
-    """Draw what comes over a line until it is closed."""
-    # Ctrl-C in the plant's terminal is the plant's.
+    """Render the exposures that arrive over a pipe until it is closed."""
+    # Ctrl-C in the plant's terminal is meant for the plant.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if load is not None:
         load()
@@ -189,7 +191,7 @@ def _drawing(line: Connection, load: Callable[[], None] | None) -> None:
 def thrown(
     target: Target, mirrors: Sequence[TrueMirror], sun: FloatArray, optics: Optics
 ) -> tuple[Thrown, ...]:
-    """Return the beams of mirrors on a target, and near enough beside it."""
+    """Return the beams of mirrors on a target or close beside it."""
     beams = []
     for mirror in mirrors:
         if not within(target, mirror.on(target, sun), NEAR):

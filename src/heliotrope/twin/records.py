@@ -1,4 +1,4 @@
-"""Command records on a simulated disk, which may be full and which outlives the plant program."""
+"""Command records on a simulated disk, which may be full and which survives the plant program."""
 
 import asyncio
 from collections import deque
@@ -25,7 +25,7 @@ class RecordsDisk:
     delay
         Time that each piece of work takes, s.
     well_since
-        Time since which the disk has had room and has kept up with the work, s.
+        Time from which the disk has had space and has kept up with the work, s.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class RecordsDisk:
         self._queue: DiskQueue | None = None
 
     def set_full(self, now: float, *, full: bool) -> None:
-        """Fill the disk, or make room."""
+        """Fill the disk, or free space."""
         if self.full and not full:
             self.well_since = now
         self.full = full
@@ -53,17 +53,17 @@ class RecordsDisk:
         return self._queue
 
     def lose(self) -> None:
-        """Lose the work that waits: the plant's program has ended."""
+        """Discard the pending work, because the plant program has ended."""
         if self._queue is not None:
             self._queue.lose()
             self._queue = None
 
     def busy(self, now: float) -> bool:
-        """Whether a record may take its time."""
+        """Whether writing a record may take long."""
         return self.delay > 0.0 or (self._queue is not None and self._queue.free_at > now)
 
     def check(self) -> None:
-        """Check that the disk has room.
+        """Check that the disk has space.
 
         Raises
         ------
@@ -75,21 +75,21 @@ class RecordsDisk:
 
 
 class DiskQueue:
-    """The work that waits for a disk in virtual time; a `files.disk.Disk`.
+    """The pending work of a disk in virtual time; a `files.disk.Disk`.
 
     Parameters
     ----------
     disk
-        Its delay is that of each piece of work.
+        Its delay applies to each piece of work.
     clock
         True time.
     context
-        Context of the program that the work belongs to.
+        Context of the program to which the work belongs.
 
     Attributes
     ----------
     free_at
-        When the work given so far is done, s.
+        Time at which all work so far is done, s.
     """
 
     def __init__(self, disk: RecordsDisk, clock: Clock, context: Context) -> None:
@@ -98,7 +98,7 @@ class DiskQueue:
         self.free_at = clock.monotonic()
 
     def do(self, work: Work, then: Then) -> None:
-        """Do work when all earlier work is done and its own time has passed."""
+        """Do the work after all earlier work is done and its own delay has passed."""
         now = self._clock.monotonic()
         self.free_at = max(self.free_at, now) + self._disk.delay
         self._waiting.append((self.free_at, work, then))
@@ -120,7 +120,7 @@ class DiskQueue:
                 then(None)
 
     def lose(self) -> None:
-        """Lose the work that waits."""
+        """Discard the pending work."""
         self._waiting.clear()
 
     def close(self) -> None:
@@ -151,7 +151,7 @@ class SimulatedAudit:
                 self.finish(identity, STOPPED, started)
 
     def begin(self, record: Record) -> None:
-        """Keep a record without a result.
+        """Store a record without a result.
 
         Raises
         ------
@@ -192,7 +192,7 @@ class SimulatedAudit:
         self._check()
 
     def lose(self) -> None:
-        """Take nothing more: the plant's program has ended, wherever it was."""
+        """Accept nothing more, because the plant program has ended, at whatever point."""
         self._lost = True
 
     def _check(self) -> None:
@@ -211,7 +211,7 @@ class EmergencyDisk:
         self._document = ""
 
     def emergency(self) -> str:
-        """Return the document, or ""."""
+        """Return the document, or "" if there is none."""
         return self._document
 
     def keep_emergency(self, document: str) -> None:
@@ -220,15 +220,15 @@ class EmergencyDisk:
 
 
 class AssignedDisk:
-    """Assigned points on a disk that survives the plant's program; an `assigned.Assigned`."""
+    """Assigned points on a disk that survives the plant program; an `assigned.Assigned`."""
 
     def __init__(self) -> None:
         self._points: dict[str, Places] = {}
 
     def read(self) -> dict[str, Places]:
-        """Return the points that are kept, by kind."""
+        """Return the stored points by kind."""
         return {kind: dict(places) for kind, places in self._points.items()}
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Replace all points that are kept."""
+        """Replace all stored points."""
         self._points = {kind: dict(places) for kind, places in points.items()}

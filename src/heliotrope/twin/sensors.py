@@ -22,9 +22,9 @@ class FluxSensor:
     Parameters
     ----------
     receivers
-        Of the plant, at least one.
+        Receivers of the plant, at least one.
     clock
-        Clock of the loop.
+        Clock of the event loop.
     stand
         Returns true normals and vertices, (N, 3).
     sun
@@ -33,7 +33,7 @@ class FluxSensor:
     Attributes
     ----------
     names
-        The one reading.
+        Name of the only reading.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class FluxSensor:
         self._read_at = -math.inf
 
     def share(self) -> float:
-        """Return the flux now, as a share of the field's if every mirror were on a receiver."""
+        """Return the present flux, as a share of the flux with every heliostat on a receiver."""
         light = self._sun()
         if light[2] <= 0.0:
             return 0.0
@@ -60,7 +60,7 @@ class FluxSensor:
         return sum(light_share(*stand, light, *aperture) for aperture in self._apertures)
 
     async def news(self) -> Readings:
-        """Return a reading each second."""
+        """Yield a reading each second."""
         now = self._clock.monotonic()
         if now - self._read_at < _EVERY:
             return Readings()
@@ -71,19 +71,19 @@ class FluxSensor:
 def light_share(
     normal: FloatArray, vertex: FloatArray, sun: npt.ArrayLike, middle: npt.ArrayLike, radius: float
 ) -> float:
-    """Return the share of a field's light that passes a receiver, 0 to 1.
+    """Return the share of a field's light that reaches a receiver, 0 to 1.
 
     Parameters
     ----------
     normal, vertex
-        Of the mirrors, (N, 3).
+        Normals and vertices of the mirrors, (N, 3).
     sun
         Direction to the sun, (3,).
     middle
         Middle of the receiver, (3,), m.
     radius
-        Beams whose axis passes nearer than this count as on it, m. Each is weighted by the cosine
-        of its incidence, relative to all beams aimed at the middle.
+        Beams whose axis passes closer than this count as on the receiver, m. Each beam is weighted
+        by its cosine of incidence, relative to the case in which all beams are aimed at the middle.
     """
     s, point = np.asarray(sun, dtype=np.float64), np.asarray(middle, dtype=np.float64)
     cosine = normal @ s

@@ -11,11 +11,11 @@ from heliotrope.geometry import FloatArray, reflect
 from heliotrope.optics import Neighbours, centroid_shift, equal_facets
 from heliotrope.twin.boards.board import Board
 
-#: Light further from the centre of a target than this many of its half diagonals is left out.
+#: Light further from a target's centre than this many half diagonals is left out.
 NEAR = 2.0
-#: Cosine of the incidence below which the light of a mirror is not worth drawing.
+#: Cosine of incidence below which the light of a mirror is too weak to draw.
 GRAZING = 0.05
-#: Elements along a side of a mirror by which its hidden part is found.
+#: Number of elements along a side of a mirror, for the computation of its shaded and blocked part.
 _ELEMENTS = 24
 
 
@@ -47,10 +47,10 @@ class TrueMirror:
     def lit_centroid(
         self, target: Target, sun: FloatArray, elements: int = _ELEMENTS
     ) -> tuple[FloatArray, float]:
-        """Return where its centroid is on the plane of a target, ENU, m, (3,), and its lit share.
+        """Return the beam centroid on a target's plane, ENU, m, (3,), and the mirror's lit share.
 
-        NaN and 0 if neighbours hide all of it. Its facets are canted at the target's distance, and
-        the mirror is divided into the square of a number of elements.
+        NaN and 0 if neighbours hide the whole mirror. The facets are canted at the target's
+        distance, and the mirror is divided into a square grid of elements.
         """
         point = self.on(target, sun)
         if self.neighbours is None or not np.isfinite(point).all():
@@ -79,7 +79,7 @@ class TrueMirror:
 def mirrors_of(
     boards: Mapping[str, Board], width: float = 3.0, height: float = 2.0
 ) -> Callable[[], Sequence[TrueMirror]]:
-    """Return a function that gives the mirrors of boards, by name, all of one size in m."""
+    """Return a function that returns the mirrors of boards by name, all of one size in m."""
 
     def mirrors() -> Sequence[TrueMirror]:
         return [TrueMirror(name, *board.mirror(), width, height) for name, board in boards.items()]
@@ -101,7 +101,7 @@ def mirrors_near(
     Parameters
     ----------
     target
-        Its corners and normal count.
+        Only its corners and normal are used.
     sun
         Unit vector to the sun, (3,).
     stand
@@ -113,7 +113,7 @@ def mirrors_near(
     reach
         Largest distance from the centre, in half diagonals of the target.
     beside
-        Rows of the neighbours of each mirror, (N, J); None: they hide nothing.
+        Rows of the neighbours of each mirror, (N, J); None: no neighbour hides anything.
     """
     middle = np.asarray(target.corners).mean(axis=0)
     limit = reach * 0.5 * float(np.hypot(target.width, target.height))

@@ -12,7 +12,7 @@ def main() -> None:
 
 
 def moving() -> None:
-    """Move a field of two heliostats, as the loop of a simulated plant does."""
+    """Move a field of two heliostats as a simulated plant's loop does."""
     from heliotrope.field.layouts import malan_plant
     from heliotrope.lcu.lease import UNIT
     from heliotrope.links.clock import VirtualClock
@@ -29,7 +29,7 @@ def moving() -> None:
 
 
 def drawing() -> None:
-    """Draw the photograph of one beam, as the process of `drawing.Drawer` does."""
+    """Render a photograph of one beam as the process of `drawing.Drawer` does."""
     from datetime import UTC, datetime
 
     from heliotrope import sun

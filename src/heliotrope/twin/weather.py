@@ -9,9 +9,9 @@ from heliotrope.links.clock import Clock
 from heliotrope.plant.emergency import DNI_READING
 from heliotrope.twin.wind import Wind
 
-#: Irradiance outside the air that the formula of `clear_sky` is fitted with, W/m².
+#: Irradiance above the atmosphere with which the formula of `clear_sky` was fitted, W/m².
 _OUTSIDE = 1353.0
-#: Wind of a day without alarms: its mean, and the mean height of gusts, m/s.
+#: Wind on a day without alarms: mean speed, and mean height of the gusts, m/s.
 _MEAN, _GUST = 3.0, 0.5
 
 
@@ -24,9 +24,9 @@ def clear_sky(elevation: float, altitude: float) -> float:
     Parameters
     ----------
     elevation
-        Of the sun, rad.
+        Elevation of the sun, rad.
     altitude
-        Of the site, m; counted as 0 to 3,000 m.
+        Altitude of the site, m; clipped to 0 to 3,000 m.
     """
     if elevation <= 0.0:
         return 0.0
@@ -37,23 +37,23 @@ def clear_sky(elevation: float, altitude: float) -> float:
 
 
 class WeatherStation:
-    """Wind and direct irradiance at a simulated plant; the mirrors do not feel this wind.
+    """Wind and direct irradiance at a simulated plant; this wind does not deflect the mirrors.
 
     Parameters
     ----------
     altitude
-        Of the site, m.
+        Altitude of the site, m.
     clock
-        Clock of the loop.
+        Clock of the event loop.
     sun
         Returns the true direction to the sun, (3,).
     seed
-        Of the wind.
+        Seed of the wind.
 
     Attributes
     ----------
     names
-        Its readings.
+        Names of the readings.
     """
 
     names = frozenset({"wind_gust", "wind_mean", DNI_READING})
@@ -65,7 +65,7 @@ class WeatherStation:
         self._wind = Wind(_MEAN, gust=_GUST, compliance=0.0, seed=seed)
 
     def readings(self) -> dict[str, float]:
-        """Return the readings now, m/s and W/m²."""
+        """Return the present readings, m/s and W/m²."""
         elevation = float(np.arcsin(np.clip(self._sun()[2], -1.0, 1.0)))
         wind = self._wind.readings(np.zeros(3), self._clock.monotonic())
         return wind | {DNI_READING: clear_sky(elevation, self._altitude)}

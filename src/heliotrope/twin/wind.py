@@ -29,16 +29,16 @@ GUST_MEAN_S, MEAN_S = 3.0, 600.0
 
 @dataclass(frozen=True)
 class Wind:
-    """A wind of one mean speed and direction.
+    """A wind with a constant mean speed and direction.
 
     Attributes
     ----------
     speed
-        Mean, m/s.
+        Mean speed, m/s.
     towards
-        Direction that it blows to: azimuth clockwise from north, rad.
+        Direction in which the wind blows: azimuth clockwise from north, rad.
     turbulence
-        Intensity: standard deviation over the mean.
+        Turbulence intensity: standard deviation over mean speed.
     length
         Length scale of the turbulence along the wind, m.
     gust
@@ -76,7 +76,7 @@ class Wind:
 
     @property
     def direction(self) -> FloatArray:
-        """Direction that it blows to, ENU, (3,)."""
+        """Direction in which the wind blows, ENU, (3,)."""
         return np.array([np.sin(self.towards), np.cos(self.towards), 0.0])
 
     @cached_property
@@ -84,7 +84,7 @@ class Wind:
         """Frequencies (Hz), lateral wave numbers (1/m), phases, amplitudes (m/s), each (W,)."""
         rng = np.random.default_rng((self.seed, 1))
         edges = np.geomspace(SLOWEST, FASTEST, WAVES + 1)
-        # Random within its band, since equal steps would repeat.
+        # Random within the band, because equally spaced frequencies would repeat.
         rate = edges[:-1] + rng.random(WAVES) * np.diff(edges)
         pace = max(self.speed, 0.1)
         scaled = rate * self.length / pace
@@ -96,7 +96,7 @@ class Wind:
         return rate, across, rng.uniform(0.0, 2.0 * np.pi, WAVES), height
 
     def at(self, place: npt.ArrayLike, time: npt.ArrayLike) -> FloatArray:
-        """Return the speed at places (..., 3), m, and times (...), s, which broadcast; m/s.
+        """Return the wind speed at positions (..., 3), m, and times (...), s, which broadcast; m/s.
 
         The direction does not change; turbulence never reverses the wind.
         """
@@ -123,10 +123,10 @@ class Wind:
         return out
 
     def turned(self, normal: npt.ArrayLike, place: npt.ArrayLike, time: float) -> FloatArray:
-        """Return normals (..., 3) of mirrors at places (..., 3), m, as the wind turns them.
+        """Return the wind-deflected normals (..., 3) of mirrors at positions (..., 3), m.
 
-        The moment on a flat plate goes as sin 2β, where β is the angle between normal and wind:
-        zero broadside and edge on (as at stow). It turns the plate broadside.
+        The moment on a flat plate is proportional to sin 2β, where β is the angle between normal
+        and wind: zero broadside and edge on (as at stow). The moment turns the plate broadside.
         """
         n, w = as_float(normal), self.direction
         pressure = 0.5 * DENSITY * self.at(place, time) ** 2
@@ -147,7 +147,7 @@ class Wind:
 
 @lru_cache(maxsize=1024)
 def _gust(seed: int, window: int) -> tuple[float, float]:
-    """Return when the gust of a window begins, s, and its height relative to the mean height."""
+    """Return the start of a window's gust, s, and its height relative to the mean height."""
     # Windows before time 0 have gusts too, but a seed may not be negative.
     rng = np.random.default_rng((seed, 2, window & 0xFFFFFFFF))
     return WINDOW_S * (window + float(rng.random())), float(rng.exponential())

@@ -1,10 +1,11 @@
-"""Yesterday's calibrations of a simulated field: what its plant would have measured and fitted.
+"""Yesterday's calibrations of a simulated field, as its plant would have measured and fitted them.
 
-A simulated plant may begin on its second day of commissioning. This module creates the first day in
-a second, without running it: the true heliostats send beams to the targets for yesterday's sun
-positions, centroids have the noise that the visits state, and the plant's estimator fits all
-heliostats at once. The errors of these calibrations are therefore those that their covariances
-predict, provided that the true heliostats differ from the plant file as the priors say.
+A simulated plant may begin on its second day of commissioning. This module creates the first day
+within a second, without simulating it step by step: the true heliostats send beams to the targets
+for yesterday's sun positions, centroids have the noise that the visits state, and the plant's
+estimator fits all heliostats at once. The errors of these calibrations are therefore those that
+their covariances predict, provided that the true heliostats differ from the plant file as the
+priors say.
 
 The heliostats nearest to a target are visited first, as in the schedule for a new field, because a
 search for a beam takes the least time there. When all have been visited once, the first of them are
@@ -40,14 +41,14 @@ from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import CampaignEntry, Records, VisitEntry
 from heliotrope.twin.live.live import CYCLE
 
-#: Default number of mirrors that were measured, and the share of them that was visited twice.
+#: Default number of heliostats measured, and the share of these that was visited twice.
 COUNT, AGAIN = 1500, 0.5
-#: Name of the campaign in the store, and the remark at each calibration.
+#: Name of the campaign in the store, and the remark on each calibration.
 CAMPAIGN = "yesterday"
 NOTE = "simulated: computed when the run began, from photographs that nobody took"
 #: Variance of a centroid in the plane of its target, m².
 CENTROID = 1e-5
-#: Share of a target's width and height over which the photographs of a visit spread the beam.
+#: Share of a target's width and height over which the beam positions of a visit are spread.
 _SPREAD = 0.5
 
 Rows = npt.NDArray[np.intp]
@@ -55,19 +56,19 @@ Rows = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Yesterday:
-    """A day of visits to targets.
+    """A day of calibration visits.
 
     Attributes
     ----------
     names
-        The heliostats of the plant, to which the rows of the sightings point.
+        The heliostats of the plant, which the sightings refer to by index.
     sightings, targets
         The M sightings, and the name of the target of each, (M,).
     calibrations
         One for each visit, older versions before newer ones; their sightings are rows of
         ``sightings``.
     visits
-        The visits, by time.
+        The visits in order of time.
     """
 
     names: tuple[str, ...]
@@ -94,7 +95,8 @@ class Yesterday:
                 self.names, some, target=target, campaign=CAMPAIGN
             )
         kept = [replace(r, sightings=numbers[r.sightings]) for r in self.calibrations]
-        # Together, since one by one they take seconds; a later version changes what is behind.
+        # Written together, because one at a time takes seconds; a later version replaces an earlier
+        # one.
         for version in sorted({record.version for record in kept}):
             records.record_calibration(*(r for r in kept if r.version == version))
         for visit in self.visits:
@@ -126,8 +128,8 @@ async def begin_second_day(
     """Keep yesterday in a new store, and return the plant with the calibrations of its store.
 
     A world of that plant has local controllers that store these calibrations; the plant's program,
-    with the design and the store as they are, recalls the same ones. A store that has calibrations
-    already gets no others.
+    with the unchanged design and store, loads the same calibrations. Nothing is added to a store
+    that already has calibrations.
 
     Parameters
     ----------
@@ -157,7 +159,7 @@ def with_records(design: Plant, records: Sequence[HeliostatCalibration]) -> Plan
 
 
 def by_model(records: Sequence[HeliostatCalibration]) -> list[StoredParameters]:
-    """Return the parameters of calibrations, those with the same parameters together."""
+    """Return the parameters of calibrations, grouped by parameter set."""
     models: dict[tuple[str, ...], list[HeliostatCalibration]] = {}
     for record in records:
         models.setdefault(record.names, []).append(record)
@@ -179,7 +181,7 @@ def measure_yesterday(
     seed: int = 0,
     cycle: CycleSettings = CYCLE,
 ) -> Yesterday:
-    """Return the visits of the day before a start, and the calibrations that they brought.
+    """Return the visits of the day before a start, and the resulting calibrations.
 
     Parameters
     ----------
@@ -188,11 +190,11 @@ def measure_yesterday(
     start
         Aware time of the present day.
     count
-        Number of heliostats to be measured. A visit is left out where no target can be served.
+        Number of heliostats to be measured. A visit is left out if it can use no target.
     seed
         Seed of the noise.
     cycle
-        Photographs of a visit, their noise and the model.
+        Settings of a visit: photographs, noise and model.
 
     Raises
     ------
@@ -206,7 +208,7 @@ def measure_yesterday(
         )
     rows, begun = _timetable(design, start, count)
     made, targets = _photographed(design, truth, rows, begun, cycle, np.random.default_rng(seed))
-    # Rows of the sightings of each visit, (V, shots); first visits come before second ones.
+    # Rows of the sightings of each visit, (V, shots); first visits precede second ones.
     shots = np.arange(len(made)).reshape(-1, cycle.shots)
     visited = made.heliostat[shots[:, 0]]
     once = np.unique(visited, return_index=True)[1]
@@ -227,7 +229,7 @@ def measure_yesterday(
 
 
 def _timetable(design: Plant, start: datetime, count: int) -> tuple[Rows, FloatArray]:
-    """Return the heliostats of all visits, (V,), and when these begin, POSIX s, (V,)."""
+    """Return the heliostats of all visits, (V,), and the start times, POSIX s, (V,)."""
     centers = np.stack([target.center for target in design.targets])
     away = np.linalg.norm(design.position[:, None] - centers, axis=-1).min(axis=1)
     order = np.argsort(away, kind="stable")[:count].astype(np.intp)
@@ -250,9 +252,9 @@ def _photographed(
     cycle: CycleSettings,
     rng: np.random.Generator,
 ) -> tuple[Sightings, npt.NDArray[np.str_]]:
-    """Return the sightings of those visits that a target allows, visit after visit; their targets.
+    """Return the sightings of all visits for which a target is usable, and their targets.
 
-    Each mirror goes to the target that its beam meets most squarely.
+    Each heliostat uses the target that its beam meets at the smallest angle of incidence.
     """
     moments = begun[:, None] + cycle.interval * np.arange(1, cycle.shots + 1)
     suns = solar.vector(moments.ravel(), design.site).reshape(*moments.shape, 3)
@@ -283,12 +285,12 @@ def _photographed(
 def _thrown(
     truth: Mechanism, suns: FloatArray, target: Target, sigma: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return step counts (V, S, 2) and measured centroids (V, S, 3) of V mirrors on a target.
+    """Return step counts (V, S, 2) and measured centroids (V, S, 3) of V heliostats on a target.
 
     Parameters
     ----------
     truth
-        True mechanisms, (V,); each is aimed at a place of its own for each photograph.
+        True mechanisms, (V,); each has its own aim point for each photograph.
     suns
         Unit vectors to the sun, (V, S, 3).
     target, sigma, rng
@@ -307,7 +309,7 @@ def _thrown(
 
 
 class _Fits:
-    """Fits of the heliostats of a group, one visit of each after another.
+    """Fits of a group's heliostats, visit by visit.
 
     Parameters
     ----------
@@ -321,7 +323,8 @@ class _Fits:
         self._design, self._offset, self._cycle = design, offset, cycle
         self._model = first_model(cycle, group.mechanism)
         self._growth = default_growth(group.mechanism)
-        #: The group as it is believed, the covariance of its parameters, and the visits of each.
+        #: The group as believed, the covariance of its parameters, and each heliostat's number of
+        #: visits.
         size = len(self._model.parameters)
         self._group, self._visits = group, 0
         self._covariance = np.full((len(group), size, size), np.nan)
@@ -344,7 +347,7 @@ class _Fits:
         rows = made.heliostat[used[:, 0]] - self._offset
         nominal, names = group.mechanism[rows], tuple(group.names[row] for row in rows)
         seen = made.take(used.ravel()).renumbered(np.repeat(np.arange(count), size))
-        # The noise is known, and no photograph is a mistake.
+        # The noise is known, and there are no outliers.
         fitted = fit(nominal, seen, self._model.parameters, loss="square", adapt_scale=False)
         fitted = replace(fitted, heliostats=names)
         present, new = group.calibrated[rows], nominal.with_parameters(fitted.parameters)
@@ -404,7 +407,7 @@ class _Fits:
     def _predicted(
         self, mechanism: Mechanism, rows: Rows, covariance: FloatArray, suns: FloatArray
     ) -> list[float]:
-        """Return the predicted errors of K normals at their aims, rad; NaN where none is known."""
+        """Return the predicted errors of K normals at their aims, rad; NaN if unknown."""
         names = [self._group.names[row] for row in rows]
         given = default_aims(self._design, names, self._group.position[rows], None)
         aims = np.stack([given[name] for name in names])

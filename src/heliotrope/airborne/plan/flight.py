@@ -1,4 +1,4 @@
-"""Flights: the order of the stations, take-off places and duration.
+"""Flights: the order of the stations, take-off positions and duration.
 
 A station is one cluster in one pose, measured with one hover pattern. While a drone flies the
 stations of some clusters, the heliostats of the other clusters move to their next pose. Clusters
@@ -19,11 +19,11 @@ from heliotrope.sun import Site, position
 
 #: Largest group of clusters tried.
 _GROUPS = 8
-#: Least distance between drones in the air, m.
+#: Minimum distance between drones in the air, m.
 APART = 15.0
-#: Longest wait of a take-off for other drones, s.
+#: Longest time for which a take-off waits for other drones, s.
 _LATEST = 7200.0
-#: Time for mirrors to settle before the first photograph, s.
+#: Time that heliostats need to settle before the first photograph, s.
 REST = 5.0
 
 
@@ -118,11 +118,11 @@ class StationVisit:
     first, last
         Rows of its hover points, ``last`` excluded.
     approach
-        Points between the previous place and the first hover point, ENU metres, (M, 3).
+        Points between the previous position and the first hover point, ENU metres, (M, 3).
     begin, end
         First and last moment of photographing, s since the start of the campaign.
     wait
-        Time hovering before the first photograph, for mirrors that are still moving, s.
+        Hover time before the first photograph, while heliostats are still moving, s.
     """
 
     station: int
@@ -145,7 +145,7 @@ class Sortie:
     start, end
         Take-off and landing, s since the start of the campaign.
     home
-        Place of take-off and landing, ENU metres, (3,).
+        Take-off and landing position, ENU metres, (3,).
     visits
         Stations in the order flown.
     back
@@ -168,7 +168,7 @@ class Sortie:
 
 @dataclass(frozen=True)
 class _Routes:
-    """Routes between stations and homes, each found once."""
+    """Routes between stations and homes, each computed only once."""
 
     airspace: Airspace
     stations: Sequence[HoverStation]
@@ -180,7 +180,7 @@ class _Routes:
     def between(
         self, a: FloatArray, b: FloatArray, whence: int, whither: int, home: FloatArray, drone: int
     ) -> FloatArray:
-        """Return the route between places of two stations; row -1 is the home."""
+        """Return the route between positions of two stations; row -1 is the home."""
         legs = self.airspace.free_legs
         if legs(a[None], b[None])[0]:
             return np.empty((0, 3))
@@ -188,7 +188,8 @@ class _Routes:
         if key not in self.known:
             ends = [home if r < 0 else self.stations[r].pattern.center for r in (whence, whither)]
             self.known[key] = self._searched(ends[0], ends[1], max(whence, whither))
-        # The route between the centres will do if it can be joined and left from here.
+        # The route between the centres is good enough if it can be joined and left from these
+        # points.
         route = self.known[key]
         if len(route) and legs(np.stack([a, route[-1]]), np.stack([route[0], b])).all():
             return route
@@ -225,7 +226,7 @@ def fly(
     airspace, craft
         Limits and performance.
     home
-        Where drones take off, ENU metres, (count, 3).
+        Take-off positions, ENU metres, (count, 3).
     labels
         Names of the clusters, for errors.
 
@@ -255,7 +256,7 @@ def fly(
             rows = grouped(mine, place, size)
             tried = _sorties_of(drone, rows, stations, home[drone], craft, routes)
             if best and tried[-1].end > 0.995 * best[-1].end:
-                # Mirrors no longer cause a wait; larger groups only lengthen the flight.
+                # Moving heliostats no longer cause a wait; larger groups only lengthen the flight.
                 break
             best, rest = tried, rows
         if flown:
@@ -272,7 +273,7 @@ def grouped(clusters: Sequence[int], place: dict[int, list[int]], size: int) -> 
     for group in np.array_split(np.array(clusters), groups):
         members = [int(c) for c in group]
         for k in range(max(len(place[c]) for c in members)):
-            # Back and forth, so that the route to the next pose is short.
+            # Alternate the direction, so that the route to the next pose is short.
             order = members if k % 2 == 0 else members[::-1]
             rows.extend(place[c][k] for c in order if k < len(place[c]))
     return rows
@@ -352,7 +353,7 @@ class _Work:
         return self.routes.between(a, b, whence, whither, self.home, self.drone)
 
     def back(self, row: int) -> float:
-        """Return the longest duration home from a station, s."""
+        """Return the longest flight time home from a station, s."""
         known = self.routes.backs
         if (self.drone, row) not in known:
             known[self.drone, row] = self._back(row)
@@ -404,14 +405,14 @@ class Timeline:
     place: FloatArray
 
     def at(self, clock: FloatArray) -> FloatArray:
-        """Return its positions at times (M,), ENU metres, (M, 3)."""
+        """Return the drone's positions at times (M,), ENU metres, (M, 3)."""
         return np.stack([np.interp(clock, self.time, self.place[:, k]) for k in range(3)], -1)
 
 
 def _delay(
     sortie: Sortie, stations: Sequence[HoverStation], craft: Craft, others: Sequence[Timeline]
 ) -> float:
-    """Return the delay with which a sortie stays clear of other drones, s."""
+    """Return the delay that keeps a sortie clear of other drones, s."""
     line = timeline([sortie], stations, craft, sortie.drone)
     clock = np.arange(sortie.start, sortie.end, 1.0)
     mine = line.at(clock)
@@ -487,7 +488,7 @@ class CameraTarget:
     days, months
         Calendar time.
     sunny
-        Usable hours a day, h.
+        Usable hours per day, h.
     """
 
     hours: float
@@ -506,7 +507,7 @@ def camera_target(
     year: int = 2026,
     min_elevation: float = float(np.radians(10.0)),
 ) -> CameraTarget:
-    """Return how long the same number of poses takes with camera and target.
+    """Return how long the same number of poses takes with a camera and a target.
 
     Parameters
     ----------
@@ -543,12 +544,12 @@ def camera_target(
 
 
 def mirror_travel(counts: FloatArray, speed: npt.ArrayLike) -> FloatArray:
-    """Return how long mirrors move from pose to pose, s, (K,), the first 0.
+    """Return how long the heliostats move from pose to pose, s, (K,); the first is 0.
 
     Parameters
     ----------
     counts
-        Counts of n mirrors in K poses, (K, n, D).
+        Counts of n heliostats in K poses, (K, n, D).
     speed
         Speed of the drives, counts/s, (n, D).
     """
@@ -557,6 +558,6 @@ def mirror_travel(counts: FloatArray, speed: npt.ArrayLike) -> FloatArray:
 
 
 def homes(home: FloatArray, count: int, apart: float = 20.0) -> FloatArray:
-    """Return a take-off place for each drone, in a row from west to east, (count, 3)."""
+    """Return a take-off position for each drone, in a row from west to east, (count, 3)."""
     shift = apart * (np.arange(count) - 0.5 * (count - 1))
     return np.asarray(home + shift[:, None] * np.array([1.0, 0.0, 0.0]))

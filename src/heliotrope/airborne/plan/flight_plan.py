@@ -51,11 +51,11 @@ class PlanSettings:
     sampling, selection, craft, airspace
         Patterns, calibration points, drones, and where drones may fly.
     home
-        Take-off place, ENU metres, (3,); None for a point south of the field.
+        Take-off position, ENU metres, (3,); None for a point south of the field.
     hours_a_day
         Flying hours per day, h.
     photo_minutes, clear
-        Parameters of the same campaign with camera and target, for comparison: time between
+        Parameters of the same campaign with a camera and a target, for comparison: time between
         photographs, min, and the fraction of the sunny hours that are clear.
     """
 
@@ -100,11 +100,11 @@ class FlightPlan:
     sorties
         Sorties of all drones.
     homes
-        Take-off place of each drone, ENU metres, (drones, 3).
+        Take-off position of each drone, ENU metres, (drones, 3).
     separation
         Minimum distance between two airborne drones, m.
     camera_target
-        Duration of the same number of poses with camera and target.
+        Duration of the same number of poses with a camera and a target.
     """
 
     plant: Plant
@@ -126,7 +126,7 @@ class FlightPlan:
 
     @property
     def seconds(self) -> float:
-        """From the first take-off to the last landing, s."""
+        """Time from the first take-off to the last landing, s."""
         return max(s.end for s in self.sorties)
 
     @property
@@ -256,7 +256,7 @@ def _look(
     settings: PlanSettings,
     label: str,
 ) -> CalibrationPoints:
-    """Return the calibration points of one cluster, chosen for the heliostat in its middle."""
+    """Return the calibration points of one cluster, chosen for its central heliostat."""
     away = np.linalg.norm(plant.position[rows] - center, axis=-1)
     group, row = plant.find(all_mirrors.names[int(rows[np.argmin(away)])])
     middle = group.calibrated[np.array([row])]
@@ -324,7 +324,7 @@ def _stations(
 def _check_patterns(
     stations: list[HoverStation], labels: tuple[str, ...], airspace: Airspace
 ) -> None:
-    """Refuse patterns that leave the permitted airspace."""
+    """Reject patterns that leave the permitted airspace."""
     sizes = np.array([len(s.pattern) for s in stations])
     free = airspace.free(np.concatenate([s.pattern.camera for s in stations]))
     owner = np.repeat(np.arange(len(stations)), sizes)
@@ -340,7 +340,7 @@ def _check_patterns(
 
 
 def _home(plant: Plant, settings: PlanSettings) -> FloatArray:
-    """Return the place of take-off: as given, or south of the middle of the field."""
+    """Return the take-off position: as specified, or south of the middle of the field."""
     if settings.home is not None:
         start = np.asarray(settings.home, dtype=np.float64)
     else:

@@ -31,11 +31,11 @@ from heliotrope.field.formats.frames import mirror_frame
 from heliotrope.geometry import FloatArray, as_float, normalize, rotation
 from heliotrope.mechanism.chain import Mechanism
 
-#: Most rounds of fit and step: two or three suffice, since the unknowns are small.
+#: Maximum number of rounds of fit and step; two or three suffice, because the unknowns are small.
 _ROUNDS = 12
 #: The iteration ends when no common unknown changes by more than this share of its prior.
 _SETTLED = 1e-3
-#: Standard deviation of a turn that does not occur, rad: it stays 0.
+#: Standard deviation of a rotation that does not occur, rad; the rotation stays 0.
 _NEVER = 1e-9
 
 
@@ -215,14 +215,15 @@ class _Step:
 
 
 def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> Sightings:
-    """Return sightings without the turn of their mirrors: their rays rotated about the vertices.
+    """Return sightings without their mirrors' rotation, by rotating the rays about the vertices.
 
     Parameters
     ----------
     flights
         M sightings of N heliostats.
     mechanism, turn
-        Of the N heliostats; the turn about the mirror's x and y axes, rad, (N, 2).
+        Mechanisms of the N heliostats, and the rotation about the mirror's x and y axes, rad, (N,
+        2).
     """
     mechanisms = mechanism[flights.heliostat]
     axes, vertex = _axes(mechanisms, flights.counts), mechanisms.pose(flights.counts).vertex
@@ -240,12 +241,12 @@ def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> S
 
 
 def derivative_by_turn(mechanism: Mechanism, sightings: Sightings) -> FloatArray:
-    """Return derivatives of whitened residuals by the turn that is removed, (M, 2, 2).
+    """Return derivatives of whitened residuals by the rotation that is removed, (M, 2, 2).
 
     Parameters
     ----------
     mechanism
-        One for each sighting, batch shape (M,).
+        One mechanism per sighting, batch shape (M,).
     sightings
         M sightings.
     """
@@ -260,7 +261,7 @@ def derivative_by_turn(mechanism: Mechanism, sightings: Sightings) -> FloatArray
 def _axes(mechanism: Mechanism, counts: FloatArray) -> FloatArray:
     """Return the x and y axes of mirrors in ENU, (M, 2, 3)."""
     frame = mirror_frame(mechanism.normal)
-    # A mechanism turns any direction fixed to the mirror as it turns the normal.
+    # A mechanism rotates any direction fixed to the mirror in the same way as the normal.
     right = replace(mechanism, normal=frame[..., 0]).pose(counts).normal
     up = np.cross(mechanism.pose(counts).normal, right)
     return np.stack([right, up], axis=1)
@@ -274,7 +275,7 @@ def derivative_by_shared(
     Parameters
     ----------
     mechanism
-        One for each sighting, batch shape (M,).
+        One mechanism per sighting, batch shape (M,).
     sightings, shift
         M sightings, and the displacement of their ends by one unit of each error, (M, 3, K).
     """

@@ -42,7 +42,7 @@ from heliotrope.values import Card, Value, amount
 Loss = Literal["square", "huber", "cauchy"]
 _LOSSES = {"square": kernels.SQUARE, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
 
-#: The start is searched globally where the nominal mechanism misses by more than this, rad.
+#: The start is searched globally if the nominal mechanism misses by more than this, rad.
 FAR = 0.15
 
 
@@ -354,8 +354,8 @@ def _fit(
         count,
         minimum_rows=2,
     )
-    # The prior is centred on the start: a zero that is off by a radian is a wrong entry in the
-    # plant file, not an improbable installation.
+    # The prior is centred on the start, because a zero that is off by a radian is a wrong entry in
+    # the plant file, not an improbable installation.
     result.values[:] += begin
     _reject(result, mechanism)
     result.lengths[order] = np.sqrt(squares) / result.scale[ordered.heliostat]
@@ -363,7 +363,7 @@ def _fit(
 
 
 def _reject(result: FieldFit, mechanism: Mechanism) -> None:
-    """Take back parameters that no mechanism can have: the heliostat keeps its nominal ones."""
+    """Reject parameters that no mechanism can have; the heliostat keeps its nominal ones."""
     most = np.array([mechanism.most(name) for name in result.names])
     beyond = ~(np.abs(result.values) <= most).all(axis=1)
     result.outcome[beyond & (result.outcome != FitOutcome.FAILED)] = FitOutcome.MISFIT
@@ -408,7 +408,7 @@ def mask_of(selection: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArra
     Raises
     ------
     InputError
-        If it has another shape, or holds something else than true and false.
+        If the mask has another shape, or contains anything but true and false.
     """
     if selection is None:
         return np.ones(rows, dtype=np.bool_)
@@ -549,7 +549,7 @@ def _regress(
     table = np.tile(drive.table, (len(trials), 1, 1))
     table[..., SLOTS["stroke_offset"]] += np.array(trials)[:, None]
     gaps = wrap_signed(angles - Drive(table).angles(counts))
-    # A median of angles is defined once they are cut open opposite to their mean direction.
+    # A median of angles is defined once the circle is cut opposite to their mean direction.
     centre = np.arctan2(np.sin(gaps).sum(axis=-1), np.cos(gaps).sum(axis=-1))
     rest = wrap_signed(gaps - centre[:, None])
     middle = np.median(rest, axis=-1)

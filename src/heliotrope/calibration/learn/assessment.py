@@ -23,13 +23,15 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.axis_accuracy import AxisAccuracy, axis_accuracy
 from heliotrope.mechanism.tracking import track
 
-#: Distance at which an aim stands for a direction, m.
+#: Distance at which an aim point represents a direction, m.
 FAR = 1e6
 #: Heliostats with fewer sightings are listed but do not enter the overall figures.
 ENOUGH = 20
-#: Share of such sightings from which a mirror is named, and share beyond which nothing agrees.
+#: Share of unexplained sightings from which a heliostat is named, and share beyond which nothing
+#: agrees.
 SHARE, NOTHING = 0.15, 0.6
-#: Mirrors of one reason that are named, and standard deviations of a prior from which a value is.
+#: Maximum number of heliostats named per reason, and prior standard deviations from which a value
+#: is named.
 NAMED, STRAINED = 8, 10.0
 
 
@@ -272,9 +274,9 @@ def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAcc
     """Return the zeros before the fit and the scatter after it, of held-out sightings.
 
     Guo's γ', α' are the drives' angles: those of the nominal drives for the zeros, (44) and
-    (46), so that a zero is found as such and not what the fit leaves of it; those of the
-    learnt drives for the scatter, (45) and (47). His γ, α, (43), are the angles at which the
-    learnt mechanism sends the source to the destination that was seen.
+    (46), so that the zero itself is found, and not what the fit leaves of it; those of the learnt
+    drives for the scatter, (45) and (47). His γ, α, (43), are the angles at which the learnt
+    mechanism reflects the source to the observed destination.
     """
     learned_mirrors = moved_by(learned.mechanism, sightings.heliostat, learned.names, values)
     vertex = learned_mirrors.pose(sightings.counts).vertex
@@ -302,14 +304,14 @@ def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAcc
                 )
             )
         except InputError:
-            # A mistaken sighting may lie over the top; its axes say nothing.
+            # A faulty sighting may lie over the top; its axis angles are meaningless.
             return None
     before, after = accuracies
     return replace(after, gamma_0=before.gamma_0, alpha_0=before.alpha_0)
 
 
 def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, ...]:
-    """Return a line on each mirror that was not learnt, or that no parameters explain, and why.
+    """Return a line on each heliostat that was not learnt or that no parameters explain, and why.
 
     Parameters
     ----------
@@ -351,7 +353,7 @@ def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, 
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first of some names, and the number of the others."""
+    """Return the first few names, and the number of remaining names."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
 

@@ -29,29 +29,30 @@ from heliotrope.parallel import run_blocks
 DAY = 86400.0
 #: Names of the time scales of the processes.
 GROUPS = ("slow", "weeks", "hours")
-#: Start values of the search, and the standard deviation of their logarithms.
+#: Starting values of the search, and the standard deviation of their logarithms.
 START_DAYS = {"slow": 300.0, "weeks": 5.0, "hours": 0.1}
 START_RAD = {"slow": 1e-3, "weeks": 1e-3, "hours": 2.5e-4}
 START_NOISE = 0.5
 STRAY = 0.7
-#: Standard deviation of one heliostat's own logarithms from the field's; half of it for times.
+#: Standard deviation of one heliostat's own logarithms about the field's; half of this for time
+#: constants.
 OWN_STRAY = 0.4
-#: Fewest sightings among which an outlier can be found.
+#: Minimum number of sightings for finding outliers.
 FEWEST = 4
-#: Share of the heliostats that the hyperparameters are learnt from.
+#: Share of the heliostats from which the hyperparameters are learnt.
 TYPICAL = 0.85
-#: Factor on the table's prior where a far start was needed.
+#: Factor on the table's prior if the fit needed a far start.
 WIDE = 10.0
 #: Standard deviation of a zero after a re-reference or repair, rad.
 REGIME_RAD = 0.020
 #: Standard deviation of a step, rad: a jack that slipped, a limit switch that moved.
 STEP_RAD = 0.001
-#: Gain in log evidence that a step needs beyond the logarithm of the number of places tried, and
-#: fewest sightings before and after it.
+#: Gain in log evidence that a step needs beyond the logarithm of the number of positions tried, and
+#: the minimum number of sightings before and after it.
 STEP_GAIN, AFTER_STEP = 4.0, 3
-#: Least time between two sightings with a step between them, days.
+#: Minimum time between two sightings with a step between them, days.
 STEP_GAP = 1.0 / 24.0
-#: Most steps of one heliostat.
+#: Maximum number of steps per heliostat.
 MOST_STEPS = 12
 
 
@@ -168,7 +169,7 @@ def start(
     Parameters
     ----------
     mechanism
-        One or more of the field.
+        One or more mechanisms of the field.
     model
         Constant parameters to be estimated.
     processes
@@ -217,11 +218,12 @@ class Linear:
     centre
         Centre of the prior, (P,).
     own
-        Whether the centre is a far start, for which no population mean holds, (P,).
+        Whether the centre is a far start, to which no population mean applies, (P,).
     steps
         Times of the steps of the zeros, days, ascending, (K,).
     suspect
-        Whether it is far from the robust fit and is used only if the others agree, (n,).
+        Whether a sighting is far from the robust fit and is used only if the others agree with it,
+        (n,).
     """
 
     jacobian: FloatArray
@@ -239,7 +241,7 @@ class Linear:
         return self.epoch_at(self.time)
 
     def epoch_at(self, time: FloatArray) -> npt.NDArray[np.int64]:
-        """Return the number of steps before times (m,) in days; 0 where it is NaN."""
+        """Return the number of steps before times (m,) in days; 0 where a time is NaN."""
         number = np.searchsorted(self.steps, time, side="right")
         return np.asarray(np.where(np.isfinite(time), number, 0), dtype=np.int64)
 
@@ -309,10 +311,10 @@ def covariance(hyper: Hyperparameters, data: Linear) -> FloatArray:
 def fit_hyperparameters(
     hyper: Hyperparameters, field: Sequence[Linear], iterations: int = 25
 ) -> tuple[Hyperparameters, float]:
-    """Return the most probable noise, amplitudes and times, and the negative log evidence.
+    """Return the most probable noise, amplitudes and time constants, and the negative log evidence.
 
-    A weak prior of standard deviation ``STRAY`` around the logarithms of the start values keeps
-    what the data do not determine.
+    A weak prior of standard deviation ``STRAY`` around the logarithms of the start values holds the
+    values that the data do not determine.
 
     Parameters
     ----------
@@ -321,7 +323,7 @@ def fit_hyperparameters(
     field
         Heliostats to learn from.
     iterations
-        Most iterations of L-BFGS.
+        Maximum number of L-BFGS iterations.
     """
     centre = start_vector(hyper)
     return _search(hyper, field, centre, np.full(len(centre), STRAY), iterations)
@@ -332,7 +334,8 @@ def typical(
 ) -> list[Linear]:
     """Return the ``share`` of heliostats that ``hyper`` explains best per sighting.
 
-    A trimmed likelihood keeps one heliostat full of mistakes from increasing the drift of all.
+    The trimmed likelihood prevents one faulty heliostat from increasing the drift of the whole
+    field.
     """
     rows = [d for d in field if len(d)]
     if len(rows) < 4:
@@ -350,7 +353,7 @@ def start_vector(hyper: Hyperparameters) -> FloatArray:
 
 
 def refine(hyper: Hyperparameters, data: Linear, iterations: int = 30) -> Hyperparameters:
-    """Return one heliostat's own hyperparameters, near the field's unless its data differ."""
+    """Return one heliostat's own hyperparameters, close to the field's unless its data differ."""
     spread = np.full(len(hyper.vector), OWN_STRAY)
     spread[1 + len(hyper.processes) :] = 0.5 * OWN_STRAY
     return _search(hyper, [data], hyper.vector, spread, iterations)[0]
@@ -419,8 +422,8 @@ def _no_less_than_nothing(covariances: FloatArray, before: FloatArray) -> FloatA
     """Covariances (m, P, P) without negative eigenvalues from rounding.
 
     Directions that the data determine almost exactly are differences of nearly equal numbers. In
-    units of the prior standard deviations (variances ``before``, (m, P)) no direction is taken as
-    known better than to 1e-6.
+    units of the prior standard deviations (variances ``before``, (m, P)), no direction is assumed
+    to be known better than to 1e-6.
     """
     scale = np.sqrt(before)
     both = scale[:, :, None] * scale[:, None, :]
@@ -465,7 +468,7 @@ class Posterior:
         share = np.broadcast_to(constant, (m, len(data), size)).copy()
         epoch = data.epoch_at(time)
         if wander:
-            # Far from all sightings there may have been steps that no sighting shows.
+            # Far from all sightings, steps may have occurred that no sighting shows.
             own = own + (h.rate * data.gap(time))[:, None] * h.step**2
         own = own + epoch[:, None] * h.step**2
         share += np.minimum(epoch[:, None], data.epoch)[:, :, None] * h.step**2
@@ -508,8 +511,8 @@ def find_outliers(
 ) -> npt.NDArray[np.bool_]:
     """Return the mask of outliers: suspects that the others contradict, then generalised ESD.
 
-    The test alone starts from a fit that bad sightings have bent; with a third of them bad it
-    would remove good ones.
+    The test alone would start from a fit that bad sightings have distorted; with a third of them
+    bad, it would remove good ones.
     """
     mask = np.zeros(len(data), dtype=np.bool_)
     if len(data) < FEWEST:
@@ -539,7 +542,7 @@ def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
 
 
 def permissive(hyper: Hyperparameters) -> Hyperparameters:
-    """Return ``hyper`` with zeros that may move within days as far as a step moves them.
+    """Return ``hyper`` with zeros that may move as far within days as a step moves them.
 
     A sighting that is an outlier even then does not indicate a step.
     """
@@ -561,7 +564,7 @@ def permissive(hyper: Hyperparameters) -> Hyperparameters:
 def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
     """Return the times (days) of steps of the zeros that the evidence supports.
 
-    The best place is found in closed form, then the next one given the first, as long as the log
+    The best time is found in closed form, then the next given the first, as long as the log
     evidence grows enough.
     """
     moving = np.flatnonzero(hyper.step > 0)
@@ -598,11 +601,12 @@ def step_rate(members: Sequence["Posterior"]) -> float:
     return steps / days
 
 
-#: Weight of the table's priors in the population, heliostats.
+#: Weight of the table's priors in the population, as a number of heliostats.
 TABLE_WORTH = 2.0
 #: Degrees of freedom of the population, so that one wrongly installed heliostat does not widen it.
 POPULATION_FREEDOM = 4.0
-#: Fewest mirrors to learn a group from: below, the tables of priors would say more than they do.
+#: Minimum number of heliostats from which a group is learnt; fewer say less than the priors in the
+#: table.
 TEACHERS = 4
 
 
@@ -611,14 +615,14 @@ def fit_population(
 ) -> Hyperparameters:
     """Return ``hyper`` with new mean and spread of the population (one step of EM).
 
-    Below `TEACHERS` heliostats the mean stays: what one mirror shows says little about others.
+    Below `TEACHERS` heliostats the mean stays: one heliostat says little about the others.
 
     Parameters
     ----------
     hyper
         Hyperparameters under which the members were computed.
     table
-        Standard deviations of the parameter table, (P,); 0 where a parameter only drifts.
+        Standard deviations from the parameter table, (P,); 0 if a parameter only drifts.
     members
         Heliostats.
     """
@@ -649,9 +653,9 @@ def fit_population(
 
 
 def heavy_tails(members: Sequence[Posterior], outliers: int) -> float:
-    """Return the factor (at least 1) on the noise variance that gives the ellipses 90 % coverage.
+    """Return the factor (at least 1) on the noise variance with which the ellipses cover 90 %.
 
-    Judged by left-out sightings; ``outliers`` further sightings count as outside.
+    The coverage is judged by left-out sightings; ``outliers`` further sightings count as outside.
     """
     parts = [m.left_out() for m in members if len(m.data) > 3]
     if not parts:

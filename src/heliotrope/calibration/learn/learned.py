@@ -34,7 +34,7 @@ from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.sun import Site, Times, unix_seconds
 from heliotrope.values import Card, Value, amount, dots, span
 
-#: Standard deviation of a sighting where none was learnt from, rad of beam.
+#: Default standard deviation of a sighting of a heliostat without sightings, rad of beam.
 USUAL_SIGMA = 5e-4
 
 
@@ -57,8 +57,8 @@ class Prediction(Value, Framed):
     values
         The parameter deviations at the time of each sighting, (M, P).
     usable
-        Whether the mechanism can predict where the beam went, (M,); where not, ``inside`` is false
-        and ``covariance`` NaN. See `heliotrope.calibration.learn.unusable`.
+        Whether the mechanism can predict the beam, (M,); otherwise ``inside`` is false and
+        ``covariance`` is NaN. See `heliotrope.calibration.learn.unusable`.
     """
 
     errors: BeamErrors
@@ -356,9 +356,9 @@ def predict_with(
     Parameters
     ----------
     learned
-        Of N heliostats: their nominal mechanisms and their noise.
+        Learnt field of N heliostats, of which the nominal mechanisms and the noise are used.
     sightings
-        M of these heliostats.
+        M sightings of these heliostats.
     values, spread
         Deviations at each sighting, (M, P), and their covariance, (M, P, P).
     """
@@ -381,7 +381,7 @@ def predict_with(
 def squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return squared lengths (M,) of errors (M, 2) in units of covariances (M, 2, 2); may be NaN.
 
-    In closed form, because a matrix of NaN has no inverse.
+    Computed in closed form, because a matrix of NaN has no inverse.
     """
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     x, y = error[:, 0], error[:, 1]

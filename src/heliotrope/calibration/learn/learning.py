@@ -39,17 +39,17 @@ from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.parallel import threads
 
-#: Fewest sightings of a heliostat from which the hyperparameters are learnt.
+#: Minimum number of sightings of a heliostat from which hyperparameters are learnt.
 FEWEST = 8
-#: The hyperparameters are learnt from this many heliostats at most.
+#: Maximum number of heliostats from which the hyperparameters are learnt.
 SAMPLE = 60
-#: A start this many prior standard deviations away is a mistake in the plant's data.
+#: A start this many prior standard deviations away indicates a mistake in the plant data.
 MISTAKE = 5.0
 #: Residuals of the robust fit longer than this, in units of its scale, are suspect.
 SUSPECT = 8.0
-#: Number of new linearisations; at Jülich a second one changes nothing.
+#: Number of repeated linearisations; on the Jülich data a second one changes nothing.
 LINEARISED = 1
-#: Most repetitions of regimes and the fit on the common one.
+#: Maximum number of repetitions of the regime search and the fit on the common regime.
 TURNS = 4
 #: Ratio of the residuals of a model to their repeatability within a day.
 REPEATS = 3.0
@@ -80,7 +80,7 @@ def prepare(
     priors: Mapping[str, npt.ArrayLike] | None = None,
     loss: Loss = "cauchy",
 ) -> Prepared:
-    """Fit each heliostat, cut its time into regimes, and linearise its sightings."""
+    """Fit each heliostat, divide its history into regimes, and linearise its sightings."""
     zeros = drift.zeros(mechanism)
     regime = np.where(used, 0, -1)
     offsets, order = _by_heliostat(sightings, used, len(mechanism))
@@ -182,14 +182,14 @@ def relinearise(
         jacobian = np.ascontiguousarray(line.jacobian[part])
         value = np.einsum("nap,np->na", jacobian, values[part] - d.centre) - line.residual[part]
         field.append(replace(d, jacobian=jacobian, value=value))
-    # Parameters that no mechanism can have are extrapolated from sightings that show nothing.
+    # Parameters that no mechanism can have are extrapolations from uninformative sightings.
     return _without_unusable(replace(prepared, field=tuple(field)), is_usable(line) & ~lost)
 
 
 def repeatability(time: FloatArray, residual: FloatArray) -> float:
     """Return `REPEATS` times the repeatability of residuals within a day; inf if unknown.
 
-    With mixed regimes the scale of all residuals is meaningless, but neighbours in time still
+    With mixed regimes the scale of all residuals is meaningless, but consecutive sightings still
     show the noise.
     """
     order = np.argsort(time, kind="stable")
@@ -223,7 +223,7 @@ def learn_field(
     teachers = [k for k, d in enumerate(prepared.field) if len(d) >= FEWEST]
     if not teachers:
         return hyper
-    # The field's, because a heliostat full of mistakes has a large noise of its own.
+    # Use the field's value, because a faulty heliostat has a large noise of its own.
     usual = max(float(np.nanmedian(prepared.static.scale[teachers])), hyper.noise)
     for _ in range(LINEARISED):
         known = [finish(replace(hyper, noise=usual), d, own=False)[0] for d in prepared.field]
@@ -344,7 +344,7 @@ def learn(
 
 @dataclass(frozen=True)
 class Task:
-    """Model and options of learning, the same for every heliostat."""
+    """Model and options of learning, common to all heliostats."""
 
     model: tuple[str, ...]
     priors: dict[str, npt.ArrayLike]
@@ -362,14 +362,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Part:
-    """Result for some heliostats; rows count within their sightings."""
+    """Result for some heliostats; indices refer to their own sightings."""
 
     prepared: Prepared
     members: tuple[Posterior, ...]
     outlier: npt.NDArray[np.bool_]
 
 
-#: Learns a list of (mechanism, sightings, used, task, hyper), here or elsewhere.
+#: Function that learns a list of (mechanism, sightings, used, task, hyper), here or elsewhere.
 Runner = Callable[
     [
         list[tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, Hyperparameters]],
@@ -499,7 +499,7 @@ def field_of(
 def _prior_row(
     model: tuple[str, ...], mechanism: Mechanism, priors: Mapping[str, npt.ArrayLike] | None
 ) -> FloatArray:
-    """One standard deviation for each parameter: the median where heliostats have their own."""
+    """One standard deviation per parameter: the median if heliostats have their own."""
     table = [as_float((priors or {}).get(n, mechanism.parameter(n).prior)) for n in model]
     return np.array([np.median(t) for t in table], dtype=np.float64)
 

@@ -28,33 +28,35 @@ from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.values import amount
 
-#: Parameters are doubtful from this sum of squares on, in standard deviations of their priors.
+#: Parameters are doubtful above this sum of squares, in standard deviations of their priors.
 DOUBTFUL = 25.0
-#: Beam error beyond which a sighting that the others contradict shows something else, rad.
+#: Beam error beyond which a sighting that the others contradict shows a different beam, rad.
 ELSEWHERE = 5e-3
-#: No change in the life of a mirror explains a median error of the beam beyond this, rad.
+#: No change during the life of a heliostat explains a median beam error beyond this, rad.
 HOPELESS = 50e-3
-#: A mistake is found where it lowers the cost by more than this, and to less than this share.
+#: A mistake is reported if its hypothesis lowers the cost by more than this, and to less than this
+#: share.
 GAIN, SHARE = 30.0, 0.5
-#: The errors of the beam that it leaves are at most this many times those without it.
+#: The beam errors under the hypothesis are at most this many times the errors without it.
 ALIKE = 1.5
 #: Fewer sightings than this leave the priors in force: they give no reason for `DOUBTFUL` values.
 WITNESSES = 3
-#: A mirror stood still if its normal turned by less than this, rad, while the bisector of its rays
-#: turned by more than that.
+#: A heliostat stood still if its normal turned by less than the first angle, rad, while the
+#: bisector of its rays turned by more than the second.
 STILL, TURNED = 1e-3, 10e-3
-#: Sightings of a mirror with which a hypothesis is tested, and other mirrors that are tried.
+#: Number of sightings with which a hypothesis is tested, and number of other heliostats that are
+#: tried.
 MOST, OTHERS = 40, 4
-#: Sightings by which those others are chosen.
+#: Number of sightings by which the other heliostats are chosen.
 FEW = 5
-#: Counts are scaled if the drives ask for a factor that differs from 1 by more than this; the fit
-#: then finds it to this standard deviation.
+#: Counts are scaled if the drives require a factor that differs from 1 by more than this; the fit
+#: then refines the factor with this prior standard deviation.
 SCALED, LOOSE = 0.02, 0.05
-#: Sightings scatter if half of them are further than this many of their sigmas from where the
-#: others put them; no fit holds if that is more than this angle too, rad. The worst of 18 real
-#: mirrors has 1.6 and 1.0 mrad.
+#: Sightings scatter if half of them are further than this many sigmas from the position that the
+#: others predict; no fit is valid if the distance also exceeds this angle, rad. The worst of 18
+#: real heliostats has 1.6 and 1.0 mrad.
 SCATTERED, APART = 4.0, 2e-3
-#: Mirrors by which photographs are judged: those with the most sightings.
+#: Number of heliostats by which photographs are judged: those with the most sightings.
 MIRRORS = 10
 #: Mistakes of photographs: text, and the signs of right and up on the target.
 PHOTOGRAPHS = (
@@ -111,7 +113,7 @@ def find_misfits(
     moved = _without(within_reach, misfits)
     fitted = fit(mechanism, moved, names, adapt_scale=False)
     error = _median_errors(mechanism, moved, fitted)
-    # Counts beyond the reach of its drives are named as such, unless a mistake explains them.
+    # Counts beyond the reach of the drives are reported as such, unless a mistake explains them.
     for row in np.setdiff1d(judged.heliostat, within_reach.heliostat):
         reason = _mistake(mechanism, judged.take(judged.heliostat == row), int(row), names)
         if reason is not None:
@@ -135,14 +137,15 @@ def find_misfits(
 
 
 def scattered(row: int, white: FloatArray, sigma: FloatArray) -> Misfit | None:
-    """Return the misfit of a mirror whose sightings contradict each other; None if they agree.
+    """Return the misfit of a heliostat whose sightings contradict each other; None if they agree.
 
     Parameters
     ----------
     row
         Row of the heliostat.
     white
-        How far each sighting is from where the others put it, in units of its sigma, (n,).
+        Distance of each sighting from the position that the others predict, in units of its sigma,
+        (n,).
     sigma
         Standard deviations of the sightings, rad of beam, (n,).
     """
@@ -174,14 +177,14 @@ def _without(sightings: Sightings, misfits: Sequence[Misfit]) -> Sightings:
 
 
 def _is_better(cost: float, unchanged: float) -> bool:
-    """Return whether sightings that are read otherwise fit far better than as they are given."""
+    """Return whether reinterpreted sightings fit far better than the original sightings."""
     return cost < unchanged - GAIN and cost < SHARE * unchanged
 
 
 def _of_photographs(
     mechanism: Mechanism, sightings: Sightings, names: tuple[str, ...], targets: Sequence[Target]
 ) -> Iterator[Misfit]:
-    """Yield all mirrors with a beam on a target, if their photographs are mirrored or turned."""
+    """Yield all heliostats with a beam on a target if their photographs are mirrored or rotated."""
     on = [
         target.holds(sightings.destination) & ~sightings.destination_at_infinity
         for target in targets
@@ -202,7 +205,7 @@ def _of_photographs(
         return costs(fitted, machines), _median_errors(machines, other, fitted)
 
     unchanged, error = read((1.0, 1.0))
-    # A mirror that fits in no manner says nothing about the photographs of the others.
+    # A heliostat that fits in no orientation says nothing about the photographs of the others.
     good = np.isfinite(unchanged)
     trials = {text: read(sign) for text, sign in PHOTOGRAPHS}
     best = min(trials, key=lambda text: float(trials[text][0][good].sum()))
@@ -224,7 +227,7 @@ def _of_photographs(
 def _reflected(
     points: FloatArray, targets: Sequence[Target], sign: tuple[float, float]
 ) -> FloatArray:
-    """Return points with their places right of and above the middle of their target reflected."""
+    """Return points mirrored about the middle of their target, in one direction or both."""
     moved, unassigned = points.copy(), np.ones(len(points), np.bool_)
     for target in targets:
         on = unassigned & target.holds(points)
@@ -269,7 +272,7 @@ def _median_errors(mechanism: Mechanism, sightings: Sightings, fitted: FieldFit)
 def _hopeless(
     mechanism: Mechanism, mine: Sightings, outcome: FitOutcome, strain: float, error: float
 ) -> str | None:
-    """Return the reason why the fit of a mirror cannot hold without a mistake, None if it can."""
+    """Return why the fit of a heliostat cannot be valid without a mistake, None if it can."""
     still = [
         mechanism.joints[joint]
         for d, joint in enumerate(mechanism.driven)
@@ -293,7 +296,7 @@ def _hopeless(
 
 
 def _mistake(mechanism: Mechanism, mine: Sightings, row: int, names: tuple[str, ...]) -> str | None:
-    """Return the mistake that explains the sightings of a mirror, None if there is none."""
+    """Return the mistake that explains the sightings of a heliostat, None if there is none."""
     part = _some(mine, MOST)
     trials = [*_hypotheses(mechanism, part, row), *_scaled(mechanism, part, row)]
     machines = mechanism[np.array([trial.row for trial in trials])]
@@ -305,8 +308,9 @@ def _mistake(mechanism: Mechanism, mine: Sightings, row: int, names: tuple[str, 
     }
     fitted = fit(machines, sightings, names, priors=priors, adapt_scale=False)
     error, trial_costs = _median_errors(machines, sightings, fitted), costs(fitted, machines)
-    # The first trial is the sightings as they are given. A mistake explains them no worse: a zero
-    # that is far off strains the priors too, but leaves smaller errors than another mirror does.
+    # The first trial uses the original sightings. A true mistake explains them no worse: a zero
+    # that is far off strains the priors too, but leaves smaller errors than a swapped heliostat
+    # does.
     least = 2.0 * float(np.median(part.sigma))
     enough = np.clip(np.nan_to_num(ALIKE * error[0], nan=np.inf), least, ELSEWHERE)
     trial_costs = np.where(error <= enough, trial_costs, np.inf)
@@ -331,14 +335,14 @@ class _Trial:
     Attributes
     ----------
     text
-        A clause for people.
+        A clause for display.
     row
         Row of the mechanism.
     sightings
-        The sightings without the mistake.
+        The sightings with the mistake undone.
     factors
         Factors of the counts by the parameters that refine them, whose prior is wide; ``text`` has
-        a place for them.
+        a placeholder for them.
     """
 
     text: str
@@ -348,7 +352,7 @@ class _Trial:
 
 
 def _scaled(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]:
-    """Yield the factors of the counts that the rays ask of the nominal drives."""
+    """Yield the count factors that the nominal drives would need to match the rays."""
     if len(mechanism.driven) != 2 or len(part) < FEW:
         return
     mirror = mechanism[row]
@@ -382,7 +386,7 @@ def _scaled(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]
 
 
 def _factor(drive: Drive, counts: FloatArray, angles: FloatArray) -> float:
-    """Return the factor that makes counts run as the angles ask; 1 if there is none."""
+    """Return the factor that makes the counts match the angles; 1 if there is none."""
     order = np.argsort(counts, kind="stable")
     expected, recorded = drive.counts(np.unwrap(angles[order])), counts[order]
     half = len(order) // 2
@@ -394,7 +398,7 @@ def _factor(drive: Drive, counts: FloatArray, angles: FloatArray) -> float:
 
 
 def _hypotheses(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]:
-    """Yield the sightings as they are, and without each of the likely mistakes."""
+    """Yield the original sightings, and the sightings with each likely mistake undone."""
     yield _Trial("", row, part)
     joints = [mechanism.joints[joint] for joint in mechanism.driven]
     back = [_reversed(mechanism, part, row, d) for d in range(len(joints))]
@@ -439,7 +443,7 @@ def _hypotheses(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Tr
 
 
 def _reversed(mechanism: Mechanism, part: Sightings, row: int, drive: int) -> FloatArray:
-    """Return the counts of a drive that counts the other way: about 0, or its range if a jack."""
+    """Return the counts of a reversed drive: reflected about 0, or within its range for a jack."""
     table = mechanism.drives.table[row, drive]
     ends = table[[SLOTS["min_count"], SLOTS["max_count"]]]
     about = ends.sum() if np.isfinite(ends).all() else 0.0
@@ -447,7 +451,7 @@ def _reversed(mechanism: Mechanism, part: Sightings, row: int, drive: int) -> Fl
 
 
 def _likely(mechanism: Mechanism, part: Sightings, row: int) -> list[int]:
-    """Return the other mirrors that would come nearest to these sightings."""
+    """Return the other heliostats that would fit these sightings best."""
     some = _some(part, FEW)
     count = len(some)
     every = np.repeat(np.arange(len(mechanism)), count)

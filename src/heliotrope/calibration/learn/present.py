@@ -24,12 +24,13 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 
-#: Sightings that are linearised at a time.
+#: Number of sightings that are linearised at a time.
 BLOCK = 1000
-#: The values hold for the days after a visit: motion within hours is at its mean by then, days.
+#: The values apply to the days after a visit, when motion within hours has returned to its mean,
+#: days.
 AHEAD = 1.0
-#: The turn by slope deviations about the mirror's two axes, as constants of the state, and the
-#: standard deviation of one that does not occur, rad.
+#: The rotation by slope deviations about the mirror's two axes, as constants of the state, and the
+#: standard deviation of a rotation that does not occur, rad.
 TURN, NO_TURN = ("turn about x", "turn about y"), 1e-9
 
 
@@ -40,13 +41,14 @@ class Flown:
     Attributes
     ----------
     sightings
-        Of heliostat 0, less the mean of the errors that the flight's rows share, (R,).
+        Sightings of heliostat 0, less the mean of the errors that the flight's measurements share,
+        (R,).
     shift
         Displacement of their ends by one unit of each of K shared errors, ENU, m, (R, 3, K).
     covariance
-        Of these errors, by all that is known of them but from this mirror, (K, K).
+        Covariance of these errors, from everything known about them except this mirror, (K, K).
     turn_sigma
-        Standard deviation of the turn that all rows of this mirror show alike, rad.
+        Standard deviation of the rotation that all measurements of this mirror share, rad.
     """
 
     sightings: Sightings
@@ -62,23 +64,23 @@ def replayed(
     hyper: Hyperparameters,
     flown: Sequence[Flown] = (),
 ) -> Belief:
-    """Return the belief of a mirror after its sightings.
+    """Return the belief about a heliostat after its sightings.
 
-    Errors that rows of flights share are constants of the state too: each flight's from its first
-    row to its last, and the mirror's turn from the first of all.
+    Errors that measurements of a flight share are also constants of the state: each flight's errors
+    from its first measurement to its last, and the mirror's rotation from the first of all.
 
     Parameters
     ----------
     mechanism
-        That the fit starts from, batch shape (1,).
+        Mechanism from which the fit starts, batch shape (1,).
     sightings
         M photographs of heliostat 0.
     fitted
-        A robust fit of all, (1,), whose names are the first of ``hyper``.
+        A robust fit of all sightings, (1,), whose names are the first in ``hyper``.
     hyper
-        Of the mirror's group, for the same parameters.
+        Hyperparameters of the heliostat's group, for the same parameters.
     flown
-        Its rows of flights.
+        Its measurements from flights.
     """
     count = len(fitted.names)
     values, centre = np.zeros(len(hyper.names)), np.zeros(len(hyper.names))
@@ -102,7 +104,8 @@ def replayed(
     if flown:
         turn = np.full(2, max(*(flight.turn_sigma for flight in flown), NO_TURN))
         belief = stream.with_constants(belief, TURN, turn)
-    # Unknown times first: they say nothing about drift, and a belief does not go back.
+    # Unknown times come first, because they say nothing about drift and a belief does not go back
+    # in time.
     order = np.argsort(np.nan_to_num(time, nan=-np.inf), kind="stable")
     for k in order:
         belief = _updated(belief, which[k], parts[which[k]], int(place[k]))
@@ -111,7 +114,7 @@ def replayed(
 
 @dataclass(frozen=True)
 class _Rows:
-    """Sightings of one origin, linear in the parameters, and the constants that they share."""
+    """Sightings from one source, linear in the parameters, and the constants that they share."""
 
     jacobian: FloatArray
     value: FloatArray
@@ -164,7 +167,7 @@ class _Rows:
 
 
 def _updated(belief: Belief, number: int, rows: _Rows, k: int) -> Belief:
-    """Return the belief after row k of one origin: 0 the photographs, or the number of a flight."""
+    """Return the belief after row k of one source: 0 for photographs, or the number of a flight."""
     names = rows.names(number)
     if names and k == 0:
         belief = stream.with_constants(belief, names, np.ones(len(names)))
@@ -183,15 +186,15 @@ def _updated(belief: Belief, number: int, rows: _Rows, k: int) -> Belief:
 def hyper_of(
     mechanism: Mechanism, fitted: FieldFit, group: Hyperparameters | None = None
 ) -> Hyperparameters:
-    """Return the hyperparameters of one mirror (1,) for the parameters of its fit (1,).
+    """Return the hyperparameters of one heliostat (1,) for the parameters of its fit (1,).
 
     Parameters
     ----------
     mechanism, fitted
-        The mirror, and its fit.
+        The heliostat's mechanism, and its fit.
     group
-        Hyperparameters of its group; parameters and processes that it lacks, and all
-        without it, have the defaults.
+        Hyperparameters of its group; parameters and processes that it lacks, or all of them without
+        a group, have the defaults.
     """
     hyper = drift.start(mechanism, tuple(fitted.names), priors=fitted.prior[0])
     hyper = replace(hyper, rate=drift.step_rate(()))
@@ -199,7 +202,7 @@ def hyper_of(
 
 
 def _applied(group: Hyperparameters, own: Hyperparameters) -> Hyperparameters:
-    """Return a mirror's hyperparameters with those of its group where both have them."""
+    """Return a heliostat's hyperparameters, replaced by its group's where both have them."""
     mean, spread = own.mean.copy(), own.spread.copy()
     for p, name in enumerate(own.names):
         # A parameter that only drifts in one of the models has no population there.
@@ -224,7 +227,7 @@ def _applied(group: Hyperparameters, own: Hyperparameters) -> Hyperparameters:
 
 
 def at_present(fitted: FieldFit, belief: Belief, time: float) -> FieldFit:
-    """Return a fit (1,) with the values and the covariance of a belief after a POSIX time, s."""
+    """Return a fit (1,) with the values and covariance of a belief after a POSIX time, s."""
     count = len(fitted.names)
     values, covariance = belief.at(time / DAY + AHEAD)
     return replace(fitted, values=values[None, :count], covariance=covariance[None, :count, :count])
@@ -237,20 +240,20 @@ def fitting_present(
     group: Hyperparameters | None = None,
     flown: Sequence[Flown] = (),
 ) -> FieldFit:
-    """Return the fit of a mirror as it is after its latest sighting.
+    """Return the fit of a heliostat in its state after the latest sighting.
 
     Parameters
     ----------
     mechanism
-        That the fit starts from, batch shape (1,).
+        Mechanism from which the fit starts, batch shape (1,).
     sightings
-        M of heliostat 0.
+        M sightings of heliostat 0.
     fitted
-        A robust fit of them, (1,). One that has failed is returned as it is.
+        A robust fit of the sightings, (1,). A failed fit is returned unchanged.
     group
         Hyperparameters of its group; default: none.
     flown
-        Its rows of flights.
+        Its measurements from flights.
     """
     times = np.concatenate([sightings.time, *(flight.sightings.time for flight in flown)])
     known = times[np.isfinite(times)]

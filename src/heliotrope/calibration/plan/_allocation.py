@@ -18,7 +18,7 @@ from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.uncertainty import CHUNK
 from heliotrope.geometry import FloatArray, as_float
 
-#: Most beams tried for moves and exchanges; takes some seconds.
+#: Maximum number of beams tried for moves and exchanges, which takes some seconds.
 TRIES = 4_000
 #: Sweeps over all beams, options tried for each, and partners tried in each.
 SWEEPS, DEPTH, PARTNERS = 8, 4, 64
@@ -35,9 +35,9 @@ class Option:
     slope
         Whitened derivatives by the scaled parameters, (n, 2, P).
     room
-        Number of beams that fit in.
+        Number of beams that fit into the interval.
     most
-        Most visits of each heliostat, (n,).
+        Maximum number of visits of each heliostat, (n,).
     """
 
     rows: npt.NDArray[np.intp]
@@ -74,7 +74,7 @@ def allocate(
     worth
         A sighting must lower the heliostat's expected squared error by this share.
     count
-        Most sightings in total; default: no limit.
+        Maximum number of sightings in total; default: no limit.
     """
     known = covariance.copy()
     square = np.einsum("npq,nqp->n", form, known)
@@ -108,7 +108,7 @@ def allocate(
 
 
 class _Exchange:
-    """The allocated beams and the information that each heliostat gains by them."""
+    """The allocated beams and the information that each heliostat gains from them."""
 
     def __init__(
         self,
@@ -164,7 +164,7 @@ class _Exchange:
         return self._replace(o, i, rest)
 
     def _replace(self, o: int, i: int, rest: FloatArray) -> bool:
-        """Give the place of a beam of ``i`` to a heliostat that gains more by it."""
+        """Give the slot of a beam of ``i`` to a heliostat that gains more from it."""
         rows = self.options[o].rows
         rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
         new = [int(b) for b in rows if b != i and self.able(o, int(b))]
@@ -193,7 +193,7 @@ class _Exchange:
         form = self.form[rows]
         change = _gain.variance_gain(rest, slope_o, form) - _gain.variance_gain(rest, slope_p, form)
         best = int(np.argmax(change))
-        # The margin keeps rounding from exchanging two beams for ever.
+        # The margin prevents rounding errors from exchanging two beams for ever.
         return rows[best] if change[best] > -gain * (1.0 - 1e-6) else None
 
     def _move(self, o: int, p: int, i: int) -> None:

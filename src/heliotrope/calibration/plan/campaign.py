@@ -27,7 +27,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.sun import Site
 
-#: Most memory for the derivatives of a day that is planned as a whole, bytes.
+#: Maximum memory for the derivatives of a day that is planned as a whole, bytes.
 MEMORY = 1e9
 
 
@@ -309,7 +309,7 @@ class _Schedule:
                 self._fill(j, queue, begin, float(arrive), sun)
 
     def _fill(self, j: int, queue: "_Queue", begin: float, arrive: float, sun: FloatArray) -> None:
-        """Give one slot of target ``j`` to the first heliostat in its queue that can be there."""
+        """Assign one slot of target ``j`` to the first heliostat in its queue that can be there."""
         waiting: list[tuple[float, int, int]] = []
         while queue.heap:
             entry = heappop(queue.heap)
@@ -322,7 +322,8 @@ class _Schedule:
                 waiting.append(entry)
                 continue
             own = self.field.single(i, sun, self.targets[j])
-            # The queue is of the middle of the interval; the slot itself may be out of reach.
+            # The queue applies to the middle of the interval, but the target may be out of reach in
+            # the slot itself.
             if not own.able[0]:
                 continue
             if arrive - own.seconds[0] < ready:
@@ -383,7 +384,7 @@ class _Schedule:
 class _Queue:
     """Heliostats for one target during an interval, the greatest gain first.
 
-    Either the order ``wanted`` is settled; or all heliostats within reach are in it with their
+    Either the order ``wanted`` is fixed, or the queue holds all heliostats within reach with their
     gain at the middle of the interval. An entry of a heliostat that has been measured since is
     outdated, which its version shows; its gain is renewed when it comes to the top.
     """

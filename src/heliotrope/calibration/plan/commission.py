@@ -29,7 +29,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.sun import Site
 
-#: Most places at which a search looks for a beam.
+#: Maximum number of positions at which a search looks for a beam.
 LOOKS = 25
 #: Percentiles of the curve.
 SHARES = (0.5, 0.9)
@@ -129,22 +129,22 @@ class CommissionTerms:
 
 @dataclass(frozen=True)
 class Visit:
-    """Mirrors on a target, or where they shine on the receiver.
+    """A visit of heliostats to a target, or at their aims on the receiver.
 
     Attributes
     ----------
     begin, end
-        POSIX s; mirrors leave their aim at the beginning and are back at it at the end.
+        POSIX s; heliostats leave their aims at the beginning and have returned at the end.
     target
-        Number of the target; the receiver has the one after the last.
+        Index of the target; the receiver has the index after the last target.
     heliostats
-        Their numbers through all fleets, (n,).
+        Their indices over all fleets, (n,).
     joint
-        Whether they are told apart by coded movements.
+        Whether coded movements distinguish them.
     own
-        Whether each has a code of its own, and a second stack verifies them.
+        Whether each has its own code, and a second stack verifies them.
     first
-        Whether some were never measured before.
+        Whether any of them was never measured before.
     missed
         Which beams are expected to miss the target in a joint first visit, (n,).
     after
@@ -336,7 +336,7 @@ def _cells(
 
 @dataclass
 class _Queue:
-    """Heliostats in the order of their value; those that have been taken are passed."""
+    """Heliostats in the order of their value; those already taken are skipped."""
 
     rows: Rows
 
@@ -347,7 +347,7 @@ class _Queue:
             free_rows = self.rows[:reach][free[self.rows[:reach]]]
             if len(free_rows) >= most or reach >= len(self.rows):
                 return free_rows[:most]
-            # Most at the front have been taken.
+            # Most heliostats at the front have already been taken.
             self.rows = self.rows[free[self.rows]]
             reach *= 4
 
@@ -356,8 +356,8 @@ class _Queue:
 class _Choices:
     """Visits that a target can take during an interval.
 
-    ``alone`` may go alone, and ``lost`` of them were never measured; ``new`` go to a joint first
-    visit, and ``known`` to a later one.
+    ``alone`` may have a single visit, and ``lost`` of these were never measured; ``new`` are for a
+    joint first visit, and ``known`` for a later joint visit.
     """
 
     view: TargetView
@@ -372,7 +372,7 @@ class _Choices:
 
 
 class _Commissioning:
-    """The state of a plan in the making."""
+    """The state of a plan under construction."""
 
     def __init__(
         self,
@@ -398,7 +398,7 @@ class _Commissioning:
         self.missed, self._owed = np.zeros(count, dtype=np.int64), 0.0
         self._last_joint: Mask = np.zeros(len(targets) + 1, dtype=np.bool_)
         places = len(targets) + (terms.receiver is not None)
-        #: End of the last interval, and what each place had left of it, s.
+        #: End of the last interval, and the unused time of each place in it, s.
         self._until, self._unused = -np.inf, np.zeros(places)
         #: When each mirror's last visit ended, and the last one on the receiver.
         self._home, self._shone = np.full((2, count), -np.inf)
@@ -417,7 +417,7 @@ class _Commissioning:
 
     def fill(self, begin: float, end: float, sun: FloatArray) -> None:
         """Give the time of all targets, and of the receiver, in an interval to visits."""
-        # What the interval before left over, too short for a visit, is used now.
+        # Time left over from the previous interval, too short for a visit, is used now.
         unused = self._unused if begin == self._until else np.zeros_like(self._unused)
         carried = begin - unused
         choices = [self._choices(sun, target) for target in self.targets]
@@ -429,14 +429,14 @@ class _Commissioning:
         while opened.any():
             j = int(np.argmin(np.where(opened, clock, np.inf)))
             now = float(clock[j])
-            # In that time, some are still on their way back from another place.
+            # During that time, some heliostats are still returning from another place.
             home = free if now >= begin else free & (self._home <= now)
             rows, joint = self._best(j, choices[j], home)
             span = self._span(j, choices[j], rows, joint) if rows.size else {}
             until = now + sum(span.values())
             if not rows.size or until > stop:
                 opened[j] = False
-                # Where nobody is left to be visited, nothing is carried on.
+                # If no heliostat is left to visit, no time is carried over.
                 self._unused[j] = max(0.0, stop - now) if rows.size else 0.0
                 self._use(j, {"idle": max(0.0, stop - now) - (begin - carried[j])})
                 continue
@@ -486,7 +486,7 @@ class _Commissioning:
         return view, spread
 
     def _gains(self, view: TargetView, accuracy: float) -> FloatArray:
-        """Return the fall of each expected squared error, 0 where it is not worth it, rad²."""
+        """Return the fall of each expected squared error, 0 where a visit is not worth it, rad²."""
         slope = view.slope * (self.sigma / accuracy)[:, None, None]
         falls = _gain.variance_gain(self.field.covariance, slope, self.field.form)
         worthy = view.able & self.counted & (falls > self.terms.worth * self.field.squares())

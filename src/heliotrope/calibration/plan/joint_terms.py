@@ -16,20 +16,20 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.beam import beam_sigma
 
-#: Time of a photograph beside the settling of the mirrors: the movement and the exposure, s.
+#: Time of a photograph excluding the settling of the heliostats: movement and exposure, s.
 _PHOTOGRAPH = 1.2
-#: Standard deviation of a centroid by a whole stack, rad.
+#: Standard deviation of a centroid from a whole stack, rad.
 _CENTROID = 1e-4
-#: Beams that share a code: 36 mirrors on a target of 12 m take 7 codes, 49 take 15; and when they
-#: are verified, known less well: 54 take 15, 57 take 31.
+#: Number of beams that share a code: 36 heliostats on a 12 m target take 7 codes, 49 take 15. The
+#: second number is for the verification, when they are known less well: 54 take 15, 57 take 31.
 _SHARING, _VERIFYING = 5.2, 3.6
-#: Numbers of codes.
+#: Possible numbers of codes.
 _CODES = (3, 7, 15, 31, 63, 127)
 #: Share of the largest expected error that automatic control allows in a later visit.
 _SURE = 0.95
-#: Share of the light that a mirror sends, and slope error of its surface, rad.
+#: Reflected share of the light, and slope error of the mirror surface, rad.
 _REFLECTED, _SLOPE = 0.8, 1e-3
-#: A beam keeps this many of its standard deviations from the border, and those of its place.
+#: A beam keeps this many standard deviations of its width and of its position from the border.
 _BORDER = 1.5
 #: Standard deviations by which the light may exceed its expectation.
 _ABOVE = 2.0
@@ -120,7 +120,7 @@ class JointTerms:
         """
         if not own:
             return 2 * (_codes(mirrors / _SHARING) + 1)
-        # Movements along one axis take half as many photographs for a code.
+        # Movements along one axis need half as many photographs per code.
         return _codes(mirrors) + 1 + max(_codes(mirrors / _VERIFYING), _CODES[1]) + 1
 
     def span(self, mirrors: int, *, own: bool) -> float:
@@ -130,7 +130,7 @@ class JointTerms:
     def fitting(
         self, target: Target, size: FloatArray, slant: FloatArray, spread: FloatArray
     ) -> int:
-        """Return how many heliostats, from the first on, keep a target below its limit.
+        """Return how many heliostats, counted from the first, keep a target below its limit.
 
         Parameters
         ----------
@@ -143,16 +143,16 @@ class JointTerms:
 
         Notes
         -----
-        The smaller the expected error of a heliostat, the farther from the middle its place may be.
-        While beam positions are unknown the irradiance is random; its expectation plus twice its
-        standard deviation counts.
+        The smaller the expected error of a heliostat, the farther from the middle its position may
+        be. While beam positions are unknown the irradiance is random; its expectation plus twice
+        its standard deviation counts.
         """
         power = _REFLECTED * size**2
         beam = beam_sigma(slant, slope=_SLOPE) ** 2 + (0.5 * size) ** 2 / 12.0
         lost = 0.5 * spread * slant**2
         half = 0.5 * min(target.width, target.height)
         room = np.maximum(half - _BORDER * (np.sqrt(beam) + np.sqrt(lost)), 0.0)
-        # Places are spread evenly over the room.
+        # Positions are spread evenly over the available space.
         wide = lost + room**2 / 3.0
         mean = np.cumsum(power / (2.0 * np.pi * (beam + wide)))
         chance = np.cumsum(power**2 / (8.0 * np.pi**2 * beam * (0.5 * beam + wide)))

@@ -9,7 +9,7 @@ from heliotrope.optics.beam import SUN_RADIUS
 
 #: Distance between neighbouring aims of a search, as a share of the target's shorter side.
 PITCH = 0.8
-#: Joint first visits in which a beam is looked for, in the middle and around it.
+#: Number of joint first visits that look for a beam, at the middle of the target and around it.
 LOOKS = 9
 #: A stack finds a beam whose centre is this far inside the target, m.
 _INSIDE = 0.5
@@ -18,7 +18,7 @@ _INSIDE = 0.5
 def chance_on_target(
     target: Target, position: FloatArray, size: FloatArray, spread: FloatArray
 ) -> FloatArray:
-    """Return the chance that a beam is wholly on a target at the first look, (N,).
+    """Return the probability that a beam is wholly on a target at the first attempt, (N,).
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def chance_on_target(
 def chance_by_try(
     target: Target, position: FloatArray, spread: FloatArray, tries: int
 ) -> FloatArray:
-    """Return the chance that a stack finds a beam which earlier ones have missed, (K, N).
+    """Return the probability that a stack finds a beam which earlier stacks have missed, (K, N).
 
     The aim of each try is that of `search_places`; the other parameters are those of
     `chance_on_target`. A beam is found whose centre is on the target.
@@ -75,7 +75,7 @@ def _cut(places: FloatArray, room: FloatArray, sigma: FloatArray) -> tuple[Float
 
 
 def search_places(target: Target, count: int) -> FloatArray:
-    """Return where a beam is sent that earlier looks have missed, right and up, m, (K, 2).
+    """Return the search points for a beam that earlier attempts missed, right and up, m, (K, 2).
 
     The middle first, then around it.
     """
@@ -87,12 +87,12 @@ def search_places(target: Target, count: int) -> FloatArray:
 
 
 def reach_of(target: Target) -> FloatArray:
-    """Return how far off the middle a stack finds a beam, right and up, m, (2,)."""
+    """Return how far from the middle a stack can find a beam, right and up, m, (2,)."""
     return np.asarray(0.5 * np.array([target.width, target.height]) - _INSIDE)
 
 
 def _deviation(target: Target, position: FloatArray, spread: FloatArray) -> FloatArray:
-    """Return the standard deviation of the place of a beam, right and up, m, (N, 2)."""
+    """Return the standard deviation of a beam's position, right and up, m, (N, 2)."""
     path = target.center - position
     distance = np.linalg.norm(path, axis=1)
     facing = np.abs(path @ target.normal) / distance

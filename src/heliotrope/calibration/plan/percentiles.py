@@ -20,7 +20,7 @@ _STEPS = 24
 def error_percentiles(
     form: FloatArray, covariance: FloatArray, shares: Sequence[float], common: float = 0.0
 ) -> FloatArray:
-    """Return percentiles of the field's RMS beam errors over the suns of the form, rad.
+    """Return percentiles of the field's RMS beam errors over the sun positions of the form, rad.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def error_percentiles(
     shares
         0 to 1; 0.5 is the median.
     common
-        Squared error that every mirror has besides, rad².
+        Additional squared error of every heliostat, rad².
 
     Notes
     -----

@@ -25,7 +25,7 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.sun import Site, Times
 
 Criterion = Literal["d", "v"]
-#: Most rounds of exchange; two or three are usual.
+#: Maximum number of exchange rounds; two or three are usual.
 SWEEPS = 50
 
 
@@ -409,7 +409,8 @@ def plan_sightings(
     matrix = as_float(information)
     scale = 1.0 / np.sqrt(np.diagonal(matrix))
     slope = candidates.jacobian * scale
-    # Scaled, metres and radians weigh alike, and the prior is close to the unit matrix.
+    # After scaling, metres and radians have equal weight, and the prior is close to the unit
+    # matrix.
     known = matrix * scale[:, None] * scale
     weights = as_float(form) * scale[:, None] * scale
     choice = _Choice(slope, candidates.time, known, weights, criterion, gap)

@@ -139,7 +139,7 @@ class Board:
         if self.node is not None:
             return
         self.now = now
-        # Where the journal's counts differ from those of the motors, the board slips.
+        # If the journal's counts differ from those of the motors, the difference becomes slip.
         journal = Journal(self.flash)
         journal.load()
         self._counts_from((journal.primary, journal.secondary))
@@ -163,7 +163,7 @@ class Board:
         self._tell("boot")
 
     def zeroed(self) -> None:
-        """Note that its step counts were declared, and how far the motors are from them."""
+        """Note that its step counts were declared, and how far the motors are from these counts."""
         if self.node is not None:
             self._counts_from([self.node.controller.motion.place(axis) for axis in (0, 1)])
 
@@ -184,7 +184,7 @@ class Board:
         self._die()
 
     def exchange(self, serial: int, items: Mapping[str, bytes] | NorFlash) -> NorFlash:
-        """Install another board at the heliostat, while there is no supply; return the old flash.
+        """Install another board at the heliostat, while power is off; return the old flash.
 
         Parameters
         ----------
@@ -283,7 +283,7 @@ class Board:
         return out
 
     def due(self, now: float) -> float:
-        """Return when the main loop should run next, in s: earlier is always allowed."""
+        """Return when the main loop should run next, in s; running earlier is always allowed."""
         node = self.node
         if node is None:
             return math.inf
@@ -324,7 +324,7 @@ class Board:
         if believed:
             counts = [axis.turned - slip for axis, slip in zip(self.axes, self.slip, strict=True)]
         key = (counts[0], counts[1])
-        if key != self._posed:  # observers ask several times for one position
+        if key != self._posed:  # observers query one position several times
             pose = self.outfit.mechanism.pose(counts)
             self._posed, self._pose = key, (pose.vertex, pose.normal)
         vertex, normal = self._pose
@@ -349,7 +349,7 @@ class Board:
         self, sun: FloatArray, point: "tuple[float, float, float]", *, believed: bool = False
     ) -> float:
         """Return the distance of the ray from a point, m; infinite if it leads away from it."""
-        # By single numbers: for three of them numpy takes several times as long.
+        # Computed with scalars, because numpy takes several times as long for three numbers.
         vertex, normal = (vector.tolist() for vector in self.mirror(believed=believed))
         (a, b, c), (i, j, k), (s, t, u) = vertex, normal, sun.tolist()
         twice = 2.0 * (i * s + j * t + k * u)

@@ -210,19 +210,19 @@ class TwinBus:
                 took = max(took, self._chance.uniform(took, timeout))
             whole = complete(answer) if complete and answer else answer.endswith(b"\0")
             if not answer or took > timeout or not whole:
-                # Wait to the end: a damaged or truncated answer has no terminator.
+                # Wait to the end, because a damaged or truncated reply has no terminator.
                 await asyncio.sleep(timeout)
                 return answer if took <= timeout else b""
             await asyncio.sleep(took)
             return answer
 
     async def _carried(self, frame: bytes) -> bytes:
-        """Carry a frame when its last byte is out; return the answers."""
+        """Carry a frame when its last byte has been sent; return the replies."""
         if not PROGRAM.get():
             if self._per_byte:
                 await asyncio.sleep(self._per_byte * len(frame))
             return self.carry(frame)
-        # The port goes on sending when the program that wrote to it is frozen.
+        # The port continues to send even if the program that wrote to it is frozen.
         loop = asyncio.get_running_loop()
         done: asyncio.Future[bytes] = loop.create_future()
 
@@ -272,7 +272,7 @@ class TwinBus:
         for place in range(len(self.stations)):
             answer += self._bring(place, frame, how)
         for place, old in kept:
-            # An answer that arrives between others is lost in them.
+            # A reply that arrives between other replies is lost.
             self._hear(place, old, "late")
         return bytes(answer)
 
@@ -313,7 +313,7 @@ class TwinBus:
             elif self._happens(faults.burst):
                 answer, how = damaged(answer, self._chance, burst=True), "damaged"
         elif self._late_answers and answer:
-            # A late answer arrives first, as from a node that took too long.
+            # A late reply arrives first, as if a node had taken too long.
             answer, how = self._late_answers.pop(0) + answer, "late"
         if self._tap is not None and answer:
             self._tap.answered(answer, how, self._clock.monotonic())

@@ -48,7 +48,7 @@ class SimulatedTime:
         self.quality: Quality = "gps"
 
     def jump(self, seconds: float) -> None:
-        """Set the reported time forward, or back."""
+        """Set the reported time forward or back."""
         self.offset += seconds
         self._jumped_at = self._clock.monotonic()
 
@@ -66,7 +66,7 @@ class SimulatedTime:
         return Time(utc_of_gps(gps).timestamp(), gps, error, self.quality, jumped)
 
     async def run(self) -> None:
-        """Wait until closed, because there is nothing to do."""
+        """Wait until closed; there is nothing to do."""
         await self._closing.wait()
 
     async def close(self) -> None:
@@ -101,7 +101,7 @@ class DriftingClock:
         return self._inner.utc()
 
     def jump(self, seconds: float) -> None:
-        """Set the calendar clock forward, or back."""
+        """Set the calendar clock forward or back."""
         self._inner.jump(seconds)
 
 

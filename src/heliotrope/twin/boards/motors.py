@@ -87,7 +87,7 @@ class MotorAxis:
             self.missed += 1
             steps -= 1
         self.turned += direction * steps
-        # The joint is carried along by the flank that pushes.
+        # The pushing gear flank carries the joint along.
         self.joint = min(max(self.joint, float(self.turned)), self.turned + self.play)
 
     def release(self, full: int) -> None:
@@ -96,7 +96,7 @@ class MotorAxis:
         self._turn(-1 if away > 0 else 1, abs(away))
 
     def stop(self) -> int:
-        """Stop at once; return the signed steps that were ordered and not made."""
+        """Stop at once; return the signed steps that were ordered but not made."""
         undone = sum(direction * count for direction, count, _ in self._queue)
         if self._queue:
             undone -= self._queue[0][0] * self._done

@@ -1,4 +1,4 @@
-"""Heliostats to simulate: imperfect mechanisms, and what their boards store about them."""
+"""Heliostats to simulate: imperfect mechanisms, and the items that their boards store."""
 
 import hashlib
 import math
@@ -18,7 +18,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
 from heliotrope.mechanism.machine import AxisLimits, Machine, spread_machines
 
-#: Steps per turn of a joint: 15.7 µrad a step. At 8000 steps/s a turn takes 50 s.
+#: Steps per turn of a joint: 15.7 µrad per step. At 8000 steps/s a turn takes 50 s.
 STEPS_PER_TURN = 400_000
 #: Rate (steps/s), acceleration (steps/s²) and backlash (steps) of both axes.
 LIMITS = (8000, 16_000, 40)
@@ -29,17 +29,17 @@ RANGES = ((-20_000, 406_000), (-4000, 104_000))
 RECEIVER = (0.0, 0.0, 50.0)
 STANDBY = (12.0, 0.0, 40.0)
 DEFOCUS = (0.1, 0.05)
-#: What the boards of `outfits` store besides their mechanisms, except the spread of the defocus.
+#: Items that the boards of `outfits` store besides their mechanisms, except the defocus spread.
 MACHINE = Machine(
     (AxisLimits(*RANGES[0], *LIMITS), AxisLimits(*RANGES[1], *LIMITS)), STOW, DEFOCUS, STANDBY
 )
-#: Centre and radius of a sphere that no beam may enter, m; no way leads there unless ordered.
+#: Centre and radius of a sphere that no beam may enter, m; no path leads there unless ordered.
 KEEP_OUT, KEEP_OUT_RADIUS = (-12.0, 0.0, 25.0), 2.0
 #: Centre and radius of a ball, ENU, m.
 Ball = tuple[tuple[float, float, float], float]
 #: Parameters whose imperfections are drawn.
 CAUSES = ("tilt_north", "tilt_east", "canting", "non_orthogonality")
-#: Most heliostats of a cluster.
+#: Maximum number of heliostats in a cluster.
 MOST = 32
 
 
@@ -129,7 +129,7 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
 
 
 def _perfect(places: npt.ArrayLike) -> Mechanism:
-    """Return mechanisms without imperfections at places (..., 3)."""
+    """Return mechanisms without imperfections at positions (..., 3)."""
     gear = {"steps_per_turn": 200, "gear_ratio": STEPS_PER_TURN / 800, "microsteps": 4}
     return kinds.azimuth_elevation(
         places, pivot_height=2.0, pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from heliotrope.links.clock import Clock
 from heliotrope.twin.boards.bus import Station
 
-#: Bytes that are read at once, and the longest frame without an end that is kept.
+#: Bytes that are read at once, and the longest unterminated frame that is kept.
 _CHUNK, _LONGEST = 4096, 65_536
 
 
@@ -30,7 +30,7 @@ class PtyLine:
 
     def __init__(self, clock: Clock, stations: Sequence[Station]) -> None:
         self._clock, self._stations = clock, tuple(stations)
-        # The far end stays open here too, else nothing could be read while nobody has it open.
+        # The far end stays open here too; otherwise reads would fail while no program has it open.
         self._line, self._far = os.openpty()
         tty.setraw(self._far)
         os.set_blocking(self._line, False)
@@ -38,7 +38,7 @@ class PtyLine:
         self._frame, self._closing = b"", asyncio.Event()
 
     async def run(self) -> None:
-        """Let the stations hear and answer until the line is closed."""
+        """Let the stations receive and reply until the line is closed."""
         loop = asyncio.get_running_loop()
         loop.add_reader(self._line, self._read)
         try:
@@ -49,7 +49,7 @@ class PtyLine:
             os.close(self._far)
 
     async def close(self) -> None:
-        """Close the line for good."""
+        """Close the line permanently."""
         self._closing.set()
 
     def _read(self) -> None:

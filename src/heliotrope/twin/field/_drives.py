@@ -22,7 +22,7 @@ class Drives:
     counts
         Initial positions, steps, (N, 2).
     play
-        Play of the gears, steps, a number or (N, 2); see `twin.boards.motors.Axis`.
+        Backlash of the gears, steps, a number or (N, 2); see `twin.boards.motors.Axis`.
     miss
         Probability that a moving axis loses a step in a tick.
     seed
@@ -38,7 +38,7 @@ class Drives:
     Raises
     ------
     InputError
-        A play below 0, or a probability outside 0 to 1.
+        If the backlash is below 0, or a probability is outside 0 to 1.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Drives:
         self._chance = np.random.default_rng(seed)
 
     def next(self) -> tuple[Integers, FloatArray, FloatArray, Bools, Integers]:
-        """Return the arrays that the kernel turns in the next tick; draws the steps to lose."""
+        """Return the arrays that the kernel advances in the next tick; draws the steps to lose."""
         if self._miss > 0.0:
             self._lost = self._chance.random(self.turned.shape) < self._miss
         return self.turned, self.joint, self._play, self._lost, self.missed

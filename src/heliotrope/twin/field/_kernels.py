@@ -114,7 +114,7 @@ def go_rows(axes, order, rows, goals, how):
 
 @njit(**OPTIONS)
 def brake_rows(axes, rows):
-    """Slow down and stop, giving the goals up: `Axis.brake`."""
+    """Slow down, stop and drop the goals: `Axis.brake`."""
     for i in rows:
         for k in range(2):
             axes[i, k]["braking"] = True
@@ -131,7 +131,7 @@ def still_rows(axes, queued, out):
 
 @njit(**INNER)
 def _carry(drives, i, k, steps):
-    """Turn a motor by its emitted steps; the flank of the gear that pushes carries the joint."""
+    """Turn a motor by its emitted steps; the pushing gear flank carries the joint."""
     turned, joint, play, lost, missed = drives
     if steps == 0:
         return

@@ -75,9 +75,10 @@ AXIS = np.dtype(
 )
 #: As `lcu.config.Config`.
 LEASE_MS, STOW_WAIT_MS, SLOT_MS, AHEAD_MS = 6000, 30_000, 50, 100
-#: A defocus: none since another motion; under way to its goals; ended (`lcu.motion.Motion.aside`).
+#: Stages of a defocus: none since another motion; moving to its goals; ended
+#: (`lcu.motion.Motion.aside`).
 NO_TURN, TURNING, TURNED = range(3)
-#: Time step of a field, ms: at least as often as a board's main loop turns.
+#: Time step of a field, ms: no longer than a pass of a board's main loop.
 TICK_MS = 50
 
 
@@ -183,7 +184,7 @@ class Field:
         self._place = np.zeros(count, dtype=np.int64)
         self._sun = np.zeros((2, 3), dtype=np.int64)
         self._sun_ms = 0
-        self._sunned = np.full(count, -RECENT_MS)  # when each took it last, ms
+        self._sunned = np.full(count, -RECENT_MS)  # when each last took the sun vector, ms
 
     def __len__(self) -> int:
         return len(self.state)
@@ -268,7 +269,7 @@ class Field:
         self._aside[rows], self._turn_goals[rows] = TURNING, self.axes["goal"][rows]
 
     def _go_on_turning(self, rows: Rows) -> None:
-        """Go on with turns that a reset or an emergency stop has interrupted."""
+        """Continue turns that a reset or an emergency stop has interrupted."""
         self.kind[rows], self._base[rows] = DEFOCUS, HOLD
         rows = rows[self._aside[rows] == TURNING]
         both = np.full(len(rows), kernels.BOTH)
@@ -280,11 +281,11 @@ class Field:
         return np.asarray(among(self.kind[rows], STOW, RETURN) | turns)
 
     def _note_motions(self) -> None:
-        """Forget the turns that other motions have replaced: `Controller._mark`."""
+        """Drop the turns that other motions have replaced: `Controller._mark`."""
         self._aside[~among(self.kind, HOLD, DEFOCUS)] = NO_TURN
 
     def _lock_now(self, rows: Rows) -> None:
-        """Stand still, but end first what takes the beam off: `Motion.lock`."""
+        """Stand still, but first finish any motion that takes the beam off: `Motion.lock`."""
         leaving = self._leaving(rows)
         self._base[rows[leaving]] = HOLD
         self._hold(rows[~leaving])
@@ -307,7 +308,7 @@ class Field:
         )
 
     def _choose_offsets(self, rows: Rows) -> None:
-        """Choose by how much heliostats turn away: `Motion._turn`."""
+        """Choose the angles by which heliostats turn away: `Motion._turn`."""
         tracks = self.kind[rows] == TRACK
         points = np.where(tracks[:, None], self.journals.standby[rows], self.aim[rows])
         points[~self._recent(rows)] = np.nan
@@ -319,7 +320,7 @@ class Field:
         )
 
     def _recent(self, rows: Rows) -> Bools:
-        """Return whether heliostats took the sun lately, (M,)."""
+        """Return whether heliostats recently received the sun vector, (M,)."""
         return np.asarray(self.now_ms - self._sunned[rows] < RECENT_MS)
 
     def _stow_directly(self, rows: Rows) -> None:
@@ -336,7 +337,7 @@ class Field:
         )
 
     def _return(self, rows: Rows) -> None:
-        """Return by the path of the approach, and stow."""
+        """Return along the approach path, and stow."""
         for i in rows:
             self._set_path(i, self._way_back(i))
         self.kind[rows] = RETURN
@@ -397,7 +398,7 @@ class Field:
         self.hear(heard)
 
     def put_up(self, values: tuple[int, ...], aims: npt.ArrayLike) -> Bools:
-        """Put stowed heliostats on track, as if raised before; return a mask of them, (N,).
+        """Set stowed heliostats to tracking, as if raised before; return a mask of them, (N,).
 
         Heliostats that cannot bring their beams to their aims stay at stow.
 
@@ -423,7 +424,7 @@ class Field:
         return np.isin(np.arange(len(self)), rows)
 
     def hear(self, rows: Rows) -> None:
-        """Note that heliostats receive from their cluster; they hold a position only then."""
+        """Note that heliostats hear from their cluster, without which they hold no position."""
         self._heard[rows] = LEASE_MS
         held = (self.kind[rows] == HOLD) & (self.state[rows] != states.FAULT)
         self._aside[rows[held & (self.state[rows] >= 0)]] = NO_TURN
@@ -490,7 +491,7 @@ class Field:
         self._stow_directly(goes[~fresh])
 
     def _lock(self, rows: Rows, name: str) -> Rows:
-        """LOCK, UNLOCK and CLEAR_FAULT; return which heliostats take it."""
+        """LOCK, UNLOCK and CLEAR_FAULT; return which heliostats accept it."""
         state = self.state[rows]
         if name == "LOCK":
             self._enter(rows, states.LOCKED)
@@ -510,7 +511,7 @@ class Field:
         return rows
 
     def _sun_bound(self, rows: Rows, name: str) -> Rows:
-        """TRACK, REFOCUS and IDLE; return which heliostats take it."""
+        """TRACK, REFOCUS and IDLE; return which heliostats accept it."""
         state, fresh = self.state[rows], self._lease[rows] > 0
         if name == "IDLE":
             back = (state == states.DEFOCUSED) & self._ready[rows] & fresh
@@ -601,7 +602,7 @@ class Field:
             self.axes[name][rows] = self.axes["count"][rows]
 
     def restore(self, rows: Rows) -> None:
-        """Restore the power: locked and faulty controllers stay so, all others turn away.
+        """Restore the power: locked and faulty controllers remain so, all others turn away.
 
         A turn that had begun is continued, and so is the direct path to stow.
         """
@@ -722,7 +723,7 @@ class Field:
         self._stow_directly(ends[self.kind[ends] == RETURN])
 
     def _follow(self, rows: Rows) -> Rows:
-        """Keep beams on their aims: `Motion._follow`; return those that no pose can serve."""
+        """Keep beams on their aims: `Motion._follow`; return those whose aims no pose reaches."""
         new = rows[self._knot[rows] <= 0]
         lost = new[:0]
         if len(new):

@@ -27,7 +27,7 @@ _ACK = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["ACK"]))
 _BUS = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["BUS"]))
 _STEPS = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["STEPS"]))
 _NUMBERS = messages.NUMBER_OF
-#: `messages.name_of` searches a text, as suits a microcontroller.
+#: `messages.name_of` searches a string, which suits a microcontroller.
 _NAMES = {number: name for name, number in messages.NUMBER_OF.items()}
 #: A STATUS for each heliostat: state, flags, fault, uptime, age of the sun, supply, temperature,
 #: checksum of the armature, boots.
@@ -37,10 +37,11 @@ _STATUS = np.dtype(
 #: Bits of `lcu.names.FLAGS`: sun fresh; clock set, configured; ready; at stow.
 _SUN_FRESH, _SOUND, _READY, _AT_STOW = 1 << 1, 0b1100, 1 << 4, 1 << 5
 _NEVER = 0xFFFFFFFF
-#: Size of a keyed message's head, and the place of the edition in it.
+#: Size of a keyed message's header, and the position of the edition in it.
 _KEY_HEAD = struct.calcsize("<" + messages.HEADS[messages.KEY][0])
 _EDITION = slice(_KEY_HEAD - 4, _KEY_HEAD)
-#: Messages of calibration with the states that accept them, and the states that accept the others.
+#: Calibration messages with the states that accept them, and the states that accept all other
+#: messages.
 _TAKES_ALL = (states.LOCKED, states.FAULT)
 _TAKES_POSE = (*_TAKES_ALL, states.STOWED)
 _TAKES_HARMLESS = (*_TAKES_POSE, states.IDLE, states.DEFOCUSED)
@@ -50,13 +51,13 @@ _TAKES = {
     "SET_POSITION": _TAKES_HARMLESS,
     "SET_DEFOCUS": _TAKES_HARMLESS,
 }
-#: Messages that need no gate: from anybody, and questions.
+#: Messages that need no gate: those that anyone may send, and queries.
 _OPEN = frozenset(
     name
     for number, name in _NAMES.items()
     if name != "QUERY_BUS" and messages.who_of(number) in (messages.ANYONE, messages.ASK)
 )
-#: Commands that the field knows.
+#: Commands that the field supports.
 KNOWN = frozenset(
     {
         "DEFOCUS",
@@ -199,12 +200,12 @@ class FieldBus:
         return self._command(name, number, payload, place, sequence)
 
     def _judged(self, gates: Gates, data: bytes) -> bytes:
-        """Pass a frame on to those whose gates let it through, and answer as they do."""
+        """Pass a frame to the heliostats whose gates accept it, and return their reply."""
         frame = next(iter(wire.Reader().feed(data)), None)
         if frame is None:
             return b""
         name, number, sequence = frame.name, frame.number, frame.sequence
-        self._edition = -1  # what the flags tell may change
+        self._edition = -1  # the reported flags may change
         if frame.to == wire.BROADCAST:
             good = [gates.judge(frame, k) == messages.DONE for k in range(len(self._rows))]
             if any(good):
@@ -242,7 +243,7 @@ class FieldBus:
     def _statuses(self) -> list[bytes]:
         """Return the STATUS payloads of the whole bus.
 
-        A cluster asks for them one after another, and nothing changes in between.
+        A cluster requests them one after another, and nothing changes in between.
         """
         field = self._field
         if self._edition != field.edition:
@@ -265,7 +266,7 @@ class FieldBus:
         return self._status_payloads
 
     def _answer(self, place: int, sequence: int, name: str, payload: bytes) -> bytes:
-        """Return a heliostat's frame; b"" without power."""
+        """Return a heliostat's reply frame; b"" without power."""
         if self._field.state[self._rows[place]] < 0:
             return b""
         head = _HEADER.pack(wire.VERSION, wire.CLUSTER_ADDRESS, place + 1, sequence, _NUMBERS[name])
@@ -312,7 +313,7 @@ class FieldBus:
 
 
 def _unstuffed(data: bytes) -> bytes:
-    """Undo `_stuffed` and its final zero; b"" where that is not possible."""
+    """Undo `_stuffed` and its final zero; b"" if that is impossible."""
     if data.find(0) != len(data) - 1:
         return b""
     out, place, end = bytearray(data), 0, len(data) - 1
@@ -336,8 +337,8 @@ def _stuffed(data: bytes) -> bytes:
 def _parts(payload: bytes) -> tuple[bytes, bytes, bytes]:
     """Return a payload up to its first zero, its stuffed middle, and the part after its last zero.
 
-    A field's heliostats do the same for hours, so few payloads differ. Each has at least two zeros,
-    since a STATUS of a field reports no uptime.
+    A field's heliostats stay in the same state for hours, so few payloads differ. Each has at least
+    two zeros, since a STATUS of a field reports no uptime.
     """
     first, _, rest = payload.partition(b"\0")
     middle, _, last = rest.rpartition(b"\0")

@@ -20,7 +20,7 @@ from heliotrope.twin.field.field import Field
 
 _KEYED = 1 << names.FLAGS.index("BUS_KEY")
 _WANTS = 1 << names.FLAGS.index("SESSION_WANTED")
-#: Items that no answer tells.
+#: Items that no reply reveals.
 SECRET = frozenset({"key_id", "bus_keys"})
 Flags = npt.NDArray[np.uint32]
 
@@ -31,7 +31,7 @@ class Gates:
     Parameters
     ----------
     field
-        The whole field; keys of the bus are kept in its journals.
+        The whole field; bus keys are kept in its journals.
     rows
         Rows of this bus.
     keys
@@ -40,7 +40,7 @@ class Gates:
     Attributes
     ----------
     boots
-        Starts of each row, (N,).
+        Number of boots of each row, (N,).
     """
 
     def __init__(self, field: Field, rows: range, keys: Sequence[bytes]) -> None:
@@ -52,7 +52,7 @@ class Gates:
         self._second: int | None = None
 
     def _started(self, place: int) -> wire.Gate:
-        """Return the gate of a row that starts now."""
+        """Return the gate of a heliostat that boots now."""
         items, own = self._field.journals.items(self._rows[place]), self._keys[place]
         edition = struct.unpack("<I", items["edition"])[0] if "edition" in items else 0
         self.boots[place] += 1
@@ -68,7 +68,7 @@ class Gates:
         return bus
 
     def look(self) -> bool:
-        """Start the rows whose supply has come back; return whether there were any."""
+        """Boot the heliostats whose power has returned; return whether there were any."""
         off = self._field.state[self._all] < 0
         back = np.flatnonzero(self._off & ~off)
         self._off = off
@@ -83,7 +83,7 @@ class Gates:
         )
 
     def judge(self, frame: wire.Frame, place: int) -> int:
-        """Return DONE if a frame may act at a row, else why not."""
+        """Return DONE if a frame may act on a heliostat, otherwise the reason why not."""
         if self._off[place]:
             return messages.REFUSED_STATE
         result = self._gates[place].judge(frame, self._field.now_ms, self._second)
@@ -93,11 +93,11 @@ class Gates:
         return result
 
     def reported(self, place: int) -> tuple[int, ...]:
-        """Return the numbers of BUS."""
+        """Return the values of BUS."""
         return self._keys_of(place).told()
 
     def take_key(self, frame: wire.Frame, place: int) -> int:
-        """Apply SET_BUS_KEY to a row; return its result."""
+        """Apply SET_BUS_KEY to a heliostat; return the result."""
         gate, bus, values = self._gates[place], self._keys_of(place), frame.values()
         if values is None:
             return messages.BAD_VALUE
@@ -111,12 +111,12 @@ class Gates:
             gate.edition = values[2]
             bus.take(stored)
             if not keyed:
-                gate.replay.epoch = -1  # anybody may have set it
+                gate.replay.epoch = -1  # anyone may have set it
         return result
 
 
 def stored(field: Field, row: int, number: int) -> bytes:
-    """Return the answer to QUERY_STORED for an item's number; b"" for a secret or unknown one."""
+    """Return the reply to QUERY_STORED for an item number; b"" if the item is secret or unknown."""
     if not 0 < number <= len(journal.ITEMS):
         return b""
     name = journal.ITEMS[number - 1][0]

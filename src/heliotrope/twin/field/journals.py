@@ -31,7 +31,7 @@ class Journals:
     believed
         Mechanisms stored at first, (N,).
     machine
-        Limits and resting places: one for all, or one for each.
+        Limits and rest positions: one for all heliostats, or one per heliostat.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Journals:
         )
         self.standby = np.full((count, 3), np.nan)
         for table, rows in self.machines():
-            # The limits of the motors are stops: a pose beyond them is no pose.
+            # The motor limits act as stops, so a pose beyond them is impossible.
             for i, axis in enumerate(table.axes):
                 own = self._drives[rows, i]
                 self._drives[rows, i, slot.MIN_COUNT] = np.maximum(own[:, slot.MIN_COUNT], axis.low)
@@ -77,12 +77,12 @@ class Journals:
 
     @property
     def corners(self) -> list[Corners]:
-        """Points of the safe paths that the plant file gives the N heliostats, ENU, m."""
+        """Points of the safe paths that the plant file specifies for the N heliostats, ENU, m."""
         return [table.way for table in self._machines]
 
     @property
     def origin(self) -> FloatArray:
-        """Points that beams start from, ENU, m, (N, 3)."""
+        """Points at which beams start, ENU, m, (N, 3)."""
         return Armature(self.armatures).origin_1
 
     @property
@@ -108,7 +108,7 @@ class Journals:
         aims
             ENU, m, (M, 3).
         counts
-            Present step counts, (M, 2): the pose that moves least is chosen.
+            Present step counts, (M, 2): the pose that needs the least motion is chosen.
         """
         solution = track(
             Armature(self.armatures[rows]),

@@ -10,19 +10,20 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, STOW
 from heliotrope.twin.invariants.ledger import Sent
 
-#: Steps that a timer may be given ahead of its rate, s.
+#: Time by which the steps handed to a timer may run ahead of its rate, s.
 AHEAD = 0.2
-#: Steps are made in slots of this length, s, in each of which the speed changes by one step more
-#: than the acceleration allows at most, since steps are whole; a longer pause is a stop, s.
+#: Steps are made in slots of this length, s. In each slot the speed may change by one step more
+#: than the acceleration allows, because steps are whole. A longer pause than the second number is a
+#: stop, s.
 SLOT, PAUSE = 0.05, 0.5
-#: The sun is sent every second; a heliostat counts as served for this long after, s.
+#: The sun vector is sent every second; a heliostat counts as served for this long afterwards, s.
 SERVED = 2.0
-#: Braking takes half a second at most; after this only the axis whose turn it is may move, s.
+#: Braking takes at most half a second; after this time only the axis that is due may move, s.
 BRAKING = 1.0
-#: Why a heliostat must leave that its cluster's file does not name: it still hears SUN and stays
-#: DEFOCUSED.
+#: Reason why a heliostat that its cluster's file does not name must leave: it still receives SUN
+#: and stays DEFOCUSED.
 UNLISTED = "it is missing in the cluster's file"
-#: True position of a mirror at stow, to within this many steps.
+#: Tolerance of the true stow position, steps.
 NEAR_STOW = 5000
 
 
@@ -37,8 +38,9 @@ def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
         Whether to include the gate's count of frames, which forged frames and frames replayed from
         before a restart of the cluster may use up.
     clock
-        Whether to include clock and gate. A board that has heard no later frame of the same epoch
-        may take an old time: it voids commands, ends the lease early, and moves nothing.
+        Whether to include clock and gate. A board that has received no later frame of the same
+        epoch may accept an old time, which voids commands and ends the lease early but moves
+        nothing.
     """
     node = board.node
     assert node is not None
@@ -63,7 +65,7 @@ def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
 
 
 def steps_from_stow(board: Board) -> int:
-    """Return how far the axes of a board stand from stow in truth, steps of the farther one."""
+    """Return the true distance of a board's axes from stow, steps of the farther axis."""
     return max(abs(axis.turned - stow) for axis, stow in zip(board.axes, STOW, strict=True))
 
 
@@ -75,34 +77,35 @@ class HeliostatAccount:
     state
         State last seen; -1 without power.
     sun_at
-        When the cluster sent the newest sun that the heliostat has received, s.
+        When the cluster sent the newest sun vector that the heliostat has received, s.
     taken
-        Index of the last frame received whole, except questions and safe orders.
+        Index of the last frame received whole, except queries and safe orders.
     in_hand, how, forged, quiet, before, good
         The frame being received: the cluster's frame, how it arrived, the forged frame, the
         invariant that forbids it any change, the fingerprint before, frames counted as good
         before.
     statuses
-        Times (s) and values of the last STATUS answers that the cluster received.
+        Times (s) and values of the last STATUS replies that the cluster received.
     from_stow
         Whether it has left stow and has not tracked since.
     stows
-        Stow positions that it was ever given, steps.
+        All stow positions that it has ever been sent, steps.
     by_way
-        Whether it has come to its standby point since it was last at stow or without power.
+        Whether it has reached its standby point since it was last at stow or without power.
     booted_at, boots, cuts
-        When it last booted, s; how often it has booted and lost its supply since the start.
+        When it last booted, s; how often it has booted and lost power since the start.
     stepped_at
-        When its timers were last given steps, s.
+        When its timers last received steps, s.
     ticks_jumped, misled
-        Whether its counter has jumped since it booted; whether it has heard a stranger's frame.
+        Whether its counter has jumped since it booted; whether it has received a stranger's frame.
     unsure
-        Whether a board of another mirror is or was there, or a drive has stalled: its motors may
-        stand elsewhere than counted.
+        Whether another heliostat's board is or was there, or a drive has stalled, so that its
+        motors may stand elsewhere than counted.
     written, unlisted_at
-        Name that it has in its cluster's file; since when it is missing there, s, None: it is not.
+        Its name in its cluster's file; since when the name has been missing there, s, None: it is
+        present.
     foot
-        Nearest that its beam came to the foot of the way in this approach, m; 0 if that is unknown.
+        Closest approach of its beam to the foot of the safe path in this approach, m; 0 if unknown.
     """
 
     def __init__(self, board: Board, now: float) -> None:
@@ -156,18 +159,18 @@ class HeliostatAccount:
         under_way = (states.APPROACHING, states.TRACKING, states.SEARCHING, states.LOCKED)
         by_itself = state == states.IDLE and self.state == states.APPROACHING
         if state in under_way or (state == states.IDLE and not by_itself):
-            # A later command has replaced the order.
+            # A later command has replaced this order.
             self._ordered.clear()
         self.state = state
         self._history.append((now, state))
 
     @property
     def changed_at(self) -> float:
-        """When it entered its state, or booted, s."""
+        """Time at which it entered its state or booted, s."""
         return self._history[-1][0]
 
     def was_in(self, choice: tuple[int, ...], since: float) -> bool:
-        """Whether the heliostat was in one of some states at any time since."""
+        """Whether the heliostat was in one of the given states at any time since."""
         begun = [state for at, state in self._history if at <= since][-1:]
         later = [state for at, state in self._history if at > since]
         return any(state in choice for state in begun + later)
@@ -189,7 +192,7 @@ class HeliostatAccount:
         self._history.append((now, -1))
 
     def booted(self, now: float) -> None:
-        """Note a boot: its times start again, and no earlier frame counts."""
+        """Note a boot: its times restart, and earlier frames no longer count."""
         self.state = self.board.state
         self.booted_at, self.boots = now, self.boots + 1
         self.ticks_jumped = self.misled = False
@@ -206,7 +209,8 @@ class HeliostatAccount:
     def keep(self) -> bool:
         """Note the contents of the journal; return whether they have changed.
 
-        Comparing references is enough: a store makes a new dictionary and leaves the old one alone.
+        Comparing references is enough, because each store creates a new dictionary and leaves the
+        old one unchanged.
         """
         node = self.board.node
         assert node is not None
@@ -229,23 +233,23 @@ class HeliostatAccount:
     # -- steps -----------------------------------------------------------------------------
 
     def place(self) -> tuple[int, int]:
-        """Return the step counts, as handed to the timers."""
+        """Return the step counts that were handed to the timers."""
         azimuth, elevation = (
             a.emitted - s for a, s in zip(self.board.axes, self.board.slip, strict=True)
         )
         return azimuth, elevation
 
     def stow(self) -> tuple[int, int]:
-        """Return the stow position that its journal holds, steps."""
+        """Return the stow position in its journal, steps."""
         azimuth, elevation = unpack("<ii", self._items["stow"])
         return azimuth, elevation
 
     def stands_at_stow(self) -> bool:
-        """Whether its axes stand at the stow position in truth, not only by its counts."""
+        """Whether its axes truly stand at the stow position, and not only by its counts."""
         return steps_from_stow(self.board) <= NEAR_STOW
 
     def rate(self, axis: int, count: int, now: float) -> str:
-        """Take steps handed to a timer now; return the fault of their rate, if any."""
+        """Note steps handed to a timer now; return an error in their rate, if any."""
         self.stepped_at = now
         limit = float(LIMITS[0])
         drained = limit * (now - self._filled_at[axis])
@@ -256,7 +260,7 @@ class HeliostatAccount:
         return f"axis {axis} is {level:.0f} steps ahead of {limit:.0f} steps/s"
 
     def ramp(self, axis: int, steps: int, now: float) -> str:
-        """Take the signed steps of a slot; return the fault of their acceleration, if any."""
+        """Note the signed steps of a slot; return an error in their acceleration, if any."""
         most = LIMITS[1] * SLOT * SLOT + 2.0
         begin = max(now, self._slot_ends[axis])
         before = self._slot_steps[axis]
@@ -271,7 +275,7 @@ class HeliostatAccount:
         return "" if self.ticks_jumped else error
 
     def order(self, axis: int) -> str | None:
-        """Take a segment; return an error in the order of the axes, "", or None if any will do."""
+        """Note a segment; return an error in the axis order, "", or None if any order will do."""
         board = self.board
         if self._stowing_since is not None and board.now - self._stowing_since > BRAKING:
             if axis == 1:
@@ -295,7 +299,7 @@ class HeliostatAccount:
         return ""
 
     def jumped(self) -> None:
-        """Note a jump of the counter: the board may take pending steps for done."""
+        """Note a counter jump, after which the board may take pending steps for completed ones."""
         self._leg, self.foot = 0, 0.0
         self.ticks_jumped = True
 
@@ -307,7 +311,7 @@ class HeliostatAccount:
             self._served_at = now
 
     def crosses(self, on: bool, now: float) -> float:
-        """Note whether the beam is on the receiver; return for how long it has been, s."""
+        """Note whether the beam is on the receiver; return for how long it has been there, s."""
         if not on:
             self._on_since = None
             return 0.0
@@ -316,7 +320,7 @@ class HeliostatAccount:
         return now - self._on_since
 
     def stays(self, on: bool, now: float) -> float:
-        """Note where the beam of a mirror that is DEFOCUSED is; return for how long it is on, s."""
+        """Note where a DEFOCUSED heliostat's beam is; return for how long it has been on, s."""
         if not on:
             self._stays_since = None
             return 0.0
@@ -330,11 +334,11 @@ class HeliostatAccount:
             self._ordered.setdefault(name, now)
 
     def forget(self) -> None:
-        """Forget the orders: the cluster that had to carry them out is gone."""
+        """Forget the orders, because the cluster that had to carry them out is gone."""
         self._ordered.clear()
 
     def deadlines(self, now: float) -> list[tuple[str, float]]:
-        """Return the causes for which it has to leave, each with its time, s."""
+        """Return the reasons why it has to leave, each with its time, s."""
         causes = list(self._ordered.items())
         if now - self._served_at > SERVED:
             causes.append(("it was cut off", self._served_at))
@@ -343,5 +347,5 @@ class HeliostatAccount:
         return causes
 
     def must_stow(self, why: str) -> bool:
-        """Whether the cause requires stow, not only defocus."""
+        """Whether the reason requires stow, not only defocus."""
         return why not in ("DEFOCUS", UNLISTED)

@@ -26,8 +26,8 @@ from heliotrope.safety import Act, Alarm
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.invariants.invariants import L2, Judge
 
-#: Alarms that only faults cause, and within what time they end once nothing has failed near the
-#: subject, s; inf: a person ends them, or another run of a program does.
+#: Alarms that only faults cause, and the time within which they clear once nothing near the subject
+#: is faulty, s; inf: an operator or another run of a program clears them.
 BY_FAULTS = {
     "bus_errors": 60.0, "bus_failed": 60.0, "clock_jump": inf, "cluster_silent": 20.0,
     "cluster_site_differs": 30.0, "cluster_time_differs": 30.0, "database_unwritable": 60.0,
@@ -35,7 +35,7 @@ BY_FAULTS = {
     "node_silent": 15.0, "order_unacknowledged": 15.0, "plant_link_lost": 20.0, "second_plant": inf,
     "sun_jumped": 75.0, "time_source": 30.0, "time_source_lost": 30.0, "two_plants": 90.0,
 }  # fmt: skip
-#: Alarms that persons, weather, wrong parameters and automatic control cause.
+#: Alarms that operators, weather, wrong parameters and automatic control cause.
 BY_OTHERS = frozenset({
     "authority_lost", "firmware_differs", "heliostat_unlisted", "not_parked", "sun_contradicted",
     "unwitnessed", "beam_blocked", "beam_disproved", "beam_unsent", "counts_doubtful",
@@ -46,33 +46,35 @@ BY_OTHERS = frozenset({
     "wind_gust_stow",
     "wind_mean_defocus", "wind_mean_stow",
 })  # fmt: skip
-#: Alarms of mirrors that point elsewhere, and the worlds in which they come without a fault.
+#: Alarms about heliostats that point elsewhere, and the worlds in which they occur without a fault.
 MISLED = {
     "identity": frozenset({"addresses", "parameters", "calibrations", "repairs"}),
     "pointing_disagrees": frozenset({
         "clock", "site", "calibrations", "repairs", "visits", "day", "lights", "parties", "days",
     }),
 }  # fmt: skip
-#: Alarms that say that mirrors did what nobody ordered, or not what was: their only cause is
-#: a fault that has ended no longer ago than this, s. A new program goes on with earlier ones.
+#: Alarms that report that heliostats did what nobody ordered, or did not do what was ordered. Their
+#: only cause is a fault that ended no longer ago than this, s. A new program continues earlier
+#: alarms.
 UNORDERED = {
     "counts_doubtful": 60.0, "flux_after_emergency": 90.0, "nodes_unacknowledged": 90.0,
     "resume_needed": 60.0,
 }  # fmt: skip
-#: The alarm of which the only cause is that a person has called an emergency.
+#: The alarm whose only cause is an emergency that an operator has called.
 CALLED = "operator_emergency"
 RECALLED_WITHIN = 5.0
-#: The alarm that the records cannot be written.
+#: The alarm which says that records cannot be written.
 UNWRITTEN = "database_unwritable"
-#: An alarm comes this long after the end of its cause at most, s.
+#: An alarm is raised at most this long after its cause has ended, s.
 RAISED_WITHIN = 30.0
-#: A board without power is named after this: silence for 10 s, asked each fifth second, and the way
-#: to the plant. A fault, and a cluster that is not heard, are named after these. s.
+#: Deadlines for naming, s. A board without power: silence for 10 s, a poll every 5 s, and the
+#: transfer to the plant. The other two: a board in FAULT, and a cluster from which nothing is
+#: received.
 SILENT_WITHIN, FAULT_WITHIN, UNHEARD_WITHIN = 18.0, 10.0, 8.0
-#: A heliostat that no cluster's file names is named after this, and a wrong time that plant and
-#: clusters share after that, s: a cluster says its names with its first status.
+#: Deadlines for naming a heliostat that no cluster's file contains, and a wrong time that plant and
+#: clusters share, s. A cluster reports its names with its first status.
 UNLISTED_WITHIN, CONTRADICTED_WITHIN = 10.0, 10.0
-#: What no text for a person holds.
+#: Strings that no text for an operator may contain.
 _NONSENSE = re.compile(r"[{}]|\bnan\b|\bNone\b|\binf\b|<[a-z_.]+ ")
 
 
@@ -82,12 +84,12 @@ class AlarmObserver(Judge):
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
-        Boards by name of the cluster.
+        Boards by cluster name.
     worlds
-        Worlds of the run. Where a second plant runs at times, its alarms are told here too, and it
-        takes lines.
+        Worlds of the run. If a second plant runs at times, its alarms are reported here too, and it
+        takes over lines.
 
     """
 
@@ -102,7 +104,7 @@ class AlarmObserver(Judge):
         self._boards = {board.outfit.name: board for some in boards.values() for board in some}
         self._clusters = {name: [b.outfit.name for b in some] for name, some in boards.items()}
         self._active: dict[tuple[str, str], float] = {}
-        self._new: list[tuple[Alarm, bool]] = []  # and whether an emergency was called by then
+        self._new: list[tuple[Alarm, bool]] = []  # and whether an emergency had been called by then
         self._last: dict[tuple[str, str], Alarm] = {}
         self._heard = dict.fromkeys(boards, start)
         self._runs_since = inf
@@ -114,10 +116,10 @@ class AlarmObserver(Judge):
         self._called = False
 
     def on_alarm(self, alarm: Alarm, now: float) -> None:
-        """Note an alarm of the plant; it is judged at the next look.
+        """Note an alarm of the plant; it is judged at the next check.
 
-        The same one may come twice: from the controller, and from the logbook, which has those of
-        automatic control too.
+        The same alarm may arrive twice: from the controller, and from the logbook, which also
+        contains the alarms of automatic control.
         """
         key = alarm.condition, alarm.subject
         if self._last.get(key) == alarm:
@@ -131,21 +133,21 @@ class AlarmObserver(Judge):
             self._called &= alarm.condition != CALLED
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note that a person has called an emergency."""
+        """Note that an operator has called an emergency."""
         del owner, act, now
         self._called = True
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended, and its alarms with it."""
+        """Note that the plant program, and with it its alarms, has ended."""
         del now
         self._active.clear()
         self._last.clear()
         self._new.clear()
         self._began_at = inf
-        self._runs_since = inf  # it may begin again before the next look
+        self._runs_since = inf  # it may start again before the next check
 
     def on_heard(self, cluster: str, now: float) -> None:
-        """Note a status that has reached the plant."""
+        """Note a status that the plant has received."""
         self._heard[cluster] = now
 
     def look(
@@ -169,9 +171,10 @@ class AlarmObserver(Judge):
         now
             s.
         runs
-            Whether the plant's program runs.
+            Whether the plant program is running.
         writes
-            Whether the disk of its records writes in time: works of a slow one end one by one.
+            Whether the disk of its records writes in time; a slow disk completes its writes one by
+            one.
         files
             What is wrong in the clusters' files; see `Pod.file`.
         """
@@ -206,7 +209,7 @@ class AlarmObserver(Judge):
                 self._named(name, max(self._well[cluster], self._runs_since), now, files)
 
     def contradicted(self, now: float, *, runs: bool) -> None:
-        """Check that a time which is wrong in plant and clusters alike is named."""
+        """Check that an alarm names a time that is wrong in both the plant and the clusters."""
         self._runs_since = min(self._runs_since, now) if runs else inf
         named = any(kind == "sun_contradicted" for kind, _ in self._active)
         passed = now - self._runs_since
@@ -216,7 +219,7 @@ class AlarmObserver(Judge):
     def _caused(
         self, alarm: Alarm, rests: Mapping[str, float], now: float, *, called: bool
     ) -> None:
-        """Check that an alarm can have a cause, names something, and is readable."""
+        """Check that an alarm has a possible cause, names a subject, and is readable."""
         kind, subject = alarm.condition, alarm.subject
         saw = f"{kind} is raised: {alarm.text}"
         known = kind in BY_FAULTS or kind in BY_OTHERS
@@ -245,7 +248,7 @@ class AlarmObserver(Judge):
         self.check(16, named or silent <= UNHEARD_WITHIN, now, cluster, saw)
 
     def _named(self, name: str, well: float, now: float, files: Mapping[str, str]) -> None:
-        """Check that a board without power, one in FAULT, and one without a row are named."""
+        """Check that alarms name boards without power, in FAULT, or missing from the file."""
         state, heard = self._boards[name].state, name not in files
         for since, holds, alarm, within, what in (
             (self._off, heard and state < 0, "node_silent", SILENT_WITHIN, "without power"),

@@ -1,4 +1,4 @@
-"""The observer of replies: what boards report of themselves, and clusters of boards, is true.
+"""The observer of replies: checks what boards report and what clusters report about boards.
 
 A board replies to queries at one instant of virtual time, so its reply is compared with the true
 board at that instant: where its motors are and whether they turn, how long ago it booted and when
@@ -24,41 +24,43 @@ from heliotrope.twin.invariants.invariants import Judge
 #: Bits of the flags in STATUS.
 _MOVING, _SUN_FRESH, _CLOCK_SET, _CONFIGURED, _READY, _AT_STOW = (1 << i for i in range(6))
 _DOUBTFUL, _UNKNOWN = 1 << 8, 1 << 9
-#: Bits that nothing in the simulation can set: a fault that is present, the switch at the mirror,
-#: a key of the bus.
+#: Bits that nothing in the simulation can set: a present fault, the switch at the heliostat, a bus
+#: key.
 _NEVER_SET = 1 << 14 | 1 << 17 | 1 << 18
-#: Motors that were given steps this recently turn, and those that were not for this long rest, s.
+#: Motors that received steps within the first time are turning; those that received none for the
+#: second are at rest, s.
 TURNS, RESTS = 0.02, 1.0
-#: The lease of a sun, with what the clocks may differ by, s.
+#: The lease of a sun vector, including the allowed clock difference, s.
 FRESH, OLD = 5.0, 6.3
-#: Largest error of the time since the boot, s, and of the age of a sun, s, which counts from its
-#: second.
+#: Largest error of the time since boot, s, and of the age of a sun vector, s, which counts from its
+#: whole second.
 UPTIME_NEAR, AGE_NEAR = 1.3, 0.5
-#: An answer is on its way for this long at most, s.
+#: Maximum transit time of a reply, s.
 BEGUN = 0.1
-#: A status is this old at most as it arrives, s: it waits for a connection and is in transit.
+#: Maximum age of a status on arrival, s: its wait for a connection plus the transit.
 UNDER_WAY = 2.3
-#: Leases come every second and last for three: what is left of the last one, s.
+#: Leases arrive every second and last for three: remaining time of the last one, s.
 LEASE_LEAST, LEASE_MOST = 0.3, 3.1
-#: The cluster's time is this late and this early at most, as a status arrives on a line that
-#: carries, s; the longest second of work, s.
+#: How late and how early the cluster's time may be when a status arrives on a working line, s; the
+#: longest second of work, s.
 LATE, EARLY, CYCLE_MOST = 1.0, 0.3, 1.5
 
 
 @dataclass
 class _Board:
-    """One board: its account, and its answers.
+    """One board: its account and its replies.
 
     Attributes
     ----------
     account
         Its account.
     moves_since, off_since
-        Since when it has said that it moves, and that its goals are not where it is, s.
+        Since when it has reported that it is moving, and that its goals differ from its position,
+        s.
     told_at, goals
-        When it last told its flags, s; the goals that it last told.
+        When it last reported its flags, s; the goals that it last reported.
     boots, booted
-        Boots that it last told, and those and cuts of the account by then.
+        The boot count that it last reported, and the account's boots and power cuts by then.
     steps
         Times (s) and values of the STEPS that the cluster received.
     """
@@ -74,7 +76,7 @@ class _Board:
 
 
 class AnswerObserver(Judge):
-    """Observes the answers on one bus, and the statuses of its cluster.
+    """Observes the replies on one bus and the statuses of its cluster.
 
     Parameters
     ----------
@@ -83,12 +85,12 @@ class AnswerObserver(Judge):
     accounts
         Accounts of its heliostats.
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
 
     Attributes
     ----------
     quiet
-        Returns the heliostats in a quiet stretch; see `QuietObserver`.
+        Returns the heliostats in an undisturbed period; see `QuietObserver`.
     utc
         Returns the true POSIX time, s.
     """
@@ -103,7 +105,7 @@ class AnswerObserver(Judge):
         self._later: list[tuple[bool, str, str]] = []
 
     def _calmly(self, good: bool, subject: str, saw: str) -> None:
-        """Check what need not hold if something has just failed: at the next look, which knows."""
+        """Check at the next look, which knows of failures, what need not hold after a failure."""
         if subject == self._cluster:
             calm = all(board.account.name in self.quiet() for board in self._boards.values())
         else:
@@ -112,7 +114,7 @@ class AnswerObserver(Judge):
             self._later.append((good, subject, saw))
 
     def look(self, now: float) -> None:
-        """Judge the answers since the last check, where nothing has failed meanwhile."""
+        """Judge the replies since the last check if nothing has failed since then."""
         later, self._later = self._later, []
         calm = self.quiet()
         whole = all(board.account.name in calm for board in self._boards.values())
@@ -123,14 +125,14 @@ class AnswerObserver(Judge):
     # -- the bus ---------------------------------------------------------------------------
 
     def heard(self, how: str, now: float) -> None:
-        """Note how bytes are about to reach a board: a late frame may follow an answer."""
+        """Note how bytes are about to reach a board, because a late frame may follow a reply."""
         if how != "whole":
             self._late_at = now
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Judge an answer as it leaves its board; only a whole one is of this instant."""
+        """Judge a reply as it leaves its board; only a complete reply describes this instant."""
         frames = wire.Reader().feed(data)
-        # If a late answer came first, only the last frame is current.
+        # If a late reply came first, only the last frame is current.
         for frame in frames[-1:] if how == "late" else frames:
             board = self._boards.get(frame.sender)
             values = frame.values()
@@ -171,7 +173,7 @@ class AnswerObserver(Judge):
             if flags & _SUN_FRESH:
                 age = now - account.sun_at
                 saw = f"{prefix}a sun of {age_ms} ms, and it left {age:.2f} s ago"
-                # An answer may have begun before the sun that has only just come.
+                # A reply may have begun before the latest sun vector arrived.
                 near = age < BEGUN or abs(age_ms / 1000.0 - age) <= AGE_NEAR
                 self._calmly(near, name, saw)
         if not flags & _SUN_FRESH:
@@ -184,7 +186,7 @@ class AnswerObserver(Judge):
         if before is not None:
             least, most = account.boots - boots_then, account.cuts - cuts_then
             saw = f"{boots} boots, after {before}; it has booted {least} times since"
-            # A boot that the supply cuts short may have been counted.
+            # A boot that a power cut interrupted may have been counted.
             good = account.unsure or least <= boots - before <= most
             self.check(11, good, now, account.name, saw)
 
@@ -198,8 +200,8 @@ class AnswerObserver(Judge):
         check(not flags & _NEVER_SET, "a fault, a switch or a key that it does not have")
         turns = now - account.stepped_at < TURNS
         check(bool(flags & _MOVING) or not turns, "it does not move, and its motors turn")
-        # A motion that has just begun makes its first step in a moment. Between two answers that
-        # are far apart one may have ended, and another begun.
+        # A motion that has just begun is about to make its first step. Between two replies that are
+        # far apart, one motion may have ended and another begun.
         lapsed, board.told_at = now - board.told_at > RESTS, now
         before = inf if lapsed else board.moves_since
         board.moves_since = min(before, now) if flags & _MOVING else inf
@@ -209,7 +211,8 @@ class AnswerObserver(Judge):
         age = now - account.sun_at
         saw = f"the sun left {age:.1f} s ago"
         check(not flags & _SUN_FRESH or age <= OLD, f"fresh, and {saw}")
-        # A stranger's frame can use up the counts of a bus without keys, that of SUN too.
+        # On a bus without keys, a stranger's frame can use up the frame counts, including that of
+        # SUN.
         fresh = bool(flags & _SUN_FRESH) or account.ticks_jumped or account.misled
         self._calmly(
             bool(fresh) or age < BEGUN or age >= FRESH,
@@ -245,7 +248,7 @@ class AnswerObserver(Judge):
         inside = all(low <= goal <= high for goal, (low, high) in zip(goals, RANGES, strict=True))
         self.check(11, inside, now, account.name, f"STEPS says goals {goals} beyond its range")
         held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and goals != place
-        # A boot ends the motion; what has the same goals afterwards is another one.
+        # A boot ends the motion; a later motion with the same goals is a new one.
         goes_on = goals == board.goals and board.off_since > account.booted_at
         before = board.off_since if goes_on else inf
         board.goals, board.off_since = goals, min(before, now) if held else inf
@@ -256,7 +259,7 @@ class AnswerObserver(Judge):
     # -- the line --------------------------------------------------------------------------
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
-        """Judge a status of the cluster as it reaches the plant."""
+        """Judge a cluster status as it reaches the plant."""
         by_name = {known.account.name: known for known in self._boards.values()}
         for name, row in zip(names, status.nodes(), strict=True):
             board = by_name.get(name)
@@ -279,7 +282,7 @@ class AnswerObserver(Judge):
         self._numbers(status)
 
     def _numbers(self, message: ClusterStatus) -> None:
-        """Judge the numbers of a cluster near which nothing has failed."""
+        """Judge the numbers of a cluster if nothing near it has failed."""
         remaining = message.lease_left
         saw = f"{remaining:.2f} s are left of the plant's lease"
         self._calmly(LEASE_LEAST <= remaining <= LEASE_MOST, self._cluster, saw)
@@ -294,5 +297,5 @@ class AnswerObserver(Judge):
         self._calmly(0.0 <= message.time_error_s < 1.0, self._cluster, saw)
 
 
-#: Columns of a row that STEPS fills.
+#: Columns of a record that STEPS fills.
 _STEPS = ("primary", "secondary", "primary_goal", "secondary_goal")

@@ -30,79 +30,80 @@ from heliotrope.twin.invariants.invariants import OFF, Judge
 
 Point = tuple[float, ...]
 
-#: A beam this far from where it was sent is astray, m: play of the gears, rough steps, pushed
-#: biases and drifting clocks stay below it at 130 m.
+#: A beam this far from its commanded point is astray, m. Backlash, coarse steps, pushed biases and
+#: drifting clocks stay below this distance at 130 m.
 ASTRAY = 1.5
-#: Time for a mirror to get where it was sent after an order or a change of state, s.
+#: Time that a heliostat has to reach its commanded position after an order or a change of state, s.
 SETTLE = 10.0
-#: An astray beam is named by an alarm, and is off, within these times, s, beyond the time that the
+#: An alarm names an astray beam, and the beam is off, within these times, s, plus the time that the
 #: drives need to bring it to its point; see `slew`.
 NAMED_WITHIN, OFF_WITHIN = 10.0, 30.0
-#: A mirror that is done is off the receiver or at stow this long after the proof, s.
+#: A heliostat that is done is off the receiver or at stow this long after the confirmation, s.
 DONE_WITHIN = 5.0
-#: Mirrors that leave within this time leave together, s; orders this old explain it.
+#: Heliostats that leave within this time leave together, s; orders no older than this explain it.
 TOGETHER = 10.0
-#: Longest time from sending an order to join to its execution, s: its life, and late on the bus.
+#: Longest time from sending an order to join to its execution, s: its lifetime plus delay on the
+#: bus.
 UNDER_WAY = 5.0
 #: A status waits up to a second, and may be in transit for another, s.
 TOLD_WITHIN = 2.2
-#: Losses that automatic control must count together, s: of its 30 s less what it may be late by.
+#: Period within which automatic control must count losses together, s: its 30 s less its delay.
 LOST_TOGETHER = 15.0
-#: After this many reports in which a board was heard, automatic control knows of its state.
+#: After this many reports that include a board, automatic control knows its state.
 REPORTS = 5
-#: A board was heard for a report if its answer is no older than this, s.
+#: A report includes a board if its reply is no older than this, s.
 _HEARD = 1.5
-#: Half angle of the largest search of the simulated persons, rad.
+#: Half angle of the simulated operators' largest search, rad.
 _SEARCH = 8e-3
-#: Error of the beams of which the plant file is wrong, until they are calibrated, rad: twice that
-#: of their mirrors.
+#: Beam error of heliostats about which the plant file is wrong, until they are calibrated, rad:
+#: twice that of their normals.
 UNSURVEYED = 45e-3
-#: This many heliostats do not all turn away by the same angles.
+#: From this number on, heliostats must not all turn away by the same angles.
 _MANY = 3
 #: States in which a beam is sent to a point.
 _LIT = {states.TRACKING: "aims", states.SEARCHING: "aims", states.IDLE: "standbys"}
 _ON = (states.TRACKING, states.SEARCHING)
-#: States from which automatic control may lose a mirror.
+#: States from which automatic control may lose a heliostat.
 _UP = (states.APPROACHING, states.IDLE, *_ON)
-#: States in which a mirror stands where a person has left it.
+#: States in which a heliostat stands where an operator has left it.
 _HELD = (states.LOCKED, states.UNCONFIGURED)
-#: Commands that leave an idle mirror elsewhere than at its standby point.
+#: Commands that leave an idle heliostat away from its standby point.
 _ELSEWHERE = ("JOG", "GOTO", "DIAGNOSE", "UNLOCK", "CLEAR_FAULT", "LOCK", "ZERO")
-#: Commands that take a mirror off the receiver, and that resume.
+#: Commands that take a heliostat off the receiver, and commands that resume.
 _TAKES_OFF = ("IDLE", "LOCK")
 _RESUMES = ("TRACK", "REFOCUS", "SEARCH")
-#: Commands that send a beam to a point, and states from which IDLE needs one.
+#: Commands that send a beam to a point, and states from which IDLE needs such a point.
 _CALLS = ("APPROACH", "IDLE", *_RESUMES)
 _AWAY = (states.STOWED, states.DEFOCUSED)
 
 
 @dataclass
 class _Mirror:
-    """One mirror as the observer knows it.
+    """One heliostat as the observer knows it.
 
     Attributes
     ----------
     aims, standbys
         Identities of orders and points: the last point that was reported as done, and all later.
     state, node, settled_at
-        State and program last seen; when it must be where it was sent, s.
+        State and program last seen; when it must have reached its commanded position, s.
     elsewhere, approached
-        Whether its last motion led to step counts, not to its standby point; whether it has come to
-        its standby point by the way from stow since it last had power or was at stow.
+        Whether its last motion led to step counts, not to its standby point; whether it has reached
+        its standby point along the path from stow since it was last without power or at stow.
     astray_since, lit_since, inside_since
-        Since when its beam is beside its place, on the receiver without an order, or inside a
+        Since when its beam has been off its position, on the receiver without an order, or inside a
         volume, s.
     due_at
-        When the drives can have brought its stray beam to its place, s.
+        Earliest time at which the drives can have brought its stray beam to its position, s.
     named_at
         When an alarm last named it, s.
     ordered_at, off_at, resumed_at
-        When the plant last sent it an order, and one that takes it off the receiver; when a person
-        last sent it there, s.
+        When the plant last sent it an order, and one that takes it off the receiver; when an
+        operator last sent it there, s.
     lost_at
         When it last left TRACKING or SEARCHING without an order, s.
     assigned, assigned_at
-        Whether a person has given it to automatic control, and since when, s.
+        Whether an operator has put it under automatic control, and since when, s.
     up, changed_at, reports, seen_up
         Whether it is up, since when, s, and how often that was reported; whether automatic control
         has seen it up since the plant last took it off.
@@ -152,11 +153,11 @@ class _Mirror:
 
 
 def slew(board: Board, sun: FloatArray, point: Point) -> float:
-    """Return how long the drives need at least to bring a beam to a point, s; 0 if none can.
+    """Return the least time that the drives need to bring a beam to a point, s; 0 if they cannot.
 
-    Near the zenith, in the keyhole, a small way of the beam is half a turn of the azimuth, and more
-    where a stop forbids the short sense. Of the two poses that reach the point, the one counts that
-    the true mirror comes to soonest; at the least rate that the boards are given, with its ramp.
+    Near the zenith, in the keyhole, a small beam movement takes half a turn of the azimuth, or more
+    if a stop blocks the shorter direction. Two poses reach the point; the true heliostat's faster
+    one counts, at the lowest rate of the boards, with its ramp.
     """
     mechanism, (rate, acceleration, _) = board.outfit.mechanism, LIMITS
     low, high = np.transpose(RANGES)
@@ -173,7 +174,7 @@ def _since(holds: bool, before: float | None, now: float) -> float | None:
 
 
 class BeamObserver(Judge):
-    """Observes beams, alarms and proofs.
+    """Observes beams, alarms and confirmations.
 
     Parameters
     ----------
@@ -257,8 +258,8 @@ class BeamObserver(Judge):
         for heliostat in heliostats or self._mirrors:
             mirror = self._mirrors[heliostat]
             mirror.ordered_at = mirror.off_at = now
-            mirror.seen_up &= not mirror.up  # what is up leaves by this order, and is not lost
-            if mirror.state == states.LOCKED:  # it has left when it is unlocked, unless it is IDLE
+            mirror.seen_up &= not mirror.up  # it leaves because of this order, so it is not lost
+            if mirror.state == states.LOCKED:  # it has left once unlocked, unless IDLE
                 mirror.reports = 0
 
     def on_accepted(
@@ -304,7 +305,7 @@ class BeamObserver(Judge):
         self._released_at = now
         for mirror in self._mirrors.values():
             mirror.resumed_at = now
-            if mirror.board.state not in _UP:  # it has left since the last look: lost before
+            if mirror.board.state not in _UP:  # it left since the last check: lost before
                 mirror.seen_up = False
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
@@ -315,7 +316,7 @@ class BeamObserver(Judge):
         for name, row in zip(names, status.nodes(), strict=True):
             mirror, age = self._mirrors.get(name), 1e-3 * int(row["heard_ms"])
             if mirror is None:
-                continue  # the cluster's file names none like it
+                continue  # the cluster's file does not name it
             locked = mirror.state == states.LOCKED
             if not locked and age <= _HEARD and now - age >= mirror.changed_at:
                 mirror.reports += 1
@@ -323,7 +324,7 @@ class BeamObserver(Judge):
                     self._known(mirror, now)
 
     def _known(self, mirror: _Mirror, now: float) -> None:
-        """Note that automatic control knows by now that a mirror is up, or is not."""
+        """Note that automatic control knows by now whether a heliostat is up."""
         lost, mirror.seen_up = mirror.seen_up and not mirror.up, mirror.up
         at = mirror.changed_at
         lost = lost and mirror.assigned and at >= max(mirror.assigned_at, self._released_at)
@@ -338,7 +339,7 @@ class BeamObserver(Judge):
             self.losses += 1
 
     def on_progress(self, message: Progress, now: float) -> None:
-        """Drop the points before the one that is reported as done."""
+        """Drop the points before the point that is reported as done."""
         del now
         if message.stage is not Stage.DONE:
             return
@@ -362,7 +363,7 @@ class BeamObserver(Judge):
         self._exchanged.add(heliostat)
 
     def on_end(self, now: float) -> None:
-        """Note that the plant program has ended, and its alarms with it.
+        """Note that the plant program, and with it its alarms, has ended.
 
         The next program must name each heliostat with doubtful step counts again, within the usual
         time.
@@ -398,7 +399,7 @@ class BeamObserver(Judge):
         for mirror in self._mirrors.values():
             if mirror.cluster not in carried or named & {mirror.name, mirror.cluster}:
                 mirror.named_at = now
-            if mirror.node is not mirror.board.node:  # it was without power, however shortly
+            if mirror.node is not mirror.board.node:  # it was without power, however briefly
                 mirror.node, mirror.approached = mirror.board.node, False
             self._enters(mirror, mirror.board.state, now)
             on += mirror.state in _ON
@@ -416,19 +417,19 @@ class BeamObserver(Judge):
             self._loss(on, now)
         if plant is not None:
             beliefs = plant.beliefs
-            # Parameters that a person has set say nothing about the others.
+            # Parameters that an operator has set say nothing about the other heliostats.
             records = {name: beliefs.record(name) for name in self._unsurveyed}
             self._unsurveyed = {n for n, r in records.items() if r is None or not len(r.sightings)}
-            if plant.sentinel.on:  # automatic control has given up the field
+            if plant.sentinel.on:  # automatic control has released the field
                 self.taken(self._mirrors)
             self._proofs(plant, sun, now)
 
     def _stays_off(self, mirror: _Mirror, now: float) -> None:
-        """Check that neither a wrong sun nor another mirror's parameters bring a beam up."""
+        """Check that neither a wrong sun nor another heliostat's parameters bring a beam up."""
         node, own = mirror.node, mirror.board.outfit.items["armature"]
         foreign = node is not None and node.journal.items.get("armature") != own
         by = "a sun that is contradicted" if self.contradicted else "another mirror's parameters"
-        # On its way to a target it may show where the sun stands.
+        # On its way to a target, its beam may reveal the sun position.
         points = [point for _, point in mirror.aims] or [RECEIVER]
         joins = self.contradicted and any(math.dist(point, RECEIVER) <= OFF for point in points)
         good = mirror.state not in _ON or not (foreign or joins)
@@ -460,7 +461,7 @@ class BeamObserver(Judge):
                 self._departures.append((now, mirror.name))
 
     def _parted(self, mirror: _Mirror, now: float) -> None:
-        """Check that beams do not turn away together: they would make a hot spot elsewhere."""
+        """Check that beams do not all turn the same way, which would make a hot spot elsewhere."""
         aside = [m.node for m in self._mirrors.values() if m.board.state == states.DEFOCUSED]
         turns = [node.journal.items.get("defocus") for node in aside if node is not None]
         known = [turn for turn in turns if turn is not None]
@@ -468,7 +469,7 @@ class BeamObserver(Judge):
         self.check(13, len(known) < _MANY or len(set(known)) > 1, now, mirror.name, saw)
 
     def _returns(self, mirror: _Mirror, now: float) -> None:
-        """Check that a mirror returns to the receiver by a person's will, if one is needed."""
+        """Check that a heliostat returns to the receiver on an operator's order, if needed."""
         known = self._lost_at + TOLD_WITHIN if self._most is None else self._lost_known_at
         losses = [(self._lost_at, known, "the field")]
         if self._most is None:
@@ -478,18 +479,18 @@ class BeamObserver(Judge):
                 f"{states.STATES[mirror.state]} {now - lost_at:.1f} s after a loss of {whose}, "
                 "without a person's command since"
             )
-            # An order that left before the plant could know of the loss cannot be called back.
+            # An order that was sent before the plant could know of the loss cannot be recalled.
             unknowing = mirror.called_at <= known_at
             late = unknowing and now - mirror.called_at <= UNDER_WAY
             good = late or mirror.resumed_at >= lost_at
             self.check(14, good, now, mirror.name, saw)
 
     def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
-        """Check that a beam that was sent to a point is there, or named and off.
+        """Check that a beam that was sent to a point is there, or is named by an alarm and off.
 
-        A mirror at standby is off if its beam is neither on the receiver nor in a volume: no order
-        can bring one whose step counts are wrong to a better place, so its alarm is all that is
-        asked for, as long as it stands. Other alarms about standby have a better remedy.
+        A heliostat at standby is off if its beam is neither on the receiver nor in a volume. If its
+        step counts are wrong, no order can bring it to a better position, so only an active alarm
+        is required. Other alarms about standby have a better remedy.
         """
         sent = _LIT.get(mirror.state)
         if sent is None or (mirror.elsewhere_idle and not mirror.uncalled):
@@ -522,7 +523,7 @@ class BeamObserver(Judge):
         self.check(12, off or passed <= OFF_WITHIN, now, mirror.name, beside)
 
     def _doubted(self, mirror: _Mirror) -> bool:
-        """Whether an alarm names a mirror for its step counts."""
+        """Whether an alarm names a heliostat because of its step counts."""
         return self._alarms.get((alarms.COUNTS_DOUBTFUL.name, mirror.name), (0.0, False))[1]
 
     def _lights(self, mirror: _Mirror, sun: FloatArray) -> bool:
@@ -547,7 +548,7 @@ class BeamObserver(Judge):
             self.check(13, passed <= OFF_WITHIN, now, mirror.name, saw)
 
     def _loss(self, on: int, now: float) -> None:
-        """Note a loss that took every mirror, of at least two, off the receiver."""
+        """Note a loss that took every heliostat (at least two) off the receiver."""
         while self._departures and now - self._departures[0][0] > TOGETHER:
             self._departures.popleft()
         if on == 0 and len({name for _, name in self._departures}) >= 2:
@@ -556,7 +557,7 @@ class BeamObserver(Judge):
             self.losses += 1
 
     def _proofs(self, plant: PlantController, sun: FloatArray, now: float) -> None:
-        """Check that a mirror proven to be done is off the receiver, or at stow, in truth."""
+        """Check that a heliostat confirmed as done is truly off the receiver or at stow."""
         order = plant.sentinel.order
         if order is None:
             return
@@ -588,7 +589,7 @@ class BeamObserver(Judge):
             self.check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
 
     def _complete(self, order: EmergencyOrder, sun: FloatArray, now: float, *, holds: bool) -> None:
-        """Check that beams that the proof calls done, one or all, are off the receiver."""
+        """Check that the beams confirmed as done, singly or all, are off the receiver."""
         complete = holds and order.report(now).complete
         if complete and order.ticket.identity != self._complete_order:
             self.proofs, self._complete_order = self.proofs + 1, order.ticket.identity

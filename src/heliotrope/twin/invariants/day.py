@@ -16,8 +16,9 @@ from heliotrope.twin.invariants.invariants import Judge
 
 #: Elevation of the sun below which the field belongs at stow, rad.
 LOWEST = radians(8.0)
-#: Time from there, from the last person's act, and from the beginning of a quiet stretch until a
-#: mirror is on its way to stow: the sun is looked at every 30 s, the field every 2 s, s.
+#: Time from that elevation, from the last operator action, and from the start of an undisturbed
+#: period until a heliostat is on its way to stow, s. The sun is checked every 30 s, the field every
+#: 2 s.
 AWAY_WITHIN = 45.0
 _UP = (
     states.APPROACHING,
@@ -61,13 +62,13 @@ class DayObserver(Judge):
             self._assigned.pop(name, None)
 
     def took(self, now: float) -> None:
-        """Note that an operator holds the command authority, or requests it."""
+        """Note that an operator holds or requests the command authority."""
         self._acted_at = now
 
     def look(
         self, plant: PlantController | None, quiet: Set[str], sun: FloatArray, now: float
     ) -> None:
-        """Check where the heliostats are.
+        """Check the positions of the heliostats.
 
         Parameters
         ----------
@@ -81,7 +82,8 @@ class DayObserver(Judge):
             s.
         """
         self._low_at = min(self._low_at, now) if sun[2] < self._low else inf
-        # A new program knows nothing of what it was given, and in an emergency all is given up.
+        # A new program does not know which heliostats it controlled, and in an emergency it
+        # releases all.
         if plant is None or plant.sentinel.order is not None:
             self._assigned.clear()
         self._calm = {name: self._calm.get(name, now) for name in quiet}

@@ -75,7 +75,7 @@ from heliotrope.twin.invariants._account import UNLISTED, HeliostatAccount, fing
 from heliotrope.twin.invariants.ledger import FrameLedger, OrderLedger, PlantCommand, Sent
 from heliotrope.twin.invariants.runs import RunAccount
 
-#: Returns the true direction to the sun, (3,), at a time in s.
+#: Function that returns the true direction to the sun, (3,), at a time in s.
 SunAt = Callable[[float], FloatArray]
 
 #: Title of each invariant.
@@ -102,8 +102,8 @@ TITLES = {
     20: "every healthy mirror tracks again",
     21: "what holds for safety outlives a restart",
 }
-#: Number of the invariant of persons' orders and locks; numbers of those of liveness, which people
-#: call by name.
+#: Number of the invariant about operators' orders and locks; numbers of the liveness invariants,
+#: which are called by name.
 WORDS = 17
 L1, L2, L3, L4 = 18, 19, 20, 21
 
@@ -113,32 +113,32 @@ def named(number: int) -> str:
     return str(number) if number < L1 else f"L{number - L1 + 1}"
 
 
-#: Local lease, and how late a board may notice its end, s.
+#: Local lease, and how late a board may notice that it has ended, s.
 LEASE, LOOK = 6.0, 0.15
-#: The plant's lease to a cluster, and how late its last sun may go out, s.
+#: The plant's lease to a cluster, and how late the cluster may send its last sun vector, s.
 PLANT_LEASE, SUN_AFTER = 3.0, 1.2
-#: Time limits to be off the receiver and at stow, s.
+#: Deadlines for being off the receiver and for being at stow, s.
 DEFOCUS_WITHIN, STOW_WITHIN = 30.0, 300.0
-#: A heliostat that has turned away has its beam on the receiver for no longer than this, s: before
-#: anything stows it, since a beam takes less than a second to leave.
+#: After a heliostat has turned away, its beam may stay on the receiver no longer than this, s. This
+#: is shorter than the time until anything stows it, because a beam leaves in less than a second.
 TURNED_WITHIN = 15.0
-#: A beam this far from the middle of the receiver is off it, m.
+#: A beam this far from the middle of the receiver counts as off the receiver, m.
 OFF = 4.0
-#: A mirror that stows without knowing the sun may carry its beam across the receiver, for no
-#: longer than this, s.
+#: A heliostat that stows without a sun vector may carry its beam across the receiver for at most
+#: this long, s.
 CROSSING = 2.0
-#: For this long after a jump, checks of leases count as number 9, s.
+#: For this long after a jump, lease checks count as invariant 9, s.
 JUMP_COUNTS = 60.0
-#: From an order to its first frame on a healthy bus, s.
+#: Maximum time from an order to its first frame on a healthy bus, s.
 ORDER_WITHIN = 1.0
-#: A value may be reported this much younger than it is, by the rounding of its age, s.
+#: A value may be reported as this much younger than it is, because its age is rounded, s.
 AGE_ROUNDING = 0.1
 #: Largest relative difference in rate between the cluster's clock and true time.
 CLOCKS_APART = 1e-3
-#: A status is made every second, and is delivered no later than this after it was sent, s.
+#: A status is made every second, and is delivered at most this long after it was sent, s.
 STATUS_LIFE = 1.0
 
-#: Transitions that a controller may make by itself, or by DEFOCUS and STOW: state before, after.
+#: Transitions that a controller may make by itself, or on DEFOCUS and STOW: state before, after.
 FREE = {
     *((before, states.DEFOCUSED) for before in (
         states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)),
@@ -147,33 +147,34 @@ FREE = {
     *((before, states.FAULT) for before in range(len(states.STATES)) if before not in (
         states.UNCONFIGURED, states.LOCKED)),
     (states.STOWING, states.STOWED), (states.APPROACHING, states.IDLE),
-    (states.DEFOCUSED, states.STOWED),  # arrived at once: it had hardly left
+    (states.DEFOCUSED, states.STOWED),  # arrives at once, because it had hardly left
     (states.SEARCHING, states.IDLE), (states.UNCONFIGURED, states.LOCKED),
 }  # fmt: skip
-#: Commands that every other transition needs, by the state that is entered.
+#: Commands that all other transitions need, by the state that is entered.
 BY_COMMAND = {
     states.TRACKING: ("TRACK", "REFOCUS"), states.SEARCHING: ("SEARCH",),
     states.APPROACHING: ("APPROACH",), states.LOCKED: ("LOCK",),
     states.IDLE: ("IDLE", "UNLOCK", "CLEAR_FAULT"),
     states.STOWED: ("UNLOCK", "CLEAR_FAULT"), states.FAULT: ("UNLOCK",),
 }  # fmt: skip
-#: Foot of the way: below the standby point, at the height of the heliostats, m.
+#: Foot of the safe path: below the standby point, at the height of the heliostats, m.
 FOOT = (STANDBY[0], STANDBY[1], 0.0)
-#: States that need a fresh sun.
+#: States that need a fresh sun vector.
 NEED_SUN = (states.APPROACHING, states.TRACKING, states.SEARCHING)
-#: An approach passes the foot of the way, on the ground below the standby point, within this, m.
+#: An approach passes within this distance of the foot of the safe path, on the ground below the
+#: standby point, m.
 NEAR_FOOT = 6.0
 #: A time that has jumped is no longer used after this, s.
 JUMP_SEEN = 3.0
-#: States that a boot may end in.
+#: States in which a boot may end.
 AFTER_BOOT = (
     states.UNCONFIGURED, states.STOWED, states.STOWING, states.DEFOCUSED, states.LOCKED,
     states.FAULT,
 )  # fmt: skip
-#: States that DEFOCUS and STOW always end: the beam is out by command, and no return path may lead
-#: through a keep-out volume.
+#: States that DEFOCUS and STOW always end, because the beam is out by command and its return path
+#: may not lead through a keep-out volume.
 ON_THE_WAY = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
-#: State that each command asks for, which is what DONE must mean.
+#: State that each command requests, and in which DONE must find the heliostat.
 ASKED = {
     "APPROACH": (states.IDLE,), "IDLE": (states.IDLE,), "TRACK": (states.TRACKING,),
     "REFOCUS": (states.TRACKING,), "LOCK": (states.LOCKED,), "SEARCH": (states.SEARCHING,),
@@ -279,7 +280,7 @@ class Judge:
     def on_progress(self, message: Progress, now: float) -> None:
         """Note a report to the plant about a command."""
 
-    # -- the plant's program and its persons -------------------------------------------------
+    # -- the plant's program and its operators -------------------------------------------------
 
     def on_alarm(self, alarm: Alarm, now: float) -> None:
         """Note an alarm of the plant."""
@@ -290,10 +291,10 @@ class Judge:
     def on_accepted(
         self, person: Person, token: int, ticket: Ticket, what: str, now: float
     ) -> None:
-        """Note a command of a person that the plant has accepted."""
+        """Note a command of an operator that the plant has accepted."""
 
     def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
-        """Note DEFOCUS or STOW by a person, which needs no authority."""
+        """Note DEFOCUS or STOW by an operator, which needs no authority."""
 
     def on_refused(
         self, person: Person, token: int, asked: tuple[str, Sequence[str]], reason: str, now: float
@@ -301,7 +302,7 @@ class Judge:
         """Note a refusal of a command (name and heliostats), and its reason."""
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an emergency that a person has raised."""
+        """Note an emergency that an operator has raised."""
 
 
 class Observer(Judge):

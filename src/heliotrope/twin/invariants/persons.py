@@ -1,11 +1,11 @@
-"""The observer of operators: what a person has ordered or locked lasts until it is ended (17).
+"""The observer of operators: what an operator has ordered or locked lasts until it is ended (17).
 
 It keeps its own ledger, from the calls that operators make and not from the plant: the emergencies
-that each person ordered, with their actions, and withdrew; the heliostats that each person locked,
-and the locks removed. While an order is active, the plant shows it under its owner's name, an
-emergency of at least that action is active, and no heliostat is up once it has had the time to turn
-away. A heliostat that a person has locked remains at rest at stow until its last lock is removed,
-whatever is ordered, and nothing is written to it.
+that each operator ordered, with their actions, and withdrew; the heliostats that each operator
+locked, and the locks removed. While an order is active, the plant shows it under its owner's name,
+an emergency of at least that action is active, and no heliostat is up once it has had the time to
+turn away. A heliostat that an operator has locked remains at rest at stow until its last lock is
+removed, whatever is ordered, and nothing is written to it.
 
 A board that restarts is exempt until it is at rest again, because no lock can prevent what it does
 at start-up; that is why anyone who works at a heliostat uses its switch.
@@ -45,14 +45,14 @@ class _Lock:
 
 @dataclass(frozen=True)
 class Words:
-    """What persons had ordered and locked at some time: orders by owner, owners of locks."""
+    """What operators had ordered and locked at some time: orders by owner, owners of locks."""
 
     orders: dict[str, tuple[Act, float]]
     locks: dict[str, tuple[str, ...]]
 
 
 class PersonsObserver(Judge):
-    """Observes what becomes of persons' orders and locks; see the module.
+    """Observes what becomes of operators' orders and locks; see the module.
 
     Parameters
     ----------
@@ -78,15 +78,15 @@ class PersonsObserver(Judge):
         self._plant: PlantController | None = None
         self._since, self._confirmed = float("inf"), True
 
-    # -- what persons do -----------------------------------------------------------------------
+    # -- what operators do -----------------------------------------------------------------------
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an emergency order; a person has one, of the stronger act."""
+        """Note an emergency order; an operator has one, of the stronger act."""
         before, at = self.orders.get(owner, (act, now))
         self.orders[owner] = max(act, before), at
 
     def withdrew(self, owner: str) -> None:
-        """Note that a person's order is withdrawn, by that person or by an engineer."""
+        """Note that an operator's order is withdrawn, by that operator or by an engineer."""
         self.orders.pop(owner, None)
 
     def withdrawal_refused(self, owner: str, reason: str, now: float) -> None:
@@ -96,7 +96,7 @@ class PersonsObserver(Judge):
         )
 
     def locked(self, owner: str, heliostats: Sequence[str], now: float) -> None:
-        """Note that a person has locked heliostats."""
+        """Note that an operator has locked heliostats."""
         for name in heliostats:
             self._locks.setdefault(name, _Lock()).owners[owner] = now
 
@@ -108,7 +108,7 @@ class PersonsObserver(Judge):
         self.check(WORDS, since <= UNDER_WAY, now, heliostat, saw)
 
     def returned(self, owner: str, heliostats: Sequence[str]) -> None:
-        """Note that a person's locks are returned, by that person or by an engineer."""
+        """Note that an operator's locks are returned, by that operator or by an engineer."""
         for name in heliostats:
             lock = self._locks.get(name, _Lock())
             lock.owners.pop(owner, None)
@@ -139,13 +139,13 @@ class PersonsObserver(Judge):
     def restored(self, words: Words, now: float) -> None:
         """Note that the plant's store is a backup: it has the orders of that time.
 
-        The locks of now go on, until persons have confirmed what the store has (`confirmed`).
+        The locks of now go on, until operators have confirmed what the store has (`confirmed`).
         """
         self.orders = {owner: (act, now) for owner, (act, _) in words.orders.items()}
         self._confirmed = False
 
     def confirmed(self) -> None:
-        """Note that persons have put their locks again, and returned old ones."""
+        """Note that operators have put their locks again, and returned old ones."""
         self._confirmed = True
 
     def forget(self) -> None:
@@ -184,7 +184,7 @@ class PersonsObserver(Judge):
             self.check(WORDS, owner in self.orders, now, "plant", saw)
 
     def _shown(self, plant: PlantController, now: float) -> None:
-        """Check that the plant has the locks of each person, and no others."""
+        """Check that the plant has the locks of each operator, and no others."""
         present = {(lock.name, lock.who) for lock in plant.lockouts}
         required = {(name, owner) for name, lock in self._locks.items() for owner in lock.owners}
         for name, owner in sorted(required ^ present):

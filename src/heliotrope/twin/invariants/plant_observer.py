@@ -194,7 +194,7 @@ class PlantObserver(Judge):
         return self._holder is not None and self._holder[0] == AUTOMATIC
 
     def _leased(self, token: int, now: float) -> None:
-        """Follow the authority of automatic control, which no person reports.
+        """Follow the authority of automatic control, which no operator reports.
 
         It may only have what nobody holds. Leases of one moment to several clusters may be from
         before a grant and after it, and arrive here in any order.
@@ -221,7 +221,7 @@ class PlantObserver(Judge):
         return self._by_itself()
 
     def holder(self, now: float) -> str | None:
-        """Return the person certain to hold the authority; None: it is not certain.
+        """Return the operator certain to hold the authority; None: it is not certain.
 
         Automatic control releases it without notice.
         """
@@ -374,8 +374,8 @@ class PlantObserver(Judge):
     def _spares_taken(self, what: str, heliostats: Sequence[str], now: float) -> None:
         """Check that automatic control moves no heliostat that the holder has commanded.
 
-        Its visits go on beside a person's command, with the other heliostats. What was on its way
-        when the person commanded may still leave.
+        Its visits go on beside an operator's command, with the other heliostats. What was on its
+        way when the operator commanded may still leave.
         """
         holder = self._live(now)
         if holder is None or holder[0] == AUTOMATIC:

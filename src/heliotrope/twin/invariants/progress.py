@@ -5,10 +5,10 @@ authority. In an undisturbed period (`quiet`) a heliostat under automatic contro
 and be measured when a target is free; a visit must end, and leave no beam on its target; no part of
 the work may fail; and measurements must continue while some heliostats are not calibrated (16). A
 heliostat that stays at stow because volumes obstruct its path must be named. Whatever a visit has
-taken is released: no heliostat stays LOCKED without a visit, a person or an emergency that holds it
-(L1). A heliostat under automatic control tracks the receiver, or is in a visit, within a time limit
-(L3). An emergency, and the list of heliostats out of service, survive a restart (L4). Taking the
-command authority ends no visit, and a heliostat that is being photographed uses fine steps,
+taken is released: no heliostat stays LOCKED without a visit, an operator or an emergency that holds
+it (L1). A heliostat under automatic control tracks the receiver, or is in a visit, within a time
+limit (L3). An emergency, and the list of heliostats out of service, survive a restart (L4). Taking
+the command authority ends no visit, and a heliostat that is being photographed uses fine steps,
 whatever an operator sets (16). All time limits are the observer's own.
 """
 
@@ -37,7 +37,7 @@ RAISED_WITHIN = 60.0
 IDLE_WITHIN, TOGETHER_WITHIN = 25.0, 110.0
 #: A visit ends within this, s.
 VISIT_WITHIN = 260.0
-#: A beam may stay on a target without a visit for this long, wherever a person has sent it, s.
+#: A beam may stay on a target without a visit for this long, wherever an operator has sent it, s.
 LEFT_WITHIN = 30.0
 #: A mirror is LOCKED without an owner for this long at most, s: parameters take seconds.
 LOCKED_WITHIN = 60.0
@@ -45,7 +45,7 @@ LOCKED_WITHIN = 60.0
 #: that leave stow one each second need three. While some are not calibrated, a measurement comes
 #: within this, s.
 TRACKS_WITHIN, MEASURED_WITHIN = 240.0, 300.0
-#: A visit goes on after a person has taken the command authority: it does not break off within
+#: A visit goes on after an operator has taken the command authority: it does not break off within
 #: this, s.
 GOES_ON = 3.0
 #: Names of the alarms that a part of the work has failed, that a way from stow is not free, and
@@ -103,7 +103,7 @@ class ProgressObserver(Judge):
         self._took_at, self._begun = -inf, dict[str, set[str]]()
         self._emergency = self._called = self._ended = False
 
-    # -- persons -----------------------------------------------------------------------------
+    # -- operators -----------------------------------------------------------------------------
 
     def given(self, heliostats: Sequence[str]) -> None:
         """Note that an operator has put heliostats under automatic control."""
@@ -269,7 +269,7 @@ class ProgressObserver(Judge):
         self._emergency = on
 
     def _go_on(self, operations: Operations, untouched: Set[str], now: float) -> None:
-        """Check that no visit of untouched mirrors breaks off when a person takes command."""
+        """Check that no visit of untouched mirrors breaks off when an operator takes command."""
         view = operations.automatic.view()
         if now - self._took_at > GOES_ON:
             self._begun.clear()

@@ -35,11 +35,11 @@ COUNTS_WITHIN = 60.0
 SHOWN_WITHIN = 1.0
 #: Errors of a result agree with the observer's own to within this share, and this, rad.
 SHARE, ERROR_WITHIN = 0.05, 2e-5
-#: Visits of one mirror in a row that may bring nothing, for which no person has asked: nine joint
+#: Visits of one mirror in a row that may bring nothing, for which no operator has asked: nine joint
 #: ones in which its beam is looked for, and some alone.
 RETRIES = 14
-#: Visits alone in a row in which a beam may be searched for in vain, for which no person has asked:
-#: the plant's program rests for longer than a day of `days` after each.
+#: Visits alone in a row in which a beam may be searched for in vain, for which no operator has
+#: asked: the plant's program rests for longer than a day of `days` after each.
 SEARCHES = 3
 #: Results in a row, of mirrors that photographs show, that do not all bring nothing though no
 #: visit broke off: so many, or all of the field but one, of so many visits.
@@ -136,7 +136,7 @@ class ResultObserver(Judge):
             self._accounts[name].vain = self._accounts[name].searched = 0
 
     def typed(self, heliostats: Sequence[str]) -> None:
-        """Note that a person has set parameters: the next version may be theirs, no visit's."""
+        """Note that an operator has set parameters: the next version may be theirs, no visit's."""
         for name in heliostats:
             self._accounts[name].typed += 1
 

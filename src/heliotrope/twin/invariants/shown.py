@@ -3,8 +3,8 @@
 It makes the same requests as a page. It knows from the boards where their motors are and where
 their beams go, from the bus what they have reported and when, and from the operators what they have
 done. A row must be what was reported, and its age must be the true age; a calibration is shown with
-the error that follows from its own covariance; each action of a person is an event, exactly once,
-and no event names a person who did nothing (11).
+the error that follows from its own covariance; each action of an operator is an event, exactly
+once, and no event names an operator who did nothing (11).
 """
 
 from collections import deque
@@ -47,7 +47,7 @@ NEAR, SETTLED = 6.0, 20.0
 FOLLOWS, SLEW, LONGEST = 1000.0, 1.0, 60.0
 #: The predicted error of a row agrees with the observer's own to within this share.
 SHARE = 0.25
-#: An act of a person is an event within this, s.
+#: An act of an operator is an event within this, s.
 NOTED_WITHIN = 1.0
 
 
@@ -105,10 +105,10 @@ class ShownObserver(Judge):
         self._frame = 0
         self._turn = 0
 
-    # -- persons -----------------------------------------------------------------------------
+    # -- operators -----------------------------------------------------------------------------
 
     def acted(self, operations: Operations | None, person: str, word: str, now: float) -> None:
-        """Note an action of a person in a program, whose event contains this word."""
+        """Note an action of an operator in a program, whose event contains this word."""
         self._acts.append((now, person, word, operations))
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
@@ -154,7 +154,7 @@ class ShownObserver(Judge):
         self._detail(operations, view, quiet, now)
 
     def _events(self, operations: Operations, now: float) -> None:
-        """Check that each act of a person is an event, once, and nothing else is."""
+        """Check that each act of an operator is an event, once, and nothing else is."""
         for row in operations.logbook.events(100):
             key = (row.at, row.who, row.text)
             if row.who not in self._persons or key in self._judged:

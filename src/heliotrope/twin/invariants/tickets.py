@@ -37,7 +37,7 @@ _REASON = 8
 
 
 class TicketObserver(Judge):
-    """Observes the tickets of persons.
+    """Observes the tickets of operators.
 
     Parameters
     ----------

@@ -89,7 +89,8 @@ class VisitObserver(Judge):
             # Once: when the store brings it back, the mirror may have slipped.
             if record is not None and (name, record.version, record.at) not in self._judged:
                 self._judged.add((name, record.version, record.at))
-                # What a person types of a mirror is one true figure beside others that may be off.
+                # What an operator types of a mirror is one true figure beside others that may be
+                # off.
                 if len(record.sightings):
                     self._believed(board, record, plant.beliefs.nominal(name)[0], sun, now)
             kept = plant.beliefs.known(name)

@@ -28,7 +28,7 @@ class Watch:
         """All observers, in the order in which their hooks are called."""
         return self.visits, self.day, self.results, self.progress, self.shown
 
-    # -- reports of persons -------------------------------------------------------------------
+    # -- reports of operators -------------------------------------------------------------------
 
     def acted(self, operations: Operations | None, person: Person, word: str, now: float) -> None:
         """Note an act in a program; its event there has this word in it."""
@@ -40,34 +40,34 @@ class Watch:
         self.progress.given(heliostats)
 
     def taken(self, heliostats: Sequence[str]) -> None:
-        """Note that a person moves heliostats."""
+        """Note that an operator moves heliostats."""
         self.day.taken(heliostats)
         self.progress.taken(heliostats)
 
     def commanded(self, what: str, heliostats: Sequence[str]) -> None:
-        """Note a command of a person that the plant has accepted."""
+        """Note a command of an operator that the plant has accepted."""
         self.progress.commanded(what, heliostats)
 
     def asked(self, heliostats: Sequence[str]) -> None:
-        """Note that a person wants heliostats calibrated now."""
+        """Note that an operator wants heliostats calibrated now."""
         self.results.asked(heliostats)
 
     def typed(self, heliostats: Sequence[str]) -> None:
-        """Note that a person has set parameters of heliostats."""
+        """Note that an operator has set parameters of heliostats."""
         self.taken(heliostats)
         self.results.typed(heliostats)
 
     def emergency(self, *, on: bool) -> None:
-        """Note that a person has raised an emergency, or that it was cleared."""
+        """Note that an operator has raised an emergency, or that it was cleared."""
         self.progress.emergency(on=on)
 
     def took(self, operations: Operations, now: float) -> None:
-        """Note that a person has taken the command authority."""
+        """Note that an operator has taken the command authority."""
         self.day.took(now)
         self.progress.took(operations, now)
 
     def switched(self, *, on: bool) -> None:
-        """Note that a person switches calibration on or off."""
+        """Note that an operator switches calibration on or off."""
         self.progress.switched(on=on)
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:

@@ -22,7 +22,7 @@ from heliotrope.twin.boards.outfit import Outfit, own_items, sha256
 
 #: Most boards that one process can run.
 MOST = 64
-#: Larger errors belong to a mirror on its way, or on a target, rad.
+#: Heliostats with larger errors are still moving, or are on a target, rad.
 _ON_ITS_WAY = 0.05
 
 
@@ -37,13 +37,13 @@ class BoardField:
     Parameters
     ----------
     clock
-        Clock of the loop.
+        Clock of the event loop.
     names
         Heliostats.
     truth, believed
         True mechanisms, and those that the boards store, (N,).
     machines
-        Limits and rest positions of each.
+        Limits and rest positions of each heliostat's drives.
     seed
         Seed of flash and motors.
 
@@ -91,7 +91,7 @@ class BoardField:
         return TwinBus(self._clock, [*made])
 
     def advance(self, milliseconds: int) -> None:
-        """Run each board when it is due; its time is the clock's."""
+        """Run each board when it is due, on the clock's time."""
         del milliseconds
         now = self._clock.monotonic()
         for board in self.boards:

@@ -186,7 +186,7 @@ class World:
         place = {name: row for row, name in enumerate(self.names)}
         for k, (name, members) in enumerate(homes.items()):
             self._wire(name, [place[member] for member in members], spread_phase(k, len(homes)))
-        # The plant orders its rows by cluster, the field in the order of the design.
+        # The plant sorts heliostats by cluster, whereas the field keeps the order of the design.
         self._rows = np.array([place[name] for members in homes.values() for name in members])
         aims = default_aims(design, self.names, design.position, None)
         self._aims = np.stack([aims[name] for name in self.names])
@@ -197,7 +197,7 @@ class World:
     # -- assembly --------------------------------------------------------------------------
 
     def _wire(self, name: str, rows: list[int], phase: float) -> None:
-        """Make a cluster with its bus, and its link to the plant."""
+        """Create a cluster with its bus and its link to the plant."""
         if rows != list(range(rows[0], rows[0] + len(rows))):
             raise InputError(
                 f"simulated plant: the heliostats of cluster {name} are not consecutive in the "
@@ -232,7 +232,8 @@ class World:
             phase=phase,
             limits={k: v for k, v in self.design.safety.items() if k in _OF_CLUSTERS},
         )
-        # A computer's clock before its programs were written was never set; simulated time may be.
+        # A clock that reads earlier than this program was never set; simulated time may be that
+        # early.
         time = SimulatedTime(self.clock)
         ring = KeyRing(key) if key else None
         self.clusters.append(Cluster(config, bus, far, self.clock, time, bus_keys=ring))
@@ -240,8 +241,8 @@ class World:
         self.buses[name] = bus
 
     def _serial(self, boards: TwinBus) -> Bus:
-        """Return a serial bus whose other end are boards."""
-        # Only this needs a library of serial ports.
+        """Return a serial bus that leads to boards."""
+        # Only this function needs the serial port library.
         from heliotrope.cluster.serial_bus import SerialBus
 
         line = PtyLine(self.clock, boards.stations)
@@ -263,7 +264,7 @@ class World:
             scenes.append(Scene(cameras[0], (target,)))
         if (visits := self.design.receiver_visits) is not None:
             scenes += [Scene(self.design.camera(visits.camera), (face,)) for face in self.faces]
-        # Malan's small mirrors are of one piece.
+        # Malan's small mirrors have a single facet.
         optics = Optics(facets=(1, 1))
         return RenderedCamera(sight, scenes, optics=optics, seed=seed, worker=self.options.worker)
 
@@ -328,7 +329,7 @@ class World:
         return np.asarray(self.field.errors(self.sun(), self._aims)[self._rows])
 
     async def _turn(self) -> None:
-        """Advance the field tick by tick."""
+        """Advance the field, one tick at a time."""
         done = self.clock.monotonic()
         while True:
             await asyncio.sleep(_TICK)
@@ -339,7 +340,7 @@ class World:
             self.field.advance(50 * ticks)
 
     def put_up(self) -> None:
-        """Put a field of arrays on track, as on a working day; a plant must control it."""
+        """Set a field of arrays to tracking, as on a working day; a plant must control it."""
         gps = gps_seconds(self.clock.utc())
         utc = self.clock.utc().timestamp()
         values = sun.broadcast_values(round(gps), utc, self.design.site)
@@ -348,7 +349,7 @@ class World:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Run field, buses, links and clusters for the duration of a block."""
+        """Run the field, buses, links and clusters for the duration of a block."""
         async with asyncio.TaskGroup() as group:
             turns = group.create_task(self._turn())
             async with running(*self._parts), running(*self.clusters):
@@ -377,7 +378,7 @@ def true_mechanisms(design: Plant, options: WorldOptions) -> Mechanism:
 
 
 def _installed(group: Heliostats, options: WorldOptions, number: int) -> Mechanism:
-    """Return the true mechanisms of a group; each group draws errors of its own."""
+    """Return the true mechanisms of a group; each group draws its own errors."""
     if len(group.mechanism.driven) != 2:
         raise InputError(
             f"simulated plant: mechanisms of kind {group.mechanism.kind} have "
@@ -388,7 +389,7 @@ def _installed(group: Heliostats, options: WorldOptions, number: int) -> Mechani
 
 
 def together(parts: Sequence[Mechanism]) -> Mechanism:
-    """Return arrays of mechanisms as one array; several kinds become armatures with drives."""
+    """Return arrays of mechanisms as one array; different kinds become armatures with drives."""
     if len(parts) == 1:
         return parts[0]
     return kinds.of_armature(

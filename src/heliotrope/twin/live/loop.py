@@ -14,11 +14,11 @@ from collections.abc import Callable
 
 from heliotrope.errors import InputError
 
-#: Loop time that timers may be late by before the loop's time is held back, s.
+#: Loop time by which timers may be late before the loop's time is held back, s.
 LATE = 0.25
-#: Wall time until a loop looks again whether its speed has changed, s.
+#: Wall time between checks whether the speed has changed, s.
 _STILL = 0.05
-#: Loop time that passes in one turn while callbacks are always ready, s.
+#: Loop time that passes per iteration while callbacks are always ready, s.
 _BUSY = 0.005
 
 
@@ -34,7 +34,7 @@ class _Pace(selectors.DefaultSelector):
         return self._start + self.speed * (self.wall() - self._begin) - self.lag
 
     def change(self, speed: float) -> None:
-        """Go on from now at another speed; 0 stands still, and files are still served."""
+        """Continue at another speed from now; at 0 time stands still but files are still served."""
         self.speed, self._begin, self._start = speed, self.wall(), self.now + self.lag
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
@@ -54,14 +54,14 @@ class _Pace(selectors.DefaultSelector):
         return list(events)
 
     def _advance(self, most: float) -> None:
-        """Let time go on, up to the next timer at ``most`` and to `until`."""
+        """Advance time, but not beyond the next timer at ``most`` or beyond `until`."""
         target = self._target()
         self.lag += max(0.0, target - most - LATE, target - max(self.until, self.now))
         self.now = max(self.now, min(target, most, self.until))
 
 
 class PacedLoop(asyncio.SelectorEventLoop):
-    """An event loop at a chosen speed; sockets and threads work as in any loop.
+    """An event loop at a chosen speed; sockets and threads work as in any event loop.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class PacedLoop(asyncio.SelectorEventLoop):
         wall: Callable[[], float] = time.monotonic,
     ) -> None:
         if not 0.0 < speed <= 1000.0:
-            self._closed = True  # BaseEventLoop.__del__ asks for it
+            self._closed = True  # BaseEventLoop.__del__ reads it
             raise InputError(f"speed {speed}: give above 0 to 1000 simulated seconds per second")
         self._pace = _Pace(speed, start, wall)
         super().__init__(self._pace)

@@ -1,7 +1,7 @@
 """A link between plant and cluster within one process, without delay or loss.
 
-For whole fields, because with hundreds of clusters the heartbeats of real links would cost more
-than everything else. `links.in_process` simulates the effects of a real line on messages.
+For whole fields: with hundreds of clusters, the heartbeats of real links would cost more than all
+other work. `links.in_process` simulates the effects of a real line on messages.
 """
 
 import asyncio
@@ -58,7 +58,7 @@ class NearLink:
 
     @property
     def problem(self) -> str:
-        """Why the link is not connected."""
+        """Reason why the link is not connected."""
         return "" if self.connected else "the line is cut"
 
     async def run(self) -> None:
@@ -109,7 +109,7 @@ class NearLink:
 
 
 def near_pair(clock: Clock, names: tuple[str, str]) -> tuple[NearLink, NearLink]:
-    """Return two ends: the first bears the second name, as the plant's end names its cluster."""
+    """Return two ends; the first bears the second name, because each end names the other side."""
     first, second = NearLink(names[1], clock), NearLink(names[0], clock)
     first.other, second.other = second, first
     return first, second

@@ -1,4 +1,4 @@
-"""What the local controllers of a simulated field store: calibrations saved by its plant."""
+"""Calibrations that a plant has saved and that a simulated field's local controllers store."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ def write_boards(path: Path, records: Sequence[HeliostatCalibration]) -> None:
 
 
 def read_boards(path: Path, design: Plant) -> Plant:
-    """Return the plant whose heliostats have the parameters in a file."""
+    """Return the plant with the heliostat parameters in a file."""
     with np.load(path) as arrays:
         for i in range(len(arrays.files) // 3):
             names = arrays[f"names_{i}"].tolist()

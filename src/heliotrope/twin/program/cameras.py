@@ -16,7 +16,7 @@ _PATIENCE = 10.0
 
 
 class TwinCameras:
-    """Photographs of a world's targets, drawn in a process of their own.
+    """Photographs of a world's targets, rendered in a separate process.
 
     Parameters
     ----------
@@ -25,9 +25,9 @@ class TwinCameras:
     loop
         Its event loop.
     seed
-        Of the sensors' noise.
+        Seed of the sensors' noise.
     drawer
-        The process that draws, which takes some seconds to begin.
+        The rendering process, which takes some seconds to start.
 
     Raises
     ------
@@ -54,17 +54,17 @@ class TwinCameras:
                 self._scenes[camera.name] = Scene(camera, seen)
 
     def wait(self) -> None:
-        """Wait until it draws, which takes some seconds at first; to be called in a thread."""
+        """Wait until the rendering process is ready, at first some seconds; call it in a thread."""
         for name in list(self._scenes)[:1]:
             self.photograph(name)
 
     def photograph(self, name: str) -> Frame:
-        """Return a photograph by a camera, exposed now; to be called in a thread.
+        """Return a photograph from a camera, exposed now; call this in a thread.
 
         Raises
         ------
         FetchError
-            The process that draws has died.
+            The rendering process has died.
         UnknownNameError
             There is no such camera.
         """
@@ -79,7 +79,7 @@ class TwinCameras:
             self._scenes[name],
             tuple(world.mirrors()),
             world.sun(),
-            # Malan's small mirrors are of one piece.
+            # Malan's small mirrors have a single facet.
             Optics(facets=(1, 1)),
             int(self._chance.integers(1 << 32)),
             f"{name} {number}",

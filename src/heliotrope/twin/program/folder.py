@@ -108,7 +108,7 @@ def read_folder(folder: Path) -> TwinFolder:
     Raises
     ------
     FormatError
-        If they are not those of a simulated field.
+        If the files are not those of a simulated field.
     """
     file = read_links(folder / LINKS)
     found = urlsplit(file.document.twin)
@@ -123,7 +123,7 @@ def read_folder(folder: Path) -> TwinFolder:
 
 
 def sensor_file(reading: str) -> str:
-    """Return the name of the file of a sensor."""
+    """Return the file name of a sensor."""
     return f"{reading}.txt"
 
 

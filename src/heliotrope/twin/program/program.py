@@ -1,4 +1,4 @@
-"""The program of a simulated field: its clock, its clusters, and what it serves."""
+"""The program of a simulated field: its clock, its clusters, and its server."""
 
 import asyncio
 import math
@@ -27,22 +27,23 @@ from heliotrope.twin.program.folder import TwinFolder, sensor_file
 from heliotrope.twin.program.server import TwinServer
 from heliotrope.twin.weather import WeatherStation
 
-#: Share of the speed at which time goes on until all clusters are connected.
+#: Share of the chosen speed at which time advances until all clusters are connected.
 _FIRST = 0.02
-#: A lease of the plant this long says that it leads the cluster, s.
+#: If the plant's lease is this long, the plant leads the cluster, s.
 _LED = 1.5
-#: Time is held this long before the end of a lease, s: the plant, which renews it each second, then
-#: takes no status of a cluster for old; and this long before a connection counts as lost, s.
+#: Time is held this long before the end of a lease, s, so that the plant, which renews the lease
+#: each second, takes no cluster status for old; and this long before a connection counts as lost,
+#: s.
 _HELD, _HEARD = 1.4, 0.4
-#: Wall time for which it is held for a plant that hangs, s: ten times what a plant of 10,000
-#: computes at a stretch, for a machine that has other work.
+#: Wall time for which it is held while the plant hangs, s: ten times the longest computation of a
+#: plant of 10,000 heliostats, because the computer may have other work.
 _HANGS = 60.0
-#: Time in which clusters have sent the orders with which they begin, and in which the plant has
-#: heard of a field that tracks, s.
+#: Time within which clusters send their first orders, and within which the plant receives word that
+#: the field is tracking, s.
 _BEGUN, _REPORTED = 0.5, 1.2
 #: Wall time between checks of the leases, s.
 _CHECKED = 0.02
-#: Clusters call a plant that begins beside them soon again.
+#: Clusters soon retry the connection to a plant that starts beside them.
 _LINK = LinkSettings(longest_pause=0.2)
 #: Time between values of the sensors, s.
 _SENSED = 1.0
@@ -68,8 +69,8 @@ class TwinOptions:
         Whether the heliostats track as soon as the plant controls them; otherwise they begin at
         stow.
     waits
-        Whether it waits for the file of what its local controllers store (`write_boards`), and for
-        the plant to start.
+        Whether the program waits for the file of its local controllers' parameters (`write_boards`)
+        and for the plant to start.
     """
 
     start: datetime | None = None
@@ -83,7 +84,7 @@ class TwinOptions:
 
 @dataclass(frozen=True)
 class _Parts:
-    """What is made once the local controllers are known."""
+    """Objects that are created once the local controllers are known."""
 
     world: World
     cameras: TwinCameras
@@ -97,7 +98,7 @@ class TwinProgram:
     design
         The plant; see `twin.live.World`.
     files
-        Its folder and addresses.
+        Folder and addresses of the simulated field.
     options
         See `TwinOptions`.
     """
@@ -108,7 +109,7 @@ class TwinProgram:
         self._parts: _Parts | None = None
 
     def loop(self) -> asyncio.AbstractEventLoop:
-        """Return a new event loop for it, whose time does not advance until the field starts."""
+        """Return a new event loop for the program, whose time stands until the field starts."""
         if self._options.start is None:
             return asyncio.SelectorEventLoop()
         loop = PacedLoop(self._options.speed)
@@ -151,7 +152,7 @@ class TwinProgram:
             cameras = TwinCameras(world, loop, self._options.seed, drawer)
             self._parts = _Parts(world, cameras)
             sensors = _Sensors(world, self._options.seed)
-            # The plant reads them as soon as it begins.
+            # The plant reads these files as soon as it starts.
             _write(self._files.folder, sensors.readings())
             self._waits = True
             if paced is not None:
@@ -176,7 +177,7 @@ class TwinProgram:
             drawer.close()
 
     async def _stored(self, ending: asyncio.Event) -> Plant:
-        """Return the plant with what its local controllers store."""
+        """Return the plant with the parameters that its local controllers store."""
         path = self._files.folder / BOARDS
         if not self._options.waits:
             return self._design
@@ -193,8 +194,9 @@ class TwinProgram:
         return self._parts
 
     async def _lead(self, world: World, cameras: TwinCameras, loop: PacedLoop | None) -> None:
-        """Let the field begin once the plant leads it."""
-        # To connect and to draw at first takes wall time, to be led takes simulated time.
+        """Start the field once the plant leads it."""
+        # Connecting and the first rendering take wall time; the plant's taking the lead takes
+        # simulated time.
         await asyncio.to_thread(cameras.wait)
         while not all(cluster.connected for cluster in world.clusters):
             await _wall(_CHECKED)
@@ -221,17 +223,17 @@ class TwinProgram:
         }
 
     async def _sense(self, sensors: "_Sensors") -> None:
-        """Write the values of the sensors into their files."""
+        """Write the sensor values to their files."""
         while True:
             await asyncio.to_thread(_write, self._files.folder, sensors.readings())
             await asyncio.sleep(_SENSED)
 
 
 async def _hold(world: World, loop: PacedLoop) -> None:
-    """Hold the loop's time before a lease of the plant or a connection ends, without end.
+    """Repeatedly hold the loop's time before a plant lease or a connection ends.
 
-    Where the machine is too slow, everything takes longer, and nothing is lost by lateness. A plant
-    that is connected to no cluster has ended, and one that says nothing for long hangs.
+    If the computer is too slow, everything takes longer, but nothing is lost by being late. A plant
+    that is connected to no cluster has ended, and a plant that sends nothing for long hangs.
     """
     said = time.monotonic()
     while True:
@@ -244,7 +246,7 @@ async def _hold(world: World, loop: PacedLoop) -> None:
 
 
 def _ends(cluster: Cluster, link: CarriedLink) -> float:
-    """Return how long time may go on before a cluster must have heard its plant, s."""
+    """Return how long time may run before a cluster must have heard from its plant, s."""
     if not link.connected:
         return math.inf
     lease = cluster.lease_left
@@ -259,13 +261,13 @@ class _Sensors:
         self._weather = WeatherStation(world.design.site.height, world.clock, world.sun, seed)
 
     def readings(self) -> dict[str, float]:
-        """Return their readings now."""
+        """Return the present readings."""
         flux = {} if self._flux is None else {FLUX_READING: self._flux.share()}
         return self._weather.readings() | flux
 
 
 class _Go:
-    """The plant's word that the field may begin."""
+    """The plant's permission for the field to start."""
 
     def __init__(self) -> None:
         self.event = asyncio.Event()
@@ -276,7 +278,7 @@ class _Go:
 
 
 async def _wall(seconds: float) -> None:
-    """Wait for wall time: the loop's own is what is slowed down."""
+    """Wait for wall time, because the loop's own time is slowed down."""
     await asyncio.to_thread(time.sleep, seconds)
 
 

@@ -1,4 +1,4 @@
-"""What a simulated field serves over HTTP: photographs, the state of its clock, true errors.
+"""HTTP server of a simulated field: photographs, the state of its clock, true errors.
 
 The standard library's server answers each request in a thread; requests that concern the field are
 executed in the field's event loop. Photographs are rendered in a separate process
@@ -17,7 +17,7 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.imaging.files import encode_image
 from heliotrope.imaging.frame import Frame
 
-#: Longest wait for an answer of the loop, s.
+#: Longest wait for a reply from the event loop, s.
 _PATIENCE = 20.0
 
 
@@ -25,7 +25,7 @@ class _Server(ThreadingHTTPServer):
     allow_reuse_address = daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing: a plant that ends has asked for what it does not take."""
+        """Print nothing: a plant that ends may leave requests whose replies it does not read."""
 
 
 class TwinServer:
@@ -38,15 +38,15 @@ class TwinServer:
     secret
         First part of every path; other paths are not found.
     clock
-        Returns the state of the clock; it is called in any thread.
+        Returns the state of the clock; may be called in any thread.
     loop
         The field's event loop.
     photograph
-        Takes a photograph by a camera, by name; called in a thread.
+        Takes a photograph with a camera, by name; called in a thread.
     errors
         Returns the true errors; called in the loop.
     begin
-        Lets the field begin; called in the loop.
+        Starts the field; called in the loop.
     """
 
     def __init__(
@@ -90,23 +90,23 @@ class TwinServer:
                 self.wfile.write(body)
 
             def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-                """Write nothing: a camera is asked each second."""
+                """Write nothing, because a camera is polled each second."""
 
         self._server = _Server(serves, Handler)
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
 
     def start(self) -> None:
-        """Begin to answer."""
+        """Start to serve requests."""
         self._thread.start()
 
     def close(self) -> None:
-        """End."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
 
 
 def _asked(loop: asyncio.AbstractEventLoop, function: Callable[[], bytes]) -> bytes:
-    """Return the result of a function called in the loop."""
+    """Call a function in the loop and return its result."""
 
     async def call() -> bytes:
         return function()

@@ -23,28 +23,28 @@ from heliotrope.twin.invariants.watch import Watch
 from heliotrope.twin.world.operator import ENGINEER, VIEWER, Operator
 from heliotrope.twin.world.work import Work
 
-#: What a person does each second on duty, with the token of the command authority.
+#: What an operator does each second on duty, with the token of the command authority.
 Commanding = Callable[[Operations, Person, int], None]
 #: Time until the clusters have a new token, and in which a command is done that only changes a
 #: setting, s.
 _DONE = 4.0
-#: Time for which a person waits until mirrors have gone to stow and take UNLOCK, s.
+#: Time for which an operator waits until mirrors have gone to stow and take UNLOCK, s.
 _UNLOCKED_WITHIN = 120.0
-#: Noise of a parameter that a person has measured, rad; and of points that persons choose, m.
+#: Noise of a parameter that an operator has measured, rad; and of points that operators choose, m.
 _MEASURED, _BESIDE = 3e-4, 0.5
 #: Least time on duty, s.
 _LEAST_DUTY = 2.0
 
 
 class Acts:
-    """Acts of persons; each raises `RefusedError` where the plant refuses it.
+    """Acts of operators; each raises `RefusedError` where the plant refuses it.
 
     Parameters
     ----------
     work
         Automatic control.
     operator
-        Its persons' means: clears what latches, raises emergencies.
+        Its operators' means: clears what latches, raises emergencies.
     watch
         Observers of automatic control, which hear of each act.
     truth

@@ -23,11 +23,11 @@ from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER
 
 #: The script, which has an operator's token.
 SCRIPT = Person("script", Role.OPERATOR)
-#: All persons of a crew whose acts are reported.
+#: All operators of a crew whose acts are reported.
 CREW = (OPERATOR, ENGINEER, VIEWER, SCRIPT)
-#: Mean time between two acts of one person, and longest wait for a moment, s.
+#: Mean time between two acts of one operator, and longest wait for a moment, s.
 _PAUSE, _PATIENCE = 110.0, 60.0
-#: Longest time from a moment until a person acts, s.
+#: Longest time from a moment until an operator acts, s.
 _AFTER = 3.0
 #: Pause between two looks at the plant, s.
 _LOOK = 0.5
@@ -35,7 +35,7 @@ _LOOK = 0.5
 _DUTY, _EMERGENCY, _CARE, _LUNCH = 40.0, 40.0, 40.0, 60.0
 #: Share of the days on which all leave at this share of the day.
 _LEAVE, _LEFT = 0.5, 0.45
-#: Words in the stages of visits for which persons wait; a mirror is locked; and any instant.
+#: Words in the stages of visits for which operators wait; a mirror is locked; and any instant.
 LOCKED, ANY_TIME = "locked", "any time"
 MOMENTS = (
     "on the way", "empty target", "photograph", "on the way back", "taking the beams apart",
@@ -72,14 +72,14 @@ class CrewAct:
 
 
 class Crew:
-    """The persons of a working day.
+    """The operators of a working day.
 
     Parameters
     ----------
     acts
         What they do.
     boards
-        All heliostats, which persons see.
+        All heliostats, which operators see.
     seconds
         Length of the day, s.
     rough

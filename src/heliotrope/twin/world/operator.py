@@ -62,7 +62,7 @@ class Maintenance(Protocol):
         ...
 
 
-#: Share of the emergencies that a second person orders too.
+#: Share of the emergencies that a second operator orders too.
 _SECOND = 0.3
 #: Somebody who looks at a mirror sees from this many steps on that it stands wrong.
 _SEEN_WRONG = 300
@@ -178,7 +178,7 @@ class Operator:
         return None
 
     def seize(self, plant: PlantController, person: Person) -> None:
-        """Put a person on duty, who breaks the present authority."""
+        """Put an operator on duty, who breaks the present authority."""
         try:
             token = plant.seize_authority(person, "on duty now").token
         except RefusedError:
@@ -194,7 +194,7 @@ class Operator:
         self._observer.granted(person, token, self._clock.monotonic(), seized=seized)
 
     def _change(self, plant: PlantController) -> None:
-        """Put another person on duty, who breaks the authority or takes it after its release."""
+        """Put another operator on duty, who breaks the authority or takes it after its release."""
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
         if self._chance.random() < 0.5:
             with contextlib.suppress(RefusedError):
@@ -347,7 +347,7 @@ class Operator:
         self.give(plant, "LOCK", (self._chance.choice(self._names),))
 
     def _unauthorised(self, plant: PlantController) -> None:
-        """Command without authority: with an old token, with another person's, or as a viewer."""
+        """Command without authority: with an old token, with another operator's, or as a viewer."""
         what = self._chance.choice(["TRACK", "APPROACH", "AIM", "REFOCUS", "STANDBY"])
         name = self._chance.choice(self._names)
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
@@ -442,7 +442,7 @@ class Operator:
         return plant.raise_emergency(who.name, act)
 
     def raised(self, who: Person, act: Act) -> None:
-        """Note an emergency that a person has raised."""
+        """Note an emergency that an operator has raised."""
         self.counts["emergencies"] += 1
         for each in self.panel.each:
             each.on_call(who.name, act, self._clock.monotonic())
@@ -465,7 +465,7 @@ class Operator:
     def clear(self, plant: PlantController) -> set[str]:
         """Withdraw one emergency order, acknowledge all that waits for it; return what was taken.
 
-        Another person's order stands on until the next time.
+        Another operator's order stands on until the next time.
         """
         if self.maintenance is not None:
             self.maintenance.confirms(plant)
@@ -474,7 +474,7 @@ class Operator:
         return self._acknowledge(plant)
 
     def withdraws(self, plant: PlantController, owner: str) -> None:
-        """Withdraw a person's order: that person does, or an engineer by name for a viewer."""
+        """Withdraw an operator's order: that operator does, or an engineer by name for a viewer."""
         who = OPERATOR if owner == OPERATOR.name else ENGINEER
         now = self._clock.monotonic()
         try:
@@ -509,7 +509,7 @@ class Operator:
         """Look at a mirror whose step counts are in doubt.
 
         Whoever confirms one without looking makes its beam miss, and no software can know that: it
-        would be the person's fault that breaks invariant 12. So these persons do look.
+        would be the operator's fault that breaks invariant 12. So these operators do look.
         """
         boards = (board for pod in self._pods for board in pod.boards)
         board = next(board for board in boards if board.outfit.name == name)

@@ -33,7 +33,7 @@ _BEFORE, _SOON = (0.55, 0.75), 300.0
 #: Nearest two heliostats, and nearest that a beam at rest passes the receiver, m.
 _APART, _BESIDE = 6.0, 8.0
 #: A beam at stow passes receiver and volumes by this much more than their radius, m: nothing can
-#: take it elsewhere, and persons change the stow position a little.
+#: take it elsewhere, and operators change the stow position a little.
 _ROOM = 10.0
 #: The sun is looked at this often, s.
 _OFTEN = 60.0
@@ -52,7 +52,7 @@ class Scene:
     places
         East and north of each heliostat, m; (): `outfits` draws them.
     keep_outs
-        Balls that no beam may enter; the first is the one that persons aim at.
+        Balls that no beam may enter; the first is the one that operators aim at.
     targets
         Calibration targets.
     lowest

@@ -20,7 +20,7 @@ from heliotrope.twin.world.crew import Crew
 from heliotrope.twin.world.operator import ENGINEER, VIEWER
 from heliotrope.twin.world.work import Work
 
-#: Pause between two looks of a person, s.
+#: Pause between two looks of an operator, s.
 LOOK = 2.0
 #: Longest time on duty, s.
 _DUTY = 15.0
@@ -30,7 +30,7 @@ _EMERGENCY = 12.0
 
 @dataclass(frozen=True)
 class Working:
-    """Automatic control of a run, the persons beside it, and the observers of its work."""
+    """Automatic control of a run, the operators beside it, and the observers of its work."""
 
     control: Work
     shift: "Shift | Crew"
@@ -62,7 +62,7 @@ class Working:
 
 
 class Shift:
-    """The persons of a run with automatic control.
+    """The operators of a run with automatic control.
 
     Parameters
     ----------

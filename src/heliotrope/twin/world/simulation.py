@@ -114,7 +114,7 @@ WITNESSES = frozenset({"sun sensor"})
 _ON_RECEIVER = 0.7
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
-#: Mean time between two interruptions by persons, s: a joint visit takes two minutes.
+#: Mean time between two interruptions by operators, s: a joint visit takes two minutes.
 SHIFT_PAUSE, PARTY_PAUSE = 90.0, 300.0
 #: The same as `NEAR` for motors that step coarsely, and may stay two full steps behind, rad.
 NEAR_COARSE = 4e-3
@@ -337,7 +337,7 @@ class Simulation:
         self._program: list[asyncio.Task[None]] = []
 
     def _observe(self, scene: Scene) -> None:
-        """Attach observers to boards, beams, sensors, alarms and persons."""
+        """Attach observers to boards, beams, sensors, alarms and operators."""
         plan = self.plan
         alone = "twice" not in plan.worlds
         self.persons = PersonsObserver(self.begin, self.boards, alone=alone)
@@ -358,7 +358,7 @@ class Simulation:
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
 
     def _employ(self) -> None:
-        """Let persons, automatic control and the tour work at the plant, before its observer."""
+        """Let operators, automatic control and the tour work at the plant, before its observer."""
         plan = self.plan
         observers = [pod.observer for pod in self.pods]
         self.observer = PlantObserver(
@@ -401,7 +401,7 @@ class Simulation:
         )
 
     def _new_work(self) -> Working:
-        """Return automatic control with its persons and its observer."""
+        """Return automatic control with its operators and its observer."""
         plan, clock = self.plan, self._clock
         boards = {board.outfit.name: board for board in self.boards}
         all_mirrors = mirrors_of(boards, MIRROR, MIRROR)
@@ -558,7 +558,7 @@ class Simulation:
         )
 
     def _people(self, seed: int, habits: Habits, panel: Panel, feeds: bool) -> Operator:
-        """Return the persons who command a plant."""
+        """Return the operators who command a plant."""
         return Operator(
             self._clock,
             seed,

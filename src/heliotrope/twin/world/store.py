@@ -50,7 +50,7 @@ class PlantStore:
         self.keeper.close()
 
     def service(self, plant: PlantController, tell: Callable[[Alarm], None]) -> Service:
-        """Return the locks of persons on a new program's heliostats."""
+        """Return the locks of operators on a new program's heliostats."""
         keeping = Keeping(plant.field.names, plant.beliefs, self.keeper)
         return Service(plant, keeping, tell)
 

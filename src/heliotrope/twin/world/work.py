@@ -35,7 +35,7 @@ from heliotrope.store.records import PlannedVisit
 from heliotrope.twin.cameras import FieldSnapshot
 from heliotrope.twin.world.photographs import LyingCamera
 
-#: Mirrors that may be lost together without a person: of so few, two may be all.
+#: Mirrors that may be lost together without an operator: of so few, two may be all.
 LOSSES = 1
 #: Orders are given again soon.
 SETTINGS = AutomaticSettings(rate=1.0, losses=LOSSES, patience=20.0)

@@ -47,7 +47,7 @@ PARTIES, PARTY = ("parties", DAYS), 6
 #: Worlds in which site, date, hour, and places are drawn.
 DRAWN = ("place", "day")
 #: Faults in a run with automatic control come this many times more seldom: a visit takes a minute,
-#: and a person's act is most of what happens on a day.
+#: and an operator's act is most of what happens on a day.
 _SELDOM, _SELDOM_BY_DAY = 4.0, 50.0
 #: Repairs take their time: faults come this many times more seldom than usual ones.
 _REPAIRED = 2.0
@@ -99,15 +99,15 @@ def mixed(seed: int) -> tuple[str, ...]:
     return tuple(name for name in worlds if name != "twice" or not works(worlds))
 
 
-#: Weights of the actions of persons while much is repaired: emergencies are frequent; and of those
-#: who leave mirrors up for a while.
+#: Weights of the actions of operators while much is repaired: emergencies are frequent; and of
+#: those who leave mirrors up for a while.
 _REPAIRING = (60, 14, 2, 6, 2, 2, 2, 3, 1)
 _REPAIRING_CALMLY = (60, 10, 1, 1.5, 0.3, 0.3, 2, 2, 1)
 
 
 @dataclass(frozen=True)
 class Habits:
-    """The acts of simulated persons, and their rates.
+    """The acts of simulated operators, and their rates.
 
     Attributes
     ----------
