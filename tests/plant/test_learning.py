@@ -197,7 +197,7 @@ def test_too_few_photographs_keep_the_defaults_and_say_so(tmp_path: Path) -> Non
     night.step()
     (view,) = night.learning.views()
     assert view.version == 0
-    said = "nothing new: 3 heliostats with 8 photographs on different days; 4 are needed"
+    said = "nothing new was learnt: 3 heliostats with 8 photographs on different days; 4 are needed"
     assert view.said == f"{said}; the defaults stay in force"
     assert night.plant.beliefs.hyper(NAMES[0]) is None
     assert any(said in row.text for row in night.log.events(20))
@@ -217,7 +217,10 @@ def test_a_failure_and_what_is_no_better_leave_in_force_what_is(tmp_path: Path) 
             lambda found: replace(found, gain=-0.1),
             "240 photographs of 5 heliostats: new values would not predict them better, so",
         ),
-        (lambda found: replace(found, gain=float("nan")), "240 photographs of 5 heliostats are"),
+        (
+            lambda found: replace(found, gain=float("nan")),
+            "240 photographs of 5 heliostats: new values would not",
+        ),
     ):
         night.here.answer = answer
         night.learning.order(ENGINEER)

@@ -176,7 +176,7 @@ class Operations:
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
         self.approvals.recall()
         self.begun.set()
-        async with asyncio.TaskGroup() as group:
+        async with contextlib.aclosing(self._flux), asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
             parts = (
                 self._look(), self._follow(), self._compare(), self._history.run(),

@@ -94,6 +94,12 @@ class PredictedFlux:
             )
         return self._views
 
+    async def aclose(self) -> None:
+        """Give up a running computation."""
+        if self._computing is not None:
+            self._computing.cancel()
+            await asyncio.gather(self._computing, return_exceptions=True)
+
     async def _compute(self) -> None:
         now, receivers = self._plant.now(), self._plant.design.receivers
         if not receivers:
