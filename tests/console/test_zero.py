@@ -77,7 +77,7 @@ def test_who_may_and_what_fits() -> None:
         for names, values, error, text in (
             ([], [0, 0], RefusedError, "between heliostats; specify one heliostat"),
             (live.names, [0, 0], RefusedError, "2 heliostats"),
-            ([name], [0], InputError, "1 numbers given"),
+            ([name], [0], InputError, "got 1 numbers"),
             ([name], [0.5, 0], InputError, "cannot be sent"),
             (["nobody"], [0, 0], UnknownNameError, "nobody"),
         ):

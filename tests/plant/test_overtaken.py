@@ -47,7 +47,7 @@ def test_what_waited_for_the_line_does_not_follow_a_safe_order(tmp_path: Path, o
             await bench.wait(5.0)
             left = () if order == "emergency" else cluster.names[2:]
             assert [m.heliostats for m in cluster.commands("IDLE")] == ([left] if left else [])
-            assert "overtaken by" in ticket.text
+            assert "came first" in ticket.text
             assert len(cluster.commands("AIM")) == 3
 
     run_virtual(main)

@@ -96,7 +96,7 @@ def test_nothing_that_waited_for_its_record_follows_an_emergency(tmp_path: Path,
 
     bench = play(tmp_path, scene)
     records, _ = read(bench.audit.path)
-    assert "overtaken" in next(r.result for r in records if r.what == "TRACK")
+    assert "came first" in next(r.result for r in records if r.what == "TRACK")
 
 
 def test_a_record_that_comes_too_late_sends_nothing(tmp_path: Path) -> None:
