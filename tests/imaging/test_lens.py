@@ -445,9 +445,9 @@ def test_points_that_cannot_be_used(points: Any, pixels: Any, sigma: Any, text: 
 
 
 def test_frames_without_partners_are_refused() -> None:
-    with pytest.raises(InputError, match="2 lists of points, 1 of pixels"):
+    with pytest.raises(InputError, match="got 2 point lists and 1 pixel lists"):
         calibrate_marks(WIDE, [FACE, FACE], [SEEN])
-    with pytest.raises(InputError, match="0 lists of points"):
+    with pytest.raises(InputError, match="got 0 point lists"):
         calibrate_marks(WIDE, [], [])
     with pytest.raises(InputError, match=r"^3 points; four or more"):
         calibrate_marks(WIDE, [FACE[:2], FACE[3:4]], [SEEN[:2], SEEN[3:4]])

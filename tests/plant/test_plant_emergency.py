@@ -356,7 +356,9 @@ def test_a_refusal_names_the_orders_that_stand_and_then_what_is_left_to_do(
         await bench.wait(1.0)
         assert not plant.sentinel.on
         assert plant.sentinel.causes() == {}
-        with pytest.raises(RefusedError, match="Olga stands; no emergency holds"):
+        with pytest.raises(
+            RefusedError, match="Olga has no active emergency order; no emergency is active"
+        ):
             plant.withdraw_emergency(OPERATOR)
 
     play(tmp_path, scene)

@@ -559,10 +559,13 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
         (("--clusters", "links.toml"), "--clusters needs the plant file"),
         (("plant.toml", "--clusters", "links.toml"), "a real plant keeps its records; give --data"),
         (("plant.toml", "--clusters", "no.toml"), "no.toml: there is no such file"),
-        (("plant.toml", "--clusters", "links.toml", "--speed", 2), "run: --speed: only in simul"),
+        (
+            ("plant.toml", "--clusters", "links.toml", "--speed", 2),
+            "run: --speed: only available in simul",
+        ),
         (
             ("plant.toml", "--clusters", "links.toml", "--start", "2012-09-02"),
-            "run: --start: only in simulation; real clusters follow the sun of now, by the clocks",
+            "run: --start: only available in simulation, because real clusters track the actual",
         ),
         (("--start", "1979-12-31"), "--start 1979-12-31: give a time in the years 1981 to 2099"),
         (("--start", "2012-09-02T10:00"), "has no time zone; append Z for UTC or an offset"),

@@ -116,4 +116,4 @@ def read_json(path: str | Path, what: str) -> JsonNode:
         raise FormatError(path, other or cut, "" if other else f"line {error.lineno}") from None
     except ValueError as error:
         # An integer of thousands of digits.
-        raise FormatError(path, f"not usable JSON ({str(error)[:80]})") from None
+        raise FormatError(path, f"invalid JSON ({str(error)[:80]})") from None

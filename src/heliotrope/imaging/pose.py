@@ -119,7 +119,8 @@ def calibrate_marks(
     """
     if not points or len(points) != len(pixels):
         raise InputError(
-            f"{len(points)} lists of points, {len(pixels)} of pixels; give one each for a frame"
+            f"got {len(points)} point lists and {len(pixels)} pixel lists; pass one of each per "
+            "frame"
         )
     noise = [sigma] * len(points) if isinstance(sigma, int | float) else sigma
     frames = [_observed(*frame) for frame in zip(points, pixels, noise, strict=True)]

@@ -670,7 +670,7 @@ class PlantController:
             person.must_be(Role.ENGINEER, f"withdraw the emergency of {who}")
         if who not in {call.who for call in calls}:
             texts = "; ".join(call.text for call in calls)
-            rows = "; ".join(self.sentinel.causes().values()) or "no emergency holds"
+            rows = "; ".join(self.sentinel.causes().values()) or "no emergency is active"
             stands = f"it was ordered by {texts}" if calls else rows
             raise refusals.NOT_CALLER.error(who=who, calls=stands)
         told = self.sentinel.withdraw(who, person.name)

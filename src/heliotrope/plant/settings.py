@@ -93,8 +93,8 @@ class PlantSettings:
             )
         if not 0.0 < self.beat <= 1.0 or not 0.0 < self.repeat < math.inf:
             raise InputError(
-                f"plant: a beat of {self.beat} s and a repetition of {self.repeat} s; give above "
-                "0 to 1 s, and above 0"
+                f"plant: a cycle of {self.beat} s and a repetition of {self.repeat} s; the ranges "
+                "are above 0 to 1 s, and above 0"
             )
 
 

@@ -90,7 +90,8 @@ class ExactCamera:
         plane = array * np.eye(2) if array.ndim == 0 else array
         if plane.shape != (2, 2) or not np.isfinite(plane).all():
             raise InputError(
-                f"exact camera: a covariance of shape {array.shape}; give a variance or (2, 2), m²"
+                f"exact camera: covariance has shape {array.shape}; pass a variance or a (2, 2) "
+                "matrix, m²"
             )
         values, vectors = np.linalg.eigh(plane)
         if not np.allclose(plane, plane.T, rtol=1e-9, atol=0.0) or values.min() < 0.0:

@@ -394,7 +394,7 @@ def _only_real(**simulated: bool) -> None:
     options = ", ".join(f"--{name}" for name, used in simulated.items() if used)
     if options:
         raise InputError(
-            f"run: {options}: only in simulation; real clusters follow the sun of now, by the "
-            "clocks of their computers: leave it out, or leave out --clusters to simulate this "
+            f"run: {options}: only available in simulation, because real clusters track the "
+            "actual sun by their own clocks; drop the option, or drop --clusters to simulate this "
             "plant"
         )
