@@ -211,8 +211,8 @@ def test_defocus_and_stow_are_taken_from_anybody(tmp_path: Path) -> None:
         ("JOG", (0,), "JOG: got 1 numbers, but the command takes 2"),
         ("JOG", (0, 0.5), "cannot be sent"),
         ("JOG", (0, 2**31), "cannot be sent"),
-        ("SEARCH", (float("nan"), 1.0), "send finite numbers"),
-        ("SEARCH", (1e-3, float("inf")), "send finite numbers"),
+        ("SEARCH", (float("nan"), 1.0), "specify finite numbers"),
+        ("SEARCH", (1e-3, float("inf")), "specify finite numbers"),
         ("SEARCH", (1e300, 1.0), "cannot be sent"),
     ],
 )
@@ -301,7 +301,7 @@ def test_a_later_command_takes_the_place_of_one_that_waits(tmp_path: Path) -> No
         assert track.refusals == {"P1B": "superseded by LOCK"}
         assert second.refusals == {"P1A": "superseded by LOCK"}
         assert plant.waiting == 0
-        for bad, said in ((np.nan, "nan is not a finite number"), (2e5, "at most 100000 m")):
+        for bad, said in ((np.nan, "nan is not a finite number"), (2e5, "the limit is 100000 m")):
             with pytest.raises(InputError, match=said):
                 plant.aim(OPERATOR, token, {"P1A": (bad, 0.0, 0.0)})
 

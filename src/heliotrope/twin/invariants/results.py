@@ -316,7 +316,7 @@ def _visits(results: Sequence[CalibrationEntry]) -> int:
 
 def _of_all(event: EventRow, entry: CalibrationEntry) -> bool:
     """Whether an event is that of a visit of several that was refused as a whole."""
-    return event.who == entry.target and event.text.endswith(f" proven together; {entry.text}")
+    return event.who == entry.target and event.text.endswith(f" identified together; {entry.text}")
 
 
 def _misses(by: Mechanism, sightings: Sightings) -> FloatArray:
