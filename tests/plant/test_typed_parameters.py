@@ -165,7 +165,7 @@ def test_a_surveyed_place_is_set_and_its_beam_is_proven_from_there(tmp_path: Pat
         wanted = items_of(example_plant()[NAME].calibrated.with_parameters(survey))
         assert bench.cluster_of(NAME).stored[NAME] == wanted
         bench.plant.authority.keep(ENGINEER, token)
-        with pytest.raises(InputError, match=r"position_east 0\.301 is beyond 6 standard dev"):
+        with pytest.raises(InputError, match=r"position_east 0\.301 is more than 6 standard dev"):
             typed.change(ENGINEER, token, NAME, {"position_east": 0.301}, "moved")
 
     play(tmp_path, scene)
