@@ -91,7 +91,7 @@ def test_an_exact_camera_tells_what_is_wrong() -> None:
         for bad, text in (
             (np.eye(3), r"shape \(3, 3\)"),
             (-1.0, "positive semidefinite"),
-            (np.nan, "give a"),
+            (np.nan, "pass a"),
         ):
             with pytest.raises(InputError, match=text):
                 ExactCamera(sight(clock), bad)

@@ -26,7 +26,16 @@ _USER: dict[str, Any] = {"user": True}
 
 
 class AtPlant:
-    """A caller with the methods of `console.Client` that `heliotrope ctl` needs."""
+    """A caller with the methods of `console.Client` that `heliotrope ctl` needs.
+
+    Parameters
+    ----------
+    token
+        API token; "": none. The plant's own user and root need none to see the plant and to order
+        EMERGENCY, DEFOCUS and STOW.
+    data
+        Data folder of the plant.
+    """
 
     def __init__(self, token: str, data: Path) -> None:
         self._hello: dict[str, Any] = {"token": token} if token else _USER
@@ -44,7 +53,13 @@ class AtPlant:
         """Do nothing, because each call has its own connection."""
 
     def ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
-        """Send an API request; return the reply."""
+        """Send an API request; return the reply.
+
+        Raises
+        ------
+        HeliotropeError
+            If the plant refuses it, or cannot be reached.
+        """
         request, arguments, blob = f"{method} {path}", dict(body or {}), b""
         if request == "POST aim":
             points = arguments.pop("points", {})

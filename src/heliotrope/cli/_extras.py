@@ -15,7 +15,15 @@ _WHOLE = {"run": "console", "ctl": "console", "store": "store"}
 
 
 def missing(error: ModuleNotFoundError, command: str) -> InputError | None:
-    """Return the refusal for a package that is not installed; None: no extra contains it."""
+    """Return the refusal for a package that is not installed; None: no extra contains it.
+
+    Parameters
+    ----------
+    error
+        What the import raised.
+    command
+        Name of the command; empty if unknown.
+    """
     package = (error.name or "").partition(".")[0]
     extra = EXTRAS.get(package)
     if extra is None:

@@ -1,4 +1,8 @@
-"""Records in a plant's store what users do with it: backups, exports, queries."""
+"""Records in a plant's store what users do with it: backups, exports, queries.
+
+A running plant records this itself, through its local interface; if the plant is stopped, the
+command writes to the store.
+"""
 
 import os
 import sys
@@ -21,7 +25,15 @@ def this_person() -> str:
 
 
 def note_use(place: str, kind: str, detail: str) -> None:
-    """Record in a store what this user did with it; report if that is not possible."""
+    """Record in a store what this user did with it; report if that is not possible.
+
+    Parameters
+    ----------
+    place
+        Data folder of a plant, or the URL of its database.
+    kind, detail
+        Name of a `SecurityEvent`, and what was done.
+    """
     detail = " ".join(detail.split())[:_LONGEST]
     try:
         try:

@@ -8,11 +8,12 @@ comment costs no memory).
 
 Who may send a message:
 
-ANYONE accepted from anyone at any time: the messages that make the field safe AUTHORITY moves the
-heliostat: carries the authority's token, and expires KEY changes stored settings: also carries a
-truncated HMAC and an edition CLUSTER from the cluster controller, about every second: time, sun,
-session ASK a query from the cluster controller; it changes nothing NODE a reply from a local
-controller
+ANYONE     accepted from anyone at any time: the messages that make the field safe
+AUTHORITY  moves the heliostat: carries the authority's token, and expires
+KEY        changes stored settings: also carries a truncated HMAC and an edition
+CLUSTER    from the cluster controller, about every second: time, sun, session
+ASK        a query from the cluster controller; it changes nothing
+NODE       a reply from a local controller
 
 Payloads of AUTHORITY and KEY messages begin with a head, which their rows leave out: the
 authority's ``token``; ``expires_s``, the GPS second after which the command is void; and for KEY
@@ -23,16 +24,23 @@ GPS seconds count from 6 January 1980 without leap seconds, modulo 2^32.
 
 Traits, needed by the plant and the clusters but not by boards:
 
-moves moves the heliostat by its parameters joins brings its beam to the aim standby brings its beam
-to the standby point counts moves it by step counts, from its present position sliced goes to many
-heliostats in slices releases ends a lock or a fault stands an idle heliostat stands still after it,
-and tracks no standby point point sets a point; only the last one counts setting changes how it
-moves later; it removes no heliostat from a visit harmless moves nothing, now or later stops only
-stops the heliostat; accepted even when no motion may begin relative takes effect again in a second
-frame again its goal looks like the state before it; a second frame does no harm stored written to
-flash before it is acknowledged operator an operator may send it; other AUTHORITY and KEY messages
-need an engineer manual an operator who sends it takes the heliostat from automatic control
-automatic an operator who sends it hands the heliostat to automatic control
+moves      moves the heliostat by its parameters
+joins      brings its beam to the aim
+standby    brings its beam to the standby point
+counts     moves it by step counts, from its present position
+sliced     goes to many heliostats in slices
+releases   ends a lock or a fault
+stands     an idle heliostat stands still after it, and tracks no standby point
+point      sets a point; only the last one counts
+setting    changes how it moves later; it removes no heliostat from a visit
+harmless   moves nothing, now or later
+stops      only stops the heliostat; accepted even when no motion may begin
+relative   takes effect again in a second frame
+again      its goal looks like the state before it; a second frame does no harm
+stored     written to flash before it is acknowledged
+operator   an operator may send it; other AUTHORITY and KEY messages need an engineer
+manual     an operator who sends it takes the heliostat from automatic control
+automatic  an operator who sends it hands the heliostat to automatic control
 """
 
 ANYONE, AUTHORITY, KEY, CLUSTER, NODE, ASK = 0, 1, 2, 3, 4, 5

@@ -23,7 +23,20 @@ _LOOKED = 2.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """Options for what leaves the computer."""
+    """Options for what leaves the computer.
+
+    Attributes
+    ----------
+    syslog, authority
+        URL of the receiver of security events and alarms, and the PEM file of its authority.
+    heads, hours
+        Folder to which the chain heads are written, and the interval, hours.
+
+    Raises
+    ------
+    InputError
+        If a URL, a folder or a time cannot be used.
+    """
 
     syslog: str | None = None
     authority: Path | None = None
