@@ -65,6 +65,9 @@ export function plant(box) {
       figures.replaceChildren(h("p", { className: "hx-hint" }, error.message));
       return;
     }
+    // Cells have none while beams of wide errors bring much of the light.
+    unsure.disabled = seen.peak_sigma === null;
+    unsure.checked &&= !unsure.disabled;
     figures.replaceChildren(facts([[t("Power"), `${within(seen.power, seen.power_sigma, 1e6, 2)} MW`],
       [t("Intercept"), seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],
       [t("Peak"), `${within(seen.peak, seen.peak_sigma, 1e3, 0)} kW/m²`], [t("Heliostats on it"), count(seen.heliostats)]]));

@@ -25,6 +25,7 @@ from heliotrope.optics import (
     flux_views,
     surface_of,
 )
+from heliotrope.optics.beam import SUN_SIGMA
 from heliotrope.optics.scene import facets_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
@@ -36,6 +37,8 @@ from heliotrope.plant.workers import Worker
 
 #: Time for which a prediction is shown, and longest wait for the next one, s.
 EVERY, PATIENCE = 5.0, 5.0
+#: Share of the power that may come from beams of wide errors where cells have an uncertainty.
+WIDE = 0.02
 _LIGHT = FieldOptics()
 
 
@@ -89,8 +92,8 @@ class PredictedFlux:
                     raise RefusedError(f"flux: not predicted now ({error})") from error
         if not self._views and self._surfaces:
             raise RefusedError(
-                "flux: the first prediction since the start is still being computed (half a "
-                "minute after an installation, otherwise seconds); ask again"
+                "flux: the first prediction since the start is still being computed (about "
+                "a minute after an installation, otherwise seconds); ask again"
             )
         return self._views
 
@@ -141,7 +144,9 @@ class PredictedFlux:
 def predicted(scene: Scene, light: FieldOptics) -> list[PredictedView]:
     """Return the expected flux on the surfaces of a scene, with its uncertainty.
 
-    The mirrors' ``pointing`` is the covariance of their errors, which count as independent.
+    The mirrors' ``pointing`` is the covariance of their errors, which count as independent. Cells
+    have no uncertainty (NaN) where much of the light comes from heliostats whose errors are wider
+    than their images, as those that were never calibrated.
     """
     engine = light.engine(scene)
     views = flux_views(engine)
@@ -152,12 +157,20 @@ def _uncertain(view: FluxView, engine: FieldFlux) -> PredictedView:
     flux, (surface,) = view.flux, engine.scene.surfaces
     sigma, power_sigma = np.full(flux.shape, np.nan), float("nan")
     if not isinstance(surface, Mesh | Cavity):
-        count, pointing = len(engine.scene.mirrors), engine.scene.mirrors.pointing
+        mirrors = engine.scene.mirrors
+        count, pointing = len(mirrors), mirrors.pointing
+        # The beam of a wider error than its image is somewhere, as sharp as ever: its power is on
+        # the surface or not, and the derivatives of its blurred image say nothing of a cell.
+        image = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
+        wide = 0.5 * np.trace(pointing, axis1=1, axis2=2) > image
         alone, together = np.zeros((count, 0, 2)), np.zeros(count, dtype=np.int64)
         no_limit = np.full(flux.shape, np.inf)
-        sigma = assess(engine, alone, together, 0.5, no_limit, 1.0).sigma
+        if engine.power[wide].sum() <= WIDE * engine.power.sum():
+            sigma = assess(engine, alone, together, 0.5, no_limit, 1.0).sigma
         slope = engine.power_slope()
-        power_sigma = float(np.sqrt(np.einsum("hi,hij,hj", slope, pointing, slope)))
+        variance = np.einsum("hi,hij,hj->h", slope, pointing, slope)
+        either = engine.power * (engine.leaving - engine.power)
+        power_sigma = float(np.sqrt(np.where(wide, either, variance).sum()))
     hottest = np.unravel_index(flux.argmax(), flux.shape)
     return PredictedView(
         **vars(view),
