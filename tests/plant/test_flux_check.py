@@ -181,3 +181,14 @@ def test_only_a_camera_with_a_pose_maps_a_flat_receiver() -> None:
     round_ = Receiver("r", "external_cylinder", RECEIVER.center, np.eye(3)[1], 4.0, 6.0)
     assert cell_places(RECEIVER, lost) is None
     assert cell_places(round_, CAMERA) is None
+
+
+def test_while_cells_have_no_uncertainty_the_whole_flux_is_compared() -> None:
+    mean, area = NOMINAL.power / SIZE, SIZE
+    unknown = replace(NOMINAL, sigma=np.full(NOMINAL.flux.shape, np.nan))
+    map_ = 0.5 * NOMINAL.flux
+    whole = distance(unknown, map_, mean, area)
+    assert whole == pytest.approx(distance(unknown, np.asarray(map_.mean()), mean, area))
+    assert whole > RAISE
+    map_[0, 0] = np.nan
+    assert math.isnan(distance(unknown, map_, mean, area))

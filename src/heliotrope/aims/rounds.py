@@ -42,7 +42,7 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
 #: A mirror's image before a move, its cell-wise maximum on the path, and its image after, (columns,
 #: rows).
-Way = tuple[FloatArray, FloatArray, FloatArray]
+PathImages = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,47 +177,55 @@ def next_round(now: Round, **light: Any) -> Answer:
                 f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of them"
             )
     best = _best(now, replace(now.demand, limit=type(now.demand.limit)(room)), light)
-    wanted = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
+    target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
     engine = FieldFlux(_posed(now.scene, now.aims), **light)
     above = _risk(engine, now.demand, room).above
     power, better = engine.powers[0], best.engine.powers[0]
     full = ((engine.maps[0] + above) / room).max() > 1.0 + HOLDS
     moves: tuple[Move, ...] = ()
-    left = 0
-    if full or better > (1.0 + BETTER) * power or not now.free[_given(now.aims)].all():
+    remaining = 0
+    if full or better > (1.0 + BETTER) * power or not now.free[_aimed(now.aims)].all():
         cap = room - np.maximum(above, best.risk.above)
-        moves, left = steps(now, wanted, cap, light)
+        moves, remaining = steps(now, target_aims, cap, light)
     shown = FieldFlux(_posed(now.scene, np.where(now.shining[:, None], now.aims, np.nan)), **light)
     risk = _risk(shown, now.demand, limit)
     safe = _safe(now, room, light)
     return Answer(
-        moves, safe, shown.maps[0] + fixed, risk.above, limit, better, power, best.choice.gap, left
+        moves,
+        safe,
+        shown.maps[0] + fixed,
+        risk.above,
+        limit,
+        better,
+        power,
+        best.choice.gap,
+        remaining,
     )
 
 
 def steps(
-    now: Round, wanted: FloatArray, cap: FloatArray, light: dict[str, Any]
+    now: Round, target_aims: FloatArray, cap: FloatArray, light: dict[str, Any]
 ) -> tuple[tuple[Move, ...], int]:
-    """Return the moves towards wanted aims (H, 3), and how many mirrors remain.
+    """Return the moves towards target aims (H, 3), and how many mirrors remain.
 
     ``cap`` is the allowable expected flux, W/m², (rows, columns).
     """
-    given, goes = _given(now.aims), _given(wanted)
-    if not given.any():
+    aimed, goes = _aimed(now.aims), _aimed(target_aims)
+    if not aimed.any():
         # No mirror shines, so all may take their best aims at once.
-        return ((Move(np.flatnonzero(goes), wanted[goes]),) if goes.any() else ()), 0
-    gone = given & ~now.free
-    path = _Path(now, wanted, light)
+        return ((Move(np.flatnonzero(goes), target_aims[goes]),) if goes.any() else ()), 0
+    taken = aimed & ~now.free
+    path = _Path(now, target_aims, light)
     moves = (
-        [Move(np.flatnonzero(gone), np.full((int(gone.sum()), 3), np.nan))] if gone.any() else []
+        [Move(np.flatnonzero(taken), np.full((int(taken.sum()), 3), np.nan))] if taken.any() else []
     )
-    have = given & now.free
+    have = aimed & now.free
     differs = have != goes
-    differs |= have & goes & (np.linalg.norm(now.aims - wanted, axis=1) > ALIKE)
-    todo = np.flatnonzero(differs & ~gone)
+    differs |= have & goes & (np.linalg.norm(now.aims - target_aims, axis=1) > ALIKE)
+    todo = np.flatnonzero(differs & ~taken)
     flux, cap = path.flux(have), as_float(np.maximum(cap, 0.0).T)
     walk = _Walk(path, flux, cap, now)
-    moves += walk.through(todo, wanted)
+    moves += walk.through(todo, target_aims)
     moves += walk.relieved(np.flatnonzero(have & ~np.isin(np.arange(len(have)), walk.done)))
     return tuple(moves), len(todo) - len(np.intersect1d(todo, walk.done))
 
@@ -227,13 +235,13 @@ def _rest(rows: Rows) -> Move:
 
 
 class _Path:
-    """Images of mirrors on their paths from present to wanted aims."""
+    """Images of mirrors on their paths from present to target aims."""
 
-    def __init__(self, now: Round, wanted: FloatArray, light: dict[str, Any]) -> None:
-        given, goes = _given(now.aims), _given(wanted)
-        start = np.where(given[:, None], now.aims, wanted)
-        end = np.where(goes[:, None], wanted, start)
-        some = given | goes
+    def __init__(self, now: Round, target_aims: FloatArray, light: dict[str, Any]) -> None:
+        aimed, goes = _aimed(now.aims), _aimed(target_aims)
+        start = np.where(aimed[:, None], now.aims, target_aims)
+        end = np.where(goes[:, None], target_aims, start)
+        some = aimed | goes
         middle = middles(now.scene)
         start = np.where(some[:, None], start, middle)
         end = np.where(some[:, None], end, middle)
@@ -244,7 +252,7 @@ class _Path:
         at = np.linspace(0.0, 1.0, count)[:, None]
         looks = start[:, None] + at * (end - start)[:, None]
         self._images: Images = engine.images(as_float(looks), np.zeros(len(some), dtype=np.int64))
-        self.given, self.goes = given, goes
+        self.aimed, self.goes = aimed, goes
 
     def flux(self, which: Mask) -> FloatArray:
         """Return the flux of mirrors at their present aims, (columns, rows)."""
@@ -268,12 +276,12 @@ class _Path:
         out[(first + np.arange(columns)) % wide, low:high] = block[:, low - bottom : high - bottom]
         return out
 
-    def most(self, row: int, *, shines: bool) -> Way:
+    def most(self, row: int, *, shines: bool) -> PathImages:
         """Return a mirror's image before, its maximum on the path, and its image after."""
-        before = self.image(row, 0) if self.given[row] else np.zeros(self._images.shape[::-1])
+        before = self.image(row, 0) if self.aimed[row] else np.zeros(self._images.shape[::-1])
         after = self.image(row, -1) if self.goes[row] else np.zeros_like(before)
         greatest = np.maximum(before, after)
-        if shines and self.given[row] and self.goes[row]:
+        if shines and self.aimed[row] and self.goes[row]:
             for place in range(1, self._images.looks - 1):
                 greatest = np.maximum(greatest, self.image(row, place))
         return before, greatest, after
@@ -287,36 +295,36 @@ class _Walk:
         self.done: Rows = np.zeros(0, dtype=np.intp)
         self._moved = 0
 
-    def through(self, todo: Rows, wanted: FloatArray) -> list[Move]:
+    def through(self, todo: Rows, target_aims: FloatArray) -> list[Move]:
         """Return the possible moves; if there are none, some mirrors rest."""
         moves, shining = [], self._now.shining
-        ways = {int(row): self._path.most(row, shines=bool(shining[row])) for row in todo[:LOOKED]}
-        while ways:
-            batch = self._batch(ways)
+        paths = {int(row): self._path.most(row, shines=bool(shining[row])) for row in todo[:LOOKED]}
+        while paths:
+            batch = self._batch(paths)
             if batch:
-                moves.append(Move(np.array(batch, dtype=np.intp), wanted[batch]))
+                moves.append(Move(np.array(batch, dtype=np.intp), target_aims[batch]))
             else:
-                batch = self._resting(ways)
+                batch = self._resting(paths)
                 if not batch:
                     break
                 moves.append(_rest(np.array(batch, dtype=np.intp)))
             self._moved += int(shining[batch].sum())
             self.done = np.union1d(self.done, batch).astype(np.intp)
             for row in batch:
-                before, _, after = ways.pop(row)
+                before, _, after = paths.pop(row)
                 rests = not np.isfinite(moves[-1].aims).all()
                 self._flux = self._flux - before + (0.0 if rests else after)
         return moves
 
-    def _batch(self, ways: dict[int, Way]) -> list[int]:
+    def _batch(self, paths: dict[int, PathImages]) -> list[int]:
         """Return the mirrors that move next; those that relieve the fullest cells come first."""
         fullness = (self._flux / np.maximum(self._cap, 1.0)) ** 8
-        gain = {row: float(((after - b) * fullness).sum()) for row, (b, _, after) in ways.items()}
+        gain = {row: float(((after - b) * fullness).sum()) for row, (b, _, after) in paths.items()}
         bound = self._flux.copy()
         batch: list[int] = []
         most = np.maximum((1.0 + HOLDS) * self._cap, self._flux) + 1e-3
-        for row in sorted(ways, key=gain.__getitem__):
-            before, greatest, _ = ways[row]
+        for row in sorted(paths, key=gain.__getitem__):
+            before, greatest, _ = paths[row]
             if self._now.shining[row] and self._moved + len(batch) >= self._now.most:
                 continue
             tried = bound - before + greatest
@@ -327,13 +335,13 @@ class _Walk:
                 break
         return batch
 
-    def _resting(self, ways: dict[int, Way]) -> list[int]:
+    def _resting(self, paths: dict[int, PathImages]) -> list[int]:
         """Return mirrors that rest, so that others may move, and come back later."""
         if self._moved >= self._now.most:
             return []
-        stuck = [row for row in ways if self._path.given[row] and self._path.goes[row]]
+        stuck = [row for row in paths if self._path.aimed[row] and self._path.goes[row]]
         full = self._flux > BINDS * self._cap
-        stuck.sort(key=lambda row: -float(ways[row][0][full].sum()))
+        stuck.sort(key=lambda row: -float(paths[row][0][full].sum()))
         return stuck[: min(self._now.together, self._now.most - self._moved)]
 
     def relieved(self, rows: Rows) -> list[Move]:
@@ -360,25 +368,25 @@ def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
     scene = replace(now.scene, dark=~now.free)
     at, start = now.at, None
     if _last:
-        before_at, lit, before = _last[0]
-        same = len(lit) == len(now.free) and _alike(before.engine.scene, scene)
+        before_at, were_free, before = _last[0]
+        same = len(were_free) == len(now.free) and _alike(before.engine.scene, scene)
         same = same and before.choice.power > 0.0
         # Images of mirrors that were dark are empty.
-        if same and 0.0 <= now.at - before_at < FRESH and not (now.free & ~lit).any():
+        if same and 0.0 <= now.at - before_at < FRESH and not (now.free & ~were_free).any():
             at, start = before_at, before
-    found = aim_scene(scene, demand, start=start, **light)
-    _last[:] = [(at, now.free, found)]
-    return found
+    computed = aim_scene(scene, demand, start=start, **light)
+    _last[:] = [(at, now.free, computed)]
+    return computed
 
 
-def _alike(one: Scene, other: Scene) -> bool:
+def _alike(scene: Scene, other: Scene) -> bool:
     """Return whether two scenes have the same mirrors and receiver; arrays may be copies."""
-    first, second = surface_in(one), surface_in(other)
+    first, second = surface_in(scene), surface_in(other)
     return bool(
         first.shape == second.shape
         and first.name == second.name
         and np.array_equal(first.cells.center, second.cells.center)
-        and np.allclose(one.mirrors.center, other.mirrors.center, atol=1.0)
+        and np.allclose(scene.mirrors.center, other.mirrors.center, atol=1.0)
     )
 
 
@@ -399,10 +407,10 @@ def _safe(now: Round, room: FloatArray, light: dict[str, Any]) -> FloatArray:
 
 def _risk(engine: FieldFlux, demand: Demand, limit: FloatArray) -> Risk:
     """Return the uncertainty of the flux."""
-    mirrors, lit = engine.scene.mirrors, engine.leaving > 0.0
-    if not lit.any() or not (mirrors.pointing.any() or demand.shared.any):
+    mirrors, shining = engine.scene.mirrors, engine.leaving > 0.0
+    if not shining.any() or not (mirrors.pointing.any() or demand.shared.any):
         return Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
-    groups = np.zeros(len(lit), dtype=np.int64) if demand.groups is None else demand.groups
+    groups = np.zeros(len(shining), dtype=np.int64) if demand.groups is None else demand.groups
     modes = demand.shared.modes(mirrors, engine.scene.sun, demand.pole)
     surface = surface_in(engine.scene)
     cell = np.sqrt(surface.cells.area[0])
@@ -412,10 +420,10 @@ def _risk(engine: FieldFlux, demand: Demand, limit: FloatArray) -> Risk:
 
 def _posed(scene: Scene, aims: FloatArray) -> Scene:
     """Return the scene with its mirrors at aims (H, 3); mirrors without an aim are dark."""
-    given = _given(aims)
-    places = np.where(given[:, None], aims, middles(scene))
-    return replace(scene, mirrors=scene.mirrors.toward(scene.sun, places), dark=~given)
+    aimed = _aimed(aims)
+    places = np.where(aimed[:, None], aims, middles(scene))
+    return replace(scene, mirrors=scene.mirrors.toward(scene.sun, places), dark=~aimed)
 
 
-def _given(aims: FloatArray) -> Mask:
+def _aimed(aims: FloatArray) -> Mask:
     return np.asarray(np.isfinite(aims).all(axis=1))

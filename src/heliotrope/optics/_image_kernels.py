@@ -334,18 +334,18 @@ def _comb(variance, place):
 
 
 @njit(**_FAST)
-def _narrow(uu, uv, vv, seen, count, step):
+def _narrow(uu, uv, vv, visible, count, step):
     """Whether a Gaussian is narrow in comparison with a cell."""
     least = 0.5 * (uu + vv) - math.sqrt(0.25 * (uu - vv) ** 2 + uv * uv)
     most = 0.0
     for k in range(count):
-        high = step * step * (seen[3, k] ** 2 + seen[4, k] ** 2)
-        most = max(most, high, 12.0 * (seen[5, k] ** 2 + seen[6, k] ** 2))
+        high = step * step * (visible[3, k] ** 2 + visible[4, k] ** 2)
+        most = max(most, high, 12.0 * (visible[5, k] ** 2 + visible[6, k] ** 2))
     return 2.0 * math.pi * math.pi * least < WIDE * most
 
 
 @njit(**INNER)
-def _conserve(uu, uv, vv, u, v, seen, count, low, step, room):
+def _conserve(uu, uv, vv, u, v, visible, count, low, step, room):
     """Divide the amplitudes by what the sum over narrow cells' middles would be off.
 
     A Gaussian narrower than the cells, at whose middles it is taken, would lose or gain power.
@@ -353,13 +353,13 @@ def _conserve(uu, uv, vv, u, v, seen, count, low, step, room):
     _, _, shrink, up, _, peak = room
     box = step * step / 12.0
     for k in range(count):
-        du, dv, wu, wv = seen[3, k], seen[4, k], seen[5, k], seen[6, k]
+        du, dv, wu, wv = visible[3, k], visible[4, k], visible[5, k], visible[6, k]
         a = uu + box * du * du + wu * wu
         b = uv + box * du * dv + wu * wv
         c = vv + box * dv * dv + wv * wv
         across = math.sqrt(12.0) * (wv * du - wu * dv)
         var = du * du * c - 2.0 * du * dv * b + dv * dv * a
-        at = (seen[2, k] - v) * du - (seen[1, k] - u) * dv
+        at = (visible[2, k] - v) * du - (visible[1, k] - u) * dv
         up[k] /= _comb(var / (across * across), at / across)
         up[k] /= _comb(1.0 / (shrink[k] * step * step), (peak[k] - low) / step)
 

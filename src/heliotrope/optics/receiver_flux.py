@@ -278,11 +278,11 @@ class FieldFlux:
 
     def on(self, surface: int) -> "FieldFlux":
         """Return the same flux with another of its surfaces as the first and only one."""
-        found = copy(self)
-        found.scene = replace(self.scene, surfaces=(self.scene.surfaces[surface],))
+        single = copy(self)
+        single.scene = replace(self.scene, surfaces=(self.scene.surfaces[surface],))
         for name in ("_plans", "_flux", "_power"):
-            setattr(found, name, [getattr(self, name)[surface]])
-        return found
+            setattr(single, name, [getattr(self, name)[surface]])
+        return single
 
     def _in_columns(self) -> "_Grid":
         plan = self._plans[0]

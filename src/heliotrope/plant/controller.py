@@ -673,10 +673,10 @@ class PlantController:
             rows = "; ".join(self.sentinel.causes().values()) or "no emergency is active"
             stands = f"it was ordered by {texts}" if calls else rows
             raise refusals.NOT_CALLER.error(who=who, calls=stands)
-        told = self.sentinel.withdraw(who, person.name)
-        about = f"; {told}" if told else ""
+        text = self.sentinel.withdraw(who, person.name)
+        about = f"; {text}" if text else ""
         self.note(person, "WITHDRAW", f"emergency order of {who}{about}")
-        return told
+        return text
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
         """Acknowledge a row of the safety table that is waiting for acknowledgement.
@@ -861,7 +861,7 @@ class PlantController:
         return self._proofs.misled(heliostat, point)
 
     def _unwritable(self, heliostat: str) -> str | None:
-        """Return why nothing may be written to a heliostat, None if it may."""
+        """Return the reason why nothing may be written to a heliostat, None if it may."""
         asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
         return self.guards.reasons(asked, *kinds).get(heliostat)
 

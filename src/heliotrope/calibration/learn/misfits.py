@@ -272,7 +272,7 @@ def _median_errors(mechanism: Mechanism, sightings: Sightings, fitted: FieldFit)
 def _hopeless(
     mechanism: Mechanism, mine: Sightings, outcome: FitOutcome, strain: float, error: float
 ) -> str | None:
-    """Return why the fit of a heliostat cannot be valid without a mistake, None if it can."""
+    """Return why a fit cannot be valid even without wrong sightings, None if it can."""
     still = [
         mechanism.joints[joint]
         for d, joint in enumerate(mechanism.driven)

@@ -38,8 +38,8 @@ def build_aims(table: AimsTable | None, folder: Path) -> AimSettings:
         limit = FluxLimit(1e3 * table.limit_kw_m2, table.margin)
     elif table.limit_map:
         limit = read_limit(folder / table.limit_map, table.margin)
-    given = {name: scale * getattr(table, key) for key, (name, scale) in _KEYS.items()}
-    return AimSettings(table.strategy, limit, table.limit_map, together=table.together, **given)
+    keywords = {name: scale * getattr(table, key) for key, (name, scale) in _KEYS.items()}
+    return AimSettings(table.strategy, limit, table.limit_map, together=table.together, **keywords)
 
 
 def aims_document(settings: AimSettings, place: Path) -> dict[str, dict[str, Any]]:

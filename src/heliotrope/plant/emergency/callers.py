@@ -119,13 +119,13 @@ class Callers:
         if now >= history.struck + REMEMBERED:
             history.strikes = 0
         often = len(history.given) == REPEATED and now - history.given[0] < REPEATED_SPAN
-        told = f"the order was repeated {history.merged:,} times" if history.merged else ""
+        text = f"the order was repeated {history.merged:,} times" if history.merged else ""
         if often or by != who:
             history.strikes = max(history.strikes + 1, MOST_WITHDRAWN if often else 0)
             history.struck = now
             if (more := history.strikes - MOST_WITHDRAWN) >= 0:
                 pause = min(LONGEST_PAUSE, PAUSE * 2.0**more)
                 history.until = now + pause
-                told += f"{told and _BETWEEN}{who}'s next order is accepted in {pause:.0f} s"
+                text += f"{text and _BETWEEN}{who}'s next order is accepted in {pause:.0f} s"
         history.merged = 0
-        return told
+        return text

@@ -459,7 +459,7 @@ class Sentinel(Part):
                 self._unproven[name] = min(self._unproven[name], now)
 
     def _doubted(self, heliostat: str) -> str | None:
-        """Return why a heliostat's reports prove nothing about its beam, None if they count."""
+        """Return the reason why its reports prove nothing about its beam, None if they count."""
         untrusted = self._identities.untrusted(heliostat)
         return untrusted or self._drive_checks.stalled.get(heliostat)
 

@@ -124,7 +124,7 @@ class DoubtfulPositions(Part):
             self._tell(kind.raised(name) if doubtful[i] else kind.ended(name))
 
     def reasons(self, names: Sequence[str], points: FloatArray) -> list[str | None]:
-        """Return why heliostats (K) may not join the receiver at points (K, 3), or None."""
+        """Return the reasons why heliostats may not join the receiver at points (K, 3), or None."""
         rows = [self._field.place(name) for name in names]
         unverified, off_place = (
             np.isin(rows, list(s)) for s in (self._unverified, self._off_place)

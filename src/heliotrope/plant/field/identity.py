@@ -144,7 +144,7 @@ class Identities(Part):
         return self._owners.get(int(self._stored[row]), set())
 
     def untrusted(self, heliostat: str) -> str | None:
-        """Return why a heliostat's reports prove nothing about its beam, None if they count.
+        """Return the reason why its reports prove nothing about its beam, None if they count.
 
         It is mismatched, or its board stores an armature that the plant has never known, so its
         step counts belong to the heliostat at which the board was before.
@@ -154,7 +154,7 @@ class Identities(Part):
         return self.mismatched.get(heliostat) or (_UNKNOWN if unknown else None)
 
     def blocked(self, heliostat: str) -> str | None:
-        """Return why a heliostat may be neither moved nor written to, None if it may."""
+        """Return the reason why a heliostat may be neither moved nor written to, None if it may."""
         field, row = self._field, self._field.place(heliostat)
         cluster = field.clusters[field.cluster[row]]
         if heliostat in self.mismatched:

@@ -87,7 +87,7 @@ class Lockouts:
     def reasons(
         self, heliostats: Sequence[str], points: FloatArray | None = None
     ) -> list[str | None]:
-        """Return why no command may move some heliostats, None for those that may be moved.
+        """Return the reasons why no command may move heliostats, None for those that may move.
 
         Parameters
         ----------

@@ -84,7 +84,7 @@ class Locks:
         return {"LOCKED": dict.fromkeys(heliostats, place)}
 
     def reason(self, heliostat: str, visit: str, held: str = "") -> str:
-        """Return why a heliostat is LOCKED, since when and until when, in words.
+        """Return the reason why a heliostat is LOCKED, since when and until when, in words.
 
         ``visit`` names the visit that holds it, if any. ``held`` is the reason why its cluster may
         begin no motion now, if there is one.

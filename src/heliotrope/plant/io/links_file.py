@@ -360,7 +360,7 @@ class PlantLinks:
     twin: str = ""
 
     def facts(self) -> dict[str, str]:
-        """Return why the last connection was refused and which new keys are not used, by name."""
+        """Return the last refused connection and the new keys that are not used, by name."""
         found = {}
         if self.server is not None and self.server.refused:
             told = f"{self.server.last_refusal} ({self.server.refused} so far)"

@@ -242,7 +242,7 @@ class PathProofs:
         return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
 
     def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str | None:
-        """Return why a heliostat may not rest at the stow position in some items."""
+        """Return the reason why a heliostat may not rest at the stow position in some items."""
         if "stow" not in items:
             return None
         counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
@@ -252,7 +252,7 @@ class PathProofs:
         return blocked.get(heliostat)
 
     def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str | None:
-        """Return why new parameters may not be written in the present pose, None if they may.
+        """Return the reason why new parameters may not be written in this pose, or None.
 
         With the present parameters and with the new ones, its beam must be clear where it stands
         and on the path from there to its standby point. With the present parameters it must also be
@@ -293,7 +293,7 @@ class PathProofs:
             self._earlier.pop(row, None)
 
     def misled(self, heliostat: str, point: FloatArray) -> str | None:
-        """Return why unverified parameters block a path to a point (3,), if they do."""
+        """Return the reason why unverified parameters block a path to a point (3,), if they do."""
         rows = np.array([self.field.place(heliostat)])
         blocked = self._by_earlier(rows, point[None])
         return blocked[heliostat].partition(";")[0] if blocked else None

@@ -164,13 +164,13 @@ class Aiming:
     def view(self) -> AimsView:
         """Return how aims are chosen now."""
         settings, answer, now = self._settings, self._answer, self._plant.now()
-        wanted, aims = self._automatic.movable(), self._automatic.aims
+        movable, aims = self._automatic.movable(), self._automatic.aims
         if settings.limit is None:
             return AimsView(settings.strategy)
         aimed = sum(name in aims for name in self._plant.field.names)
         made = AimsView(
             settings.strategy, self._source, limit=float(np.min(settings.limit.flux)),
-            aimed=aimed, resting=max(int(wanted.sum()) - aimed, 0), problem=self._problem,
+            aimed=aimed, resting=max(int(movable.sum()) - aimed, 0), problem=self._problem,
             moved=self._moved, moved_ago=now - self._moved_at,
         )  # fmt: skip
         if answer is None:
@@ -198,13 +198,13 @@ class Aiming:
 
     async def _step(self, now: float) -> None:
         """Compute and send aims; after a failure the last good aims stay in force."""
-        given = self._round(now)
-        if not given.free.any():
+        present = self._round(now)
+        if not present.free.any():
             self._good_at = now  # no heliostat may be moved, so no aims are late
             return
         try:
             answer = await asyncio.wait_for(
-                self._worker(next_round, given), self._settings.deadline
+                self._worker(next_round, present), self._settings.deadline
             )
         except TimeoutError:
             await self._failed(f"no answer within {self._settings.deadline:g} s")

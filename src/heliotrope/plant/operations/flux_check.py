@@ -58,19 +58,22 @@ def distance(view: PredictedView, measured: FloatArray, mean: float, area: float
 
     Returns
     -------
-    D of the module's text; NaN if no cell was measured.
+    D of the module's text; NaN if no cell was measured, or the prediction's uncertainty is unknown.
     """
+    if measured.ndim and not np.isfinite(view.sigma).any():
+        # Cells have no uncertainty while many beams may be anywhere, but the whole flux has.
+        measured = as_float(np.mean(measured))
     if measured.ndim:
         flux, own, shape = view.flux, view.sigma, SHAPE * view.peak
     else:
         flux, own, shape = as_float(view.power / area), as_float(view.power_sigma / area), 0.0
-    seen = np.isfinite(measured)
-    if not seen.any():
+    visible = np.isfinite(measured)
+    if not visible.any():
         return math.nan
-    square = np.nan_to_num(own) ** 2 + (SCALE**2 + READ**2) * flux**2 + shape**2
+    square = own**2 + (SCALE**2 + READ**2) * flux**2 + shape**2
     square = square + (FLOOR * mean) ** 2
-    away = np.where(seen, measured - flux, 0.0)
-    return float(np.sqrt(np.sum(away**2) / np.sum(square[seen])))
+    away = np.where(visible, measured - flux, 0.0)
+    return float(np.sqrt(np.sum(away**2) / np.sum(square[visible])))
 
 
 class FluxCheck:

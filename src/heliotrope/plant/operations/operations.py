@@ -178,11 +178,8 @@ class Operations:
         self.begun.set()
         async with contextlib.aclosing(self._flux), asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())
-            parts = (
-                self._look(), self._follow(), self._compare(), self._history.run(),
-                self._aiming.run(),
-            )  # fmt: skip
-            beside = [group.create_task(part) for part in parts]
+            parts = self._look, self._follow, self._compare, self._history.run, self._aiming.run
+            beside = [group.create_task(part()) for part in parts]
             await self._closing.wait()
             self.automatic.stop()
             work.cancel()

@@ -101,7 +101,7 @@ class Settings:
         return self.settle + self.shots * self.interval
 
     def closed(self, sun: FloatArray, weather: Weather) -> str | None:
-        """Return why a photograph is impossible at a sun vector (3,) and weather, else None."""
+        """Return the reason why no photograph is possible with this sun and weather, or None."""
         elevation = float(np.arcsin(np.clip(sun[2], -1.0, 1.0)))
         if elevation < self.limits.min_elevation:
             lowest = np.degrees(self.limits.min_elevation)

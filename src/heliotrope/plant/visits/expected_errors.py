@@ -45,7 +45,7 @@ def expected_covariances(
         Names of the parameters whose priors apply before the first calibration, by heliostat.
     """
     design, beliefs = plant.design, plant.beliefs
-    found = np.full((len(heliostats), 2, 2), np.nan)
+    covariances = np.full((len(heliostats), 2, 2), np.nan)
     # Heliostats of one group with the same parameters are computed together.
     parts: dict[tuple[int, tuple[str, ...], bool], list[int]] = {}
     for k, name in enumerate(heliostats):
@@ -70,5 +70,5 @@ def expected_covariances(
         rows = np.array([plant.field.place(name) for name in chosen], dtype=np.intp)
         present, here = nominal.with_parameters(values), plant.field.counts(rows)
         expected = expected_error(present, names, covariance, sun, aims[members], current=here)
-        found[members] = expected.covariance
-    return found
+        covariances[members] = expected.covariance
+    return covariances

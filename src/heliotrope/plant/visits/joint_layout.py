@@ -126,7 +126,7 @@ def _darkened(
 def _unknown(
     plant: PlantController, name: str, error: float, settings: JointSettings
 ) -> str | None:
-    """Return why a beam with an expected error is not known well enough, if that is the case."""
+    """Return the reason why a beam is not known well enough by its expected error, or None."""
     if plant.beliefs.record(name) is None:
         return "it has no calibration yet; it is calibrated alone first"
     if error > settings.known:

@@ -240,7 +240,7 @@ class Centred:
         return aim
 
     def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str | None:
-        """Return why light is not the beam, which moves with its aim."""
+        """Return the reason why light is not the beam, which moves with its aim."""
         place = seen(target, shot)
         if place is None:
             return None if shot.reasons else "no light on the target"
