@@ -146,6 +146,16 @@ def test_aim_a_group_at_a_point_of_the_flux_picture(
     names, operations = field.live.names[6:8], field.live.operations
     receiver = operations.plant.design.receivers[0]
     page = enter("operator")
+
+    def calibrated(route: Any) -> None:
+        """As if all heliostats were calibrated: only then have cells an uncertainty."""
+        view = route.fetch().json()
+        sigma = [
+            [0.1 * abs(value) + 1e3 * k for value in row] for k, row in enumerate(view["flux"])
+        ]
+        route.fulfill(json={**view, "sigma": sigma, "peak_sigma": 0.1 * view["peak"]})
+
+    page.route(f"**/receivers/{receiver.name}/flux", calibrated)
     page.click(".hx-authority >> text=Take command")
     page.wait_for_selector(".hx-authority >> text=You have command")
     # Visits under way go on to their ends.
