@@ -5,6 +5,7 @@ import contextlib
 import os
 import socket
 import struct
+import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -352,6 +353,29 @@ def test_a_socket_of_another_user_is_given_no_token(
     assert connection.recv(100) == b""
     connection.close()
     listener.close()
+
+
+def test_a_connection_that_is_cancelled_while_it_connects_closes_its_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the system closes it much later, and the plant counts a caller too many."""
+    made, begun = list[socket.socket](), threading.Event()
+
+    def slowly(path: Path, timeout: float) -> socket.socket:
+        made.append(connect(path, timeout))
+        begun.set()
+        time.sleep(0.1)
+        return made[0]
+
+    async def work(path: Path, _: _Echo) -> None:
+        monkeypatch.setattr("heliotrope.local.client.connect", slowly)
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(LocalConnection(path, HELLO).run())
+            await asyncio.to_thread(begun.wait)
+            running.cancel()
+        assert made[0].fileno() == -1
+
+    _run(tmp_path, work)
 
 
 def test_requests_under_way_are_bounded(tmp_path: Path) -> None:

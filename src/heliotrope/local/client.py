@@ -78,7 +78,7 @@ class LocalConnection:
 
     async def _live(self) -> None:
         """Connect, and receive replies until the connection ends."""
-        raw = await asyncio.to_thread(connect, self._path, 2.0)
+        raw = await self._connect()
         raw.setblocking(False)
         reader, writer = await asyncio.open_unix_connection(sock=raw)
         try:
@@ -98,6 +98,17 @@ class LocalConnection:
                 if not waiting.done():
                     waiting.set_exception(self._away("the connection has ended"))
             self._waiting.clear()
+
+    async def _connect(self) -> socket.socket:
+        """Connect in a thread; close the socket if this is cancelled meanwhile."""
+        loop = asyncio.get_running_loop()
+        connecting = loop.run_in_executor(None, connect, self._path, 2.0)
+        try:
+            return await asyncio.shield(connecting)
+        except asyncio.CancelledError:
+            with contextlib.suppress(OSError):
+                (await connecting).close()
+            raise
 
     def _away(self, why: str) -> AwayError:
         return AwayError(f"the plant's process does not answer ({why}); see whether it runs")
