@@ -50,7 +50,7 @@ class SnapshotSource(Source):
     """
 
     url: str
-    interval: float = 1.0
+    interval: float = 5.0
     timeout: float = 10.0
 
     def __post_init__(self) -> None:

@@ -41,8 +41,8 @@ _HANGS = 60.0
 #: Time within which clusters send their first orders, and within which the plant receives word that
 #: the field is tracking, s.
 _BEGUN, _REPORTED = 0.5, 1.2
-#: Wall time between checks of the leases, s.
-_CHECKED = 0.02
+#: Least and greatest wall time between checks of the leases, s; each looks at all clusters.
+_CHECKED, _RARELY = 0.02, 0.2
 #: Clusters soon retry the connection to a plant that starts beside them.
 _LINK = LinkSettings(longest_pause=0.2)
 #: Time between values of the sensors, s.
@@ -242,7 +242,8 @@ async def _hold(world: World, loop: PacedLoop) -> None:
             said = time.monotonic()
         hangs = time.monotonic() - said > _HANGS
         loop.until = math.inf if hangs else loop.time() + max(0.0, ends)
-        await _wall(_CHECKED)
+        # Most of what is left may pass unchecked, because the loop stops at `until` by itself.
+        await _wall(min(max(_CHECKED, 0.25 * ends / max(1.0, loop.speed)), _RARELY))
 
 
 def _ends(cluster: Cluster, link: CarriedLink) -> float:

@@ -90,7 +90,7 @@ class TwinServer:
                 self.wfile.write(body)
 
             def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-                """Write nothing, because a camera is polled each second."""
+                """Write nothing, because cameras are polled all the time."""
 
         self._server = _Server(serves, Handler)
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
