@@ -1,6 +1,7 @@
 """Aim points that keep the flux on a receiver under a limit despite pointing errors.
 
-- `FluxLimit`: the allowable flux on a receiver, a number or a map (`heliotrope.field.flux_limit`).
+- `FluxLimit`: the allowable flux on a receiver, a number or a map (`heliotrope.field.flux_limit`);
+  `FluxTable` gives one by the fluid's temperature and velocity (`heliotrope.field.flux_table`).
 - `candidates` and `optimiser`: images of each mirror at a few aims, and the choice that maximises
   power.
 - `errors`: the uncertainty of the flux due to each mirror's own error and to shared errors.
@@ -16,18 +17,32 @@ from heliotrope.aims.plan import AimPlan, compare_aims, plan_aims
 from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene
 from heliotrope.aims.strategies import STRATEGIES
 from heliotrope.field.flux_limit import FluxLimit, read_limit
+from heliotrope.field.flux_table import (
+    FluxTable,
+    Panel,
+    limit_of,
+    read_flux_table,
+    read_panels,
+    read_table_limit,
+)
 
 __all__ = [
     "STRATEGIES",
     "AimPlan",
     "Demand",
     "FluxLimit",
+    "FluxTable",
+    "Panel",
     "Risk",
     "SceneAims",
     "SharedErrors",
     "aim_scene",
     "compare_aims",
+    "limit_of",
     "plan_aims",
+    "read_flux_table",
     "read_limit",
+    "read_panels",
+    "read_table_limit",
     "write_aims",
 ]

@@ -53,6 +53,10 @@ def aim(
     limit: Annotated[
         str, typer.Option(help="Allowable flux: kW/m², or a file of the cells' (CSV, W/m²).")
     ],
+    panels: Annotated[
+        Path | None,
+        typer.Option(help="Panels with the fluid's state (CSV); --limit is then a table (CSV)."),
+    ] = None,
     margin: Annotated[
         float, typer.Option(min=0, max=0.5, help="Share of it kept for the model's own error.")
     ] = 0.01,
@@ -102,7 +106,7 @@ def aim(
         dni, shape, air, slope_mrad, error_mrad, reflectivity, clean, focus, facets, cells, tower
     )
     _check(field, csv, picture)
-    allowed = _limit(limit, margin)
+    allowed = _limit(limit, margin, panels)
     if time is not None and sun is not None:
         raise InputError("give --time or --sun, not both")
     plant = open_plant(field, None if site is None else parse_site(site))
@@ -147,9 +151,11 @@ def _check(field: Path, csv: Path | None, picture: Path | None) -> None:
     check_outputs(tuple(path for path in (csv, picture) if path is not None), field, None)
 
 
-def _limit(text: str, margin: float) -> "FluxLimit":
-    from heliotrope.aims import FluxLimit, read_limit
+def _limit(text: str, margin: float, panels: Path | None) -> "FluxLimit":
+    from heliotrope.aims import FluxLimit, read_limit, read_table_limit
 
+    if panels is not None:
+        return read_table_limit(text, panels, margin)
     if Path(text).suffix.lower() == ".csv":
         return read_limit(text, margin)
     refusal = f"--limit {shown(text)}: give kW/m² from 0.001 to 64000, or a file .csv in W/m²"

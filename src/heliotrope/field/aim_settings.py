@@ -66,7 +66,7 @@ class AimSettings:
                 f"aims: strategy {self.strategy!r}; give one of {', '.join(AIM_STRATEGIES)}"
             )
         if self.strategy == "limit" and self.limit is None:
-            raise InputError('aims: strategy "limit" needs limit_kw_m2 or limit_map')
+            raise InputError('aims: strategy "limit" needs limit_kw_m2, limit_map or limit_table')
         if self.strategy == "spread" and self.limit is not None:
             raise InputError('aims: a flux limit needs strategy = "limit"; add it, or remove it')
         ranges = {

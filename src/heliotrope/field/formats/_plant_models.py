@@ -429,6 +429,14 @@ class AimsTable(StrictTable):
         description="Allowable flux of each cell, W/m²: a file of numbers (CSV) beside this one, "
         "highest row first.",
     )
+    limit_table: str = Field(
+        "",
+        description="Allowable flux over temperature and velocity of the fluid: a table (CSV) "
+        "beside this one; needs limit_panels.",
+    )
+    limit_panels: str = Field(
+        "", description="Panels with the state of the fluid: a table (CSV) beside this one."
+    )
     margin: Number = Field(0.05, description="Share kept for the model's own error; 0 to 0.5.")
     probability: Number = Field(
         AimSettings.probability, description="That the limit holds everywhere; 0.5 to 0.9999."
