@@ -55,6 +55,19 @@ def test_json_keeps_the_limit_of_a_file(aim: Any) -> None:
     assert len(got["heliostats"]) == 18
 
 
+def test_a_uniform_flux_and_a_ramp_are_told(aim: Any) -> None:
+    code, out, err = aim(
+        "--limit=120", "--wanted=uniform", "--give-percent=5", "--ramp=5", "--csv=a.csv"
+    )
+    assert code == 0, err
+    assert "differs from the wanted one by" in out
+    assert "start-up: the last of" in out
+    with Path("a.csv").open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    assert all((row["joins_s"] != "") == (row["state"] == "aim") for row in rows)
+    assert len({row["joins_s"] for row in rows}) > 2
+
+
 def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> None:
     Path("afd.csv").write_text(
         "temperature_c,velocity_m_s,flux_w_m2\n290,2,160000\n565,2,80000\n", encoding="utf-8"
@@ -80,6 +93,7 @@ def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> N
         (("--limit=much",), "--limit 'much': give kW/m²"),
         (("--limit=none.csv",), "none.csv"),
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
+        (("--limit=100", "--wanted=even"), "--wanted 'even': give uniform"),
         (("--limit=100", "--time=now"), "--time or --sun"),
         (("--limit=100", "--receiver=other"), "other"),
     ],

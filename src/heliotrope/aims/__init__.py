@@ -5,6 +5,7 @@
 - `candidates` and `optimiser`: images of each mirror at a few aims, and the choice that maximises
   power.
 - `errors`: the uncertainty of the flux due to each mirror's own error and to shared errors.
+- `ramp`: when each mirror joins along a ramp.
 - `scene_aims`: aims for a scene; `plan`: aims for a plant; `strategies`: simpler strategies for
   comparison.
 
@@ -14,6 +15,7 @@ Begin with `plan_aims`, which is `heliotrope.aim`.
 from heliotrope.aims.errors import Risk, SharedErrors
 from heliotrope.aims.files import write_aims
 from heliotrope.aims.plan import AimPlan, compare_aims, plan_aims
+from heliotrope.aims.ramp import ramp_up
 from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene
 from heliotrope.aims.strategies import STRATEGIES
 from heliotrope.field.flux_limit import FluxLimit, read_limit
@@ -40,6 +42,7 @@ __all__ = [
     "compare_aims",
     "limit_of",
     "plan_aims",
+    "ramp_up",
     "read_flux_table",
     "read_limit",
     "read_panels",

@@ -253,39 +253,24 @@ class _Path:
         count = int(np.clip(np.ceil(far.max(initial=0.0)) + 1, 2, PLACES))
         at = np.linspace(0.0, 1.0, count)[:, None]
         looks = start[:, None] + at * (end - start)[:, None]
-        self._images: Images = engine.images(as_float(looks), np.zeros(len(some), dtype=np.int64))
+        self.images: Images = engine.images(as_float(looks), np.zeros(len(some), dtype=np.int64))
         self.aimed, self.goes = aimed, goes
 
     def flux(self, which: Mask) -> FloatArray:
         """Return the flux of mirrors at their present aims, (columns, rows)."""
-        total = np.zeros(self._images.shape[::-1])
+        total = np.zeros(self.images.shape[::-1])
         for row in np.flatnonzero(which):
-            total += self.image(int(row), 0)
+            total += self.images.of(int(row))
         return total
-
-    def image(self, row: int, place: int) -> FloatArray:
-        """Return the image of a mirror at a position on its path, W/m², (columns, rows)."""
-        images = self._images
-        rows, wide = images.shape
-        j = row * images.looks + place % images.looks
-        first, columns, bottom, tall = (int(n) for n in images.box[j])
-        out = np.zeros((wide, rows))
-        low, high = max(bottom, 0), min(bottom + tall, rows)
-        if columns <= 0 or high <= low:
-            return out
-        begin = int(images.begin[j])
-        block = images.values[begin : begin + columns * tall].reshape(columns, tall)
-        out[(first + np.arange(columns)) % wide, low:high] = block[:, low - bottom : high - bottom]
-        return out
 
     def most(self, row: int, *, shines: bool) -> PathImages:
         """Return a mirror's image before, its maximum on the path, and its image after."""
-        before = self.image(row, 0) if self.aimed[row] else np.zeros(self._images.shape[::-1])
-        after = self.image(row, -1) if self.goes[row] else np.zeros_like(before)
+        before = self.images.of(row) if self.aimed[row] else np.zeros(self.images.shape[::-1])
+        after = self.images.of(row, -1) if self.goes[row] else np.zeros_like(before)
         greatest = np.maximum(before, after)
         if shines and self.aimed[row] and self.goes[row]:
-            for place in range(1, self._images.looks - 1):
-                greatest = np.maximum(greatest, self.image(row, place))
+            for place in range(1, self.images.looks - 1):
+                greatest = np.maximum(greatest, self.images.of(row, place))
         return before, greatest, after
 
 
@@ -353,12 +338,12 @@ class _Walk:
             over = np.maximum(self._flux - (1.0 + HOLDS) * self._cap, 0.0)
             if not over.any():
                 break
-            share = [float((self._path.image(int(row), 0) * over).sum()) for row in rows]
+            share = [float((self._path.images.of(int(row)) * over).sum()) for row in rows]
             k = int(np.argmax(share))
             if share[k] <= 0.0:
                 break
             row = rows[k : k + 1]
-            self._flux = self._flux - self._path.image(int(row[0]), 0)
+            self._flux = self._flux - self._path.images.of(int(row[0]))
             moves.append(_rest(row))
             self.done = np.union1d(self.done, row).astype(np.intp)
             rows = np.delete(rows, k)
