@@ -16,6 +16,7 @@ _KEYS = {
     "clock_s": ("clock", 1.0),
     "cluster_mrad": ("cluster", 1e-3),
     "dni_w_m2": ("dni", 1.0),
+    "ramp_kw_m2_min": ("ramp", 1e3 / 60.0),
     "moves_per_minute": ("moves", 1.0),
     "every_s": ("every", 1.0),
     "deadline_s": ("deadline", 1.0),

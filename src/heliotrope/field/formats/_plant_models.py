@@ -447,6 +447,11 @@ class AimsTable(StrictTable):
     dni_w_m2: Number = Field(
         AimSettings.dni, description="The limit holds at this irradiance at least; 1 to 1500."
     )
+    ramp_kw_m2_min: Number = Field(
+        0.0,
+        description="Greatest rise of the flux in a cell while the receiver is heated after "
+        "standby or a cloud, kW/m² a minute; 0: no ramp.",
+    )
     moves_per_minute: Number = Field(
         AimSettings.moves, description="Tracking heliostats that get another aim; 1 to 6000."
     )

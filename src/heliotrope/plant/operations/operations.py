@@ -166,7 +166,7 @@ class Operations:
         self._records = records
         self._flux = PredictedFlux(plant, self.viewer, automatic.book, automatic.installed, worker)
         self.flux_check = FluxCheck(plant, self._flux, logbook)
-        self._aiming = Aiming(plant, logbook, automatic, self._flux, worker)
+        self._aiming = Aiming(plant, logbook, automatic, self.flux_check, worker)
         self._closing, self.begun = asyncio.Event(), asyncio.Event()
 
     # -- running ---------------------------------------------------------------------------
