@@ -144,12 +144,15 @@ def true_scene(live: PlantAssembly, world: World) -> Scene:
 
 
 async def live_through(count: int, minutes: float, case: str) -> tuple[Seen, float, float]:
-    """Return what was seen, the limit, and the greatest flux of its cells in W/m²."""
+    """Return what was seen, the limit, and the greatest flux of a cell, W/m²."""
     clock = VirtualClock(asyncio.get_running_loop().time, BEGIN)
     design, limit = design_of(count)
     world = World(design, clock, WorldOptions(rendered=False, installed=lambda mechanism: mechanism))
     sky, seen = Sky(clock), Seen()
-    work = AutomaticSettings(wanted=True, calibrate=False, rate=20.0)
+    # A lost cluster must not make automatic control wait for a person.
+    work = AutomaticSettings(
+        wanted=True, calibrate=False, rate=20.0, losses=count, losses_share=1.0
+    )
     settings = AssemblySettings(work, cycle=CYCLE, machines=MachineTables.HELD)
     live = PlantAssembly(design, replace(world.ports(), sensors=sky), settings)
     power = [0.0]

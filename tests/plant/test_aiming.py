@@ -21,6 +21,7 @@ from heliotrope.plant.operations import aiming
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.workers import at_once
 from heliotrope.twin.sensors import FluxSensor
 from support.live import LiveOptions, LivePlant, play
 
@@ -141,6 +142,49 @@ def test_a_heliostat_that_leaves_makes_room_and_a_person_s_beam_stays() -> None:
         plant.release_authority(person, token)
         assert await greatest(made, 45.0, 5.0) <= LIMIT
         np.testing.assert_allclose(plant.aims[plant.field.place(name)], point)
+
+    played(scene)
+
+
+class Kept:
+    """A store that names the beams that people have aimed."""
+
+    aimed: tuple[str, ...] = ()
+
+    def aimed_by_people(self) -> tuple[str, ...]:
+        return self.aimed
+
+    def keep_aimed_by_people(self, heliostats: tuple[str, ...]) -> None:
+        self.aimed = heliostats
+
+
+def test_a_person_s_beam_stays_the_person_s_after_a_restart() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        plant, operations, kept = made.plant, made.operations, Kept()
+        first, second = sorted(operations.automatic.aims)[:2]
+
+        def program() -> aiming.Aiming:
+            """Return the aiming of a program that has just begun."""
+            given = operations.automatic, operations.flux_check, at_once
+            new = aiming.Aiming(plant, operations.logbook, *given, kept)  # type: ignore[arg-type]
+            new.recall()
+            return new
+
+        before = program()
+        assert before._movers(plant.now())[plant.field.place(first)]
+        before.by_person((first, second), aimed=True)
+        before.by_person((second,), aimed=False)
+        assert kept.aimed == (first,)
+        after = program()
+        assert not after._movers(plant.now())[plant.field.place(first)]
+        assert after._movers(plant.now())[plant.field.place(second)]
+        now = after._round(plant.now())
+        np.testing.assert_allclose(
+            now.fixed[plant.field.place(first)], plant.aims[plant.field.place(first)]
+        )
+        after.by_person((), aimed=False)
+        assert kept.aimed == ()
 
     played(scene)
 

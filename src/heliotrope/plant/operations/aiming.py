@@ -39,6 +39,7 @@ from heliotrope.plant.operations.flux_check import Beyond, FluxCheck
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.workers import Worker
 from heliotrope.safety import alarms
+from heliotrope.store.records import Records, StoreError
 from heliotrope.sun import clear_sky
 
 #: A beam without reports may still be where it was for this time, s.
@@ -128,6 +129,8 @@ class Aiming:
         The measured flux and the prediction.
     worker
         Place for the computation.
+    records
+        Store that names the beams that people have aimed after a restart; None: there is none.
     """
 
     def __init__(
@@ -137,7 +140,9 @@ class Aiming:
         automatic: AutomaticControl,
         check: FluxCheck,
         worker: Worker,
+        records: Records | None = None,
     ) -> None:
+        self._records = records
         self._plant, self._log, self._automatic = plant, log, automatic
         self._check, self._worker, self._settings = check, worker, plant.design.aims
         count = len(plant.field)
@@ -159,7 +164,26 @@ class Aiming:
     def by_person(self, heliostats: Sequence[str], *, aimed: bool) -> None:
         """Note that an operator has aimed heliostats (() for all), or returned them."""
         rows = [self._plant.field.place(name) for name in heliostats or self._plant.field.names]
+        if (self._by_person[rows] == aimed).all():
+            return
         self._by_person[rows] = aimed
+        if self._records is not None:
+            names = np.array(self._plant.field.names)[self._by_person]
+            try:
+                self._records.keep_aimed_by_people(tuple(names.tolist()))
+            except StoreError as error:
+                self._log.take_alarm(alarms.RECORDS.raised(problem=error))
+
+    def recall(self) -> None:
+        """Leave the beams where they are that people had aimed when the last program ended."""
+        if self._records is None:
+            return
+        try:
+            names = self._records.aimed_by_people()
+        except StoreError as error:
+            self._log.take_alarm(alarms.RECORDS.raised(problem=error))
+            return
+        self._by_person |= np.isin(self._plant.field.names, names)
 
     def points(self, heliostats: Sequence[str]) -> Mapping[str, FloatArray]:
         """Return the aims on the first receiver, ENU, m, (3,), by name.
