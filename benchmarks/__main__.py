@@ -20,7 +20,7 @@ NAMES = (
     "control", "plant", "airborne", "console", "day", "learning", "signing",
     "splits", "coded", "production", "commission", "drifting", "obstruction", "floor",
     "prototype", "heliopoint", "spots", "first_run", "flux",
-    "aiming",
+    "aiming", "clouds",
 )  # fmt: skip
 #: Width of a table that goes to a file or a pipe, characters.
 WIDTH = 180

@@ -110,11 +110,15 @@ COLUMNS = {
         "excess_percent", "warm_s", "warm_processor_s", "warm_gap_percent", "power_mw",
         "image_size_mw", "image_size_peak_of_limit",
     },
+    "clouds": {
+        "case", "heliostats", "simulated_min", "flux_over_limit_percent", "back_percent",
+        "kept_percent", "aimed_most", "cpu_s",
+    },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 #: A browser with fifty viewers, plants, days and many pictures take their time.
 SLOW = {
-    "coded", "commission", "console", "control", "day", "drifting", "first_run", "flux", "imaging",
+    "clouds", "coded", "commission", "console", "control", "day", "drifting", "first_run", "flux", "imaging",
     "obstruction", "production", "prototype", "spots",
 }  # fmt: skip
 RESULT = {

@@ -8,9 +8,18 @@ import pytest
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 import heliotrope as ht
-from heliotrope.aims import Demand, FluxLimit, SceneAims, SharedErrors, aim_scene, read_limit
+from heliotrope.aims import (
+    Demand,
+    FluxLimit,
+    SceneAims,
+    SharedErrors,
+    aim_scene,
+    ramp_up,
+    read_limit,
+)
 from heliotrope.aims.candidates import candidates
 from heliotrope.aims.optimiser import bound, optimise
+from heliotrope.aims.scene_aims import deviation
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.geometry import normalize, reflect
 from heliotrope.optics.receiver_flux import FieldFlux
@@ -121,6 +130,55 @@ def test_the_engine_s_flux_keeps_the_limit(scene: Scene, peak: float, held: Scen
     # It loses less than what needs no limit, and no more than the middle has.
     assert spread.engine.powers[0] < held.engine.powers[0] <= 1.01 * middle.engine.powers[0]
     assert held.binding.any()
+
+
+def test_a_uniform_flux_is_evener_for_the_power_that_may_be_given_up(
+    scene: Scene, peak: float, held: SceneAims
+) -> None:
+    uniform, ones = FluxLimit(1.0), np.ones((28, 18)).T
+    got = aim_scene(scene, Demand(FluxLimit(0.6 * peak), wanted=uniform, give=0.05))
+    flux, before = got.engine.maps[0], held.engine.maps[0]
+    assert flux.max() < 0.95 * before.max()
+    assert 0.95 * held.engine.powers[0] <= got.engine.powers[0]
+    assert deviation(flux, ones) < deviation(before, ones) - 0.03
+    nothing = aim_scene(scene, Demand(FluxLimit(0.6 * peak), wanted=uniform, give=0.0))
+    assert nothing.engine.powers[0] >= held.engine.powers[0]
+    with pytest.raises(InputError, match="60 % of the power"):
+        Demand(FluxLimit(peak), wanted=uniform, give=0.6)
+
+
+def test_a_wanted_map_draws_the_flux_to_it_and_the_limit_holds(
+    scene: Scene, peak: float, held: SceneAims
+) -> None:
+    wanted = np.tile(np.linspace(2.0, 1.0, 6)[:, None], 3)  # more light below
+    demand = Demand(FluxLimit(0.6 * peak), wanted=FluxLimit(wanted), give=0.2)
+    got = aim_scene(scene, demand)
+    on = demand.wanted.on(18, 28) if demand.wanted is not None else wanted
+    assert deviation(got.engine.maps[0], on) < deviation(held.engine.maps[0], on) - 0.05
+    assert got.engine.maps[0].max() <= 0.6 * peak
+    assert got.engine.powers[0] >= 0.8 * held.engine.powers[0]
+    low, high = np.split(got.engine.maps[0], 2)
+    assert low.sum() > 1.1 * high.sum()
+
+
+def test_along_a_ramp_no_cell_heats_faster_than_it_may(scene: Scene, held: SceneAims) -> None:
+    peak = float(held.engine.maps[0].max())
+    joins = ramp_up(held, peak / 600.0, 60.0)
+    assert np.isnan(joins).sum() == held.defocused.sum()
+    before = np.zeros((18, 28))
+    for k in range(round(np.nanmax(joins) / 60.0) + 1):
+        here = joins <= 60.0 * k
+        flux = FieldFlux(replace(held.engine.scene, dark=~here)).maps[0]
+        # Heliostats that wait shade as those that shine.
+        assert flux.max() <= 1.005 * (k + 1) * peak / 10.0
+        assert (flux >= before - 1e-3 * peak).all()
+        before = flux
+    assert before.max() == pytest.approx(peak, rel=1e-3)
+    assert 540.0 <= np.nanmax(joins) <= 900.0, "nearly as fast as the ramp"
+    with pytest.raises(InputError, match="both must be above 0"):
+        ramp_up(held, 0.0)
+    with pytest.raises(InputError, match="more than 2000 steps"):
+        ramp_up(held, 1e-3)
 
 
 def test_a_map_binds_where_it_is_low(scene: Scene, peak: float) -> None:

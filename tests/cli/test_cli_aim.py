@@ -55,12 +55,45 @@ def test_json_keeps_the_limit_of_a_file(aim: Any) -> None:
     assert len(got["heliostats"]) == 18
 
 
+def test_a_uniform_flux_and_a_ramp_are_told(aim: Any) -> None:
+    code, out, err = aim(
+        "--limit=120", "--wanted=uniform", "--give-percent=5", "--ramp=5", "--csv=a.csv"
+    )
+    assert code == 0, err
+    assert "differs from the wanted one by" in out
+    assert "start-up: the last of" in out
+    with Path("a.csv").open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    assert all((row["joins_s"] != "") == (row["state"] == "aim") for row in rows)
+    assert len({row["joins_s"] for row in rows}) > 2
+
+
+def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> None:
+    Path("afd.csv").write_text(
+        "temperature_c,velocity_m_s,flux_w_m2\n290,2,160000\n565,2,80000\n", encoding="utf-8"
+    )
+    Path("panels.csv").write_text(
+        "path,begin,end,flow,inlet_c,outlet_c,velocity_m_s\n"
+        "west,0,0.5,up,290,565,2\neast,0.5,1,down,290,565,2\n",
+        encoding="utf-8",
+    )
+    code, out, err = aim("--limit=afd.csv", "--panels=panels.csv", "--margin=0", "--json")
+    assert code == 0, err
+    got = json.loads(out)
+    limit, flux = np.array(got["limit_w_m2"]), np.array(got["quantile_w_m2"])
+    assert limit[-1, 0] == limit[0, -1] == 80000.0
+    assert limit[0, 0] > 150000.0
+    assert (flux <= limit).all()
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
         (("--limit=5", "--keep-all"), "no aims were found that hold the flux limit"),
         (("--limit=much",), "--limit 'much': give kW/m²"),
         (("--limit=none.csv",), "none.csv"),
+        (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
+        (("--limit=100", "--wanted=even"), "--wanted 'even': give uniform"),
         (("--limit=100", "--time=now"), "--time or --sun"),
         (("--limit=100", "--receiver=other"), "other"),
     ],

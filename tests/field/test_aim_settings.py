@@ -40,13 +40,38 @@ def test_a_map_stands_beside_the_plant_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.limit.flux, flux)
 
 
+def test_a_table_is_read_with_its_panels_and_kept_as_a_map(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    write_plant(replace(lay_out("radial", 6), aims=NUMBER), path)
+    (tmp_path / "afd.csv").write_text(
+        "temperature_c,velocity_m_s,flux_w_m2\n290,1,8e5\n565,1,4e5\n290,3,1.2e6\n565,3,6e5\n"
+    )
+    (tmp_path / "panels.csv").write_text(
+        "path,begin,end,flow,inlet_c,outlet_c,velocity_m_s\n"
+        "west,0,0.5,up,290,565,2\neast,0.5,1,down,290,565,3\n"
+    )
+    keys = 'limit_table = "afd.csv"\nlimit_panels = "panels.csv"'
+    path.write_text(path.read_text().replace("limit_kw_m2 = 600.0", keys))
+    read = read_plant(path)
+    assert read.aims.limit is not None
+    got = read.aims.limit.on(10, 4)
+    assert got[-1, 0] == pytest.approx(0.9 * 5e5)
+    assert got[0, 3] == pytest.approx(0.9 * 6e5)
+    write_plant(read, tmp_path / "again.toml")
+    again = read_plant(tmp_path / "again.toml").aims.limit
+    assert again is not None
+    np.testing.assert_allclose(again.on(10, 4), got)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "text"),
     [
-        ("limit_kw_m2 = 600.0", "", "needs limit_kw_m2 or limit_map"),
+        ("limit_kw_m2 = 600.0", "", "needs limit_kw_m2, limit_map or limit_table"),
         ("limit_kw_m2 = 600.0", "limit_kw_m2 = -3.0", "limit_kw_m2"),
         ("limit_kw_m2 = 600.0", 'limit_map = "none.csv"', "none.csv"),
         ("limit_kw_m2 = 600.0", 'limit_kw_m2 = 1.0\nlimit_map = "a.csv"', "give one of them"),
+        ("limit_kw_m2 = 600.0", 'limit_table = "a.csv"', "limit_panels belong together"),
+        ("limit_kw_m2 = 600.0", 'limit_map = "b"\nlimit_table = "a.csv"', "give one of them"),
         ('strategy = "limit"', 'strategy = "spread"', 'needs strategy = "limit"'),
         ('strategy = "limit"', 'strategy = "best"', "aims.strategy"),
         ("margin = 0.1", "margin = 0.7", "a margin of 0.7"),

@@ -16,13 +16,19 @@ from heliotrope.lcu import states
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.surfaces import surface_of
+from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations import aiming
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.orders.authority import Person, Role
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.workers import at_once
+from heliotrope.twin.sensors import FluxSensor
 from support.live import LiveOptions, LivePlant, play
 
 COUNT = 6
 LIMIT = 70e3
+#: Of the receiver, W.
+NOMINAL = 1e5
 
 
 def exact(mechanism: Mechanism) -> Mechanism:
@@ -31,7 +37,10 @@ def exact(mechanism: Mechanism) -> Mechanism:
 
 
 def played(
-    work: Callable[[LivePlant], Awaitable[None]], limit: float = LIMIT, **changes: object
+    work: Callable[[LivePlant], Awaitable[None]],
+    limit: float = LIMIT,
+    sensors: tuple[str, ...] = (),
+    **changes: object,
 ) -> None:
     """Run a small field in virtual time, with a flux limit."""
     design = lay_out("radial", COUNT)
@@ -41,13 +50,19 @@ def played(
     settings: dict[str, object] = {"probability": 0.95, "moves": 60.0, "every": 15.0}
     aims = AimSettings("limit", FluxLimit(limit, 0.05), **(settings | changes))  # type: ignore[arg-type]
     work_settings = AutomaticSettings(wanted=True, calibrate=False, rate=5.0)
-    options = LiveOptions(rendered=False, threads=0, work=work_settings, installed=exact)
+    plant = PlantSettings(sensors=frozenset(sensors))
+    options = LiveOptions(
+        rendered=False, threads=0, work=work_settings, installed=exact, plant=plant
+    )
 
     async def later(made: LivePlant) -> None:
         await asyncio.sleep(4.0)
         await work(made)
 
-    play(later, replace(design, groups={name: group}, aims=aims), options)
+    (receiver,) = design.receivers
+    receivers = (replace(receiver, nominal_power=NOMINAL),)
+    design = replace(design, groups={name: group}, aims=aims, receivers=receivers)
+    play(later, design, options)
 
 
 def true_flux(made: LivePlant) -> FloatArray:
@@ -131,6 +146,49 @@ def test_a_heliostat_that_leaves_makes_room_and_a_person_s_beam_stays() -> None:
     played(scene)
 
 
+class Kept:
+    """A store that names the beams that people have aimed."""
+
+    aimed: tuple[str, ...] = ()
+
+    def aimed_by_people(self) -> tuple[str, ...]:
+        return self.aimed
+
+    def keep_aimed_by_people(self, heliostats: tuple[str, ...]) -> None:
+        self.aimed = heliostats
+
+
+def test_a_person_s_beam_stays_the_person_s_after_a_restart() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        plant, operations, kept = made.plant, made.operations, Kept()
+        first, second = sorted(operations.automatic.aims)[:2]
+
+        def program() -> aiming.Aiming:
+            """Return the aiming of a program that has just begun."""
+            given = operations.automatic, operations.flux_check, at_once
+            new = aiming.Aiming(plant, operations.logbook, *given, kept)  # type: ignore[arg-type]
+            new.recall()
+            return new
+
+        before = program()
+        assert before._movers(plant.now())[plant.field.place(first)]
+        before.by_person((first, second), aimed=True)
+        before.by_person((second,), aimed=False)
+        assert kept.aimed == (first,)
+        after = program()
+        assert not after._movers(plant.now())[plant.field.place(first)]
+        assert after._movers(plant.now())[plant.field.place(second)]
+        now = after._round(plant.now())
+        np.testing.assert_allclose(
+            now.fixed[plant.field.place(first)], plant.aims[plant.field.place(first)]
+        )
+        after.by_person((), aimed=False)
+        assert kept.aimed == ()
+
+    played(scene)
+
+
 def test_a_limit_that_no_aims_hold_keeps_the_field_at_standby_with_an_alarm() -> None:
     async def scene(made: LivePlant) -> None:
         assert await greatest(made, 60.0, 10.0) == 0.0
@@ -174,3 +232,91 @@ def test_without_answers_the_last_good_aims_stay_and_then_the_safe_spread(
         assert not [a for a in operations.logbook.alarms() if a.active and a.condition == "aims"]
 
     played(scene, deadline=30.0)
+
+
+class Sky:
+    """Puts readings into the plant every few seconds."""
+
+    def __init__(self, made: LivePlant) -> None:
+        self.made, self.dni, self.flux = made, 950.0, 1.0
+
+    async def shine(self) -> None:
+        while True:
+            self.made.plant.put(DNI_READING, self.dni)
+            await asyncio.sleep(3.0)
+
+    def share(self) -> float:
+        """Return what a flux sensor says that reads ``flux`` times the true flux."""
+        area = float(surface_of(self.made.design.receivers[0]).cells.area.sum())
+        mean = 1e-3 * self.dni * float(true_flux(self.made).mean())
+        return self.flux * mean * area / NOMINAL
+
+
+def test_the_receiver_is_heated_in_steps_at_the_start_and_after_a_cloud() -> None:
+    ramp, every = 30e3, 15.0
+
+    async def scene(made: LivePlant) -> None:
+        sky = Sky(made)
+        async with asyncio.TaskGroup() as group:
+            shining = group.create_task(sky.shine())
+            seen: list[float] = []
+
+            async def watched(seconds: float) -> list[float]:
+                """Return the greatest true flux in full sun, in each period of the ramp."""
+                begun = len(seen)
+                for _ in range(int(seconds / every)):
+                    most = await greatest(made, every)
+                    seen.append(0.95 * most)
+                return seen[begun:]
+
+            up = await watched(150.0)
+            assert up[-1] > 1.5 * ramp
+            # One step at the present flux, and one that has just been allowed.
+            rises = np.diff([0.0, *up])
+            assert rises.max() <= 1.3 * ramp, rises
+            sky.dni = 20.0
+            cloud = await watched(135.0)
+            assert cloud[2] > 0.9 * up[-1], "a short cloud changes nothing"
+            assert cloud[-1] <= 1.3 * ramp, "what the sun would bring at once"
+            assert cloud[-1] > 0.0, "not the whole field leaves"
+            sky.dni = 950.0
+            back = await watched(120.0)
+            assert np.diff([cloud[-1], *back]).max() <= 1.3 * ramp
+            assert back[-1] > 0.9 * up[-1]
+            shining.cancel()
+
+    played(scene, sensors=(DNI_READING,), ramp=ramp / every)
+
+
+def test_a_measured_flux_relieves_the_spot_and_a_lying_sensor_does_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scene(made: LivePlant) -> None:
+        sky = Sky(made)
+        monkeypatch.setattr(FluxSensor, "share", lambda _: sky.share())
+        async with asyncio.TaskGroup() as group:
+            shining = group.create_task(sky.shine())
+            await up(made)
+            await asyncio.sleep(40.0)
+            before = await greatest(made, 15.0)
+            sky.flux = 4.0
+            assert await greatest(made, 45.0) > 0.97 * before, "no beam can have brought that"
+            assert not texts(made, "flux_above_limit")
+            sky.flux = 1.4
+            await asyncio.sleep(60.0)
+            assert texts(made, "flux_above_limit"), "raised, and over since beams left"
+            after = await greatest(made, 30.0)
+            assert 0.5 * before < after < 0.9 * before
+            sky.flux = 1.0
+            await asyncio.sleep(60.0)
+            assert not texts(made, "flux_above_limit", active=True)
+            assert await greatest(made, 15.0) < 0.9 * before, "wary for a while"
+            shining.cancel()
+
+    played(scene, sensors=(DNI_READING,))
+
+
+def texts(made: LivePlant, condition: str, *, active: bool = False) -> list[str]:
+    """Return the texts of the alarms of a condition."""
+    alarms = made.operations.logbook.alarms()
+    return [a.text for a in alarms if a.condition == condition and a.active >= active]

@@ -3,6 +3,7 @@
 import asyncio
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -425,3 +426,13 @@ class TestOpening:
         with pytest.raises(StoreError) as caught:
             Keeper(f"postgresql://plant:secret@/x?host={tmp_path}")
         assert "secret" not in str(caught.value)
+
+
+def test_beams_that_people_have_aimed_are_kept(tmp_path: Path) -> None:
+    with closing(Keeper(tmp_path, inline=True)) as keeper:
+        assert keeper.aimed_by_people() == ()
+        keeper.keep_aimed_by_people(("P1A", "P2B"))
+    with closing(Keeper(tmp_path, inline=True)) as keeper:
+        assert keeper.aimed_by_people() == ("P1A", "P2B")
+        keeper.keep_aimed_by_people(())
+        assert keeper.aimed_by_people() == ()

@@ -5,7 +5,8 @@ import pytest
 
 from heliotrope.links.clock import VirtualClock
 from heliotrope.safety import CONDITIONS
-from heliotrope.twin.weather import WeatherStation, clear_sky
+from heliotrope.sun import clear_sky
+from heliotrope.twin.weather import WeatherStation
 
 
 def test_the_clear_sky_is_as_published() -> None:

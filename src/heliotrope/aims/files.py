@@ -8,19 +8,23 @@ import numpy as np
 
 from heliotrope.aims.plan import AimPlan
 from heliotrope.files import write_text
+from heliotrope.geometry import FloatArray
 
 
-def write_aims(path: str | Path, plan: AimPlan) -> None:
-    """Write a CSV table of aims, one line per heliostat; defocused heliostats have no aim."""
+def write_aims(path: str | Path, plan: AimPlan, joins: FloatArray | None = None) -> None:
+    """Write a CSV table of aims, one line per heliostat; defocused heliostats have no aim.
+
+    ``joins``: when each heliostat joins along a ramp, s, (N,), for a further column.
+    """
     text = io.StringIO(newline="")
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(
-        ("heliostat", "east_m", "north_m", "up_m", "state", "power_kw", "calibration_gain_kw")
-    )
+    head = ("heliostat", "east_m", "north_m", "up_m", "state", "power_kw", "calibration_gain_kw")
+    rows.writerow(head if joins is None else (*head, "joins_s"))
     power, gain = 1e-3 * plan.light.heliostat_power, 1e-3 * plan.gain
     for k, name in enumerate(plan.names):
         state = "out of reach" if plan.out_of_reach[k] else "aim"
         state = "defocus" if plan.defocused[k] else state
         aim = ["" if np.isnan(x) else f"{x:.4f}" for x in plan.aim[k]]
-        rows.writerow((name, *aim, state, f"{power[k]:.4f}", f"{gain[k]:.6f}"))
+        more = () if joins is None else ("" if np.isnan(joins[k]) else f"{joins[k]:.0f}",)
+        rows.writerow((name, *aim, state, f"{power[k]:.4f}", f"{gain[k]:.6f}", *more))
     write_text(path, text.getvalue())

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from heliotrope.aims.errors import SharedErrors
 from heliotrope.aims.optimiser import Step
-from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene
+from heliotrope.aims.ramp import ramp_up
+from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene, deviation
 from heliotrope.aims.strategies import STRATEGIES, Strategy
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.flux_limit import FluxLimit
@@ -95,6 +96,15 @@ class AimPlan(Value, Framed):
         """Power that a perfect calibration of each heliostat would add, W, (N,)."""
         return self.scene.gain
 
+    def deviation(self, wanted: "FluxLimit | npt.ArrayLike") -> float:
+        """Return the RMS difference of the flux from a wanted map of equal mean, over the mean."""
+        flux = self.light.flux
+        return deviation(flux, FluxLimit.of(wanted).on(*flux.shape))
+
+    def ramp_up(self, rate: float, step: float = 60.0) -> FloatArray:
+        """Return when each heliostat joins along a ramp, s; see `heliotrope.aims.ramp_up`."""
+        return ramp_up(self.scene, rate, step)
+
     def _card(self) -> Card:
         line = f"{self.strategy} aims of {amount(len(self.names), 'heliostat')} of "
         line += f"{self.light.plant}, {1e-3 * self.power:.5g} kW, "
@@ -133,6 +143,8 @@ def plan_aims(
     probability: float = 0.99,
     shared: SharedErrors | None = None,
     keep: bool = False,
+    wanted: "FluxLimit | npt.ArrayLike | None" = None,
+    give: float = 0.01,
     start: AimPlan | None = None,
     progress: Step | None = None,
     light: FieldOptics | None = None,
@@ -158,6 +170,11 @@ def plan_aims(
         Errors that mirrors share; None: none. Each mirror's own error is ``error`` of the light.
     keep
         Whether no heliostat may be defocused.
+    wanted
+        Wanted flux: a map, or a number for a uniform flux; only the ratios between cells count.
+        None: most power, wherever it is.
+    give
+        Share of the power that may be given up for the wanted map, 0 to 0.5.
     start
         A plan of the same plant and receiver for another sun position, irradiance or limit, from
         which the search begins.
@@ -192,6 +209,8 @@ def plan_aims(
         np.unique(clusters, return_inverse=True)[1],
         np.array([0.0, np.cos(latitude), np.sin(latitude)]),
         keep,
+        None if wanted is None else FluxLimit.of(wanted),
+        give,
     )
     options = {"sun": optics.shape, "air": optics.air, "gaussians": optics.gaussians}
     begin = None if start is None else start.scene

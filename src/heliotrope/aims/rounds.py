@@ -38,6 +38,11 @@ THINNER = 0.85
 #: Age at which images are computed anew, s.
 FRESH = 600.0
 
+#: Multiples of the golden ratio less their whole parts spread evenly.
+GOLDEN = 0.6180339887498949
+#: Share of the mirrors that rest before it is computed anew which others must.
+SHED = 0.01
+
 Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
 #: A mirror's image before a move, its cell-wise maximum on the path, and its image after, (columns,
@@ -69,6 +74,9 @@ class Round:
         Aims of the plant file, for the safe spread, ENU m, (H, 3).
     most, together
         Maximum numbers of shining mirrors that may move in this round, and at the same time.
+    ramp
+        Flux up to which the receiver may be heated in this round, in the scene's irradiance, W/m²,
+        (rows, columns); None: no ramp.
     """
 
     scene: Scene
@@ -81,6 +89,7 @@ class Round:
     spread: FloatArray
     most: int
     together: int
+    ramp: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,12 +192,17 @@ def next_round(now: Round, **light: Any) -> Answer:
     engine = FieldFlux(_posed(now.scene, now.aims), **light)
     above = _risk(engine, now.demand, room).above
     power, better = engine.powers[0], best.engine.powers[0]
+    cap = room - np.maximum(above, best.risk.above)
     full = ((engine.maps[0] + above) / room).max() > 1.0 + HOLDS
+    if now.ramp is not None:
+        # The ramp is no limit that must hold with a probability.
+        warm = now.ramp - fixed
+        full = full or (engine.maps[0] > (1.0 + HOLDS) * np.maximum(warm, 0.0) + 1.0).any()
+        cap = np.minimum(cap, warm)
     moves: tuple[Move, ...] = ()
     remaining = 0
     if full or better > (1.0 + BETTER) * power or not now.free[_aimed(now.aims)].all():
-        cap = room - np.maximum(above, best.risk.above)
-        moves, remaining = steps(now, target_aims, cap, light)
+        moves, remaining = steps(now, target_aims, as_float(cap), light)
     shown = FieldFlux(_posed(now.scene, np.where(now.shining[:, None], now.aims, np.nan)), **light)
     risk = _risk(shown, now.demand, limit)
     safe = _safe(now, room, light)
@@ -213,7 +227,7 @@ def steps(
     ``cap`` is the allowable expected flux, W/m², (rows, columns).
     """
     aimed, goes = _aimed(now.aims), _aimed(target_aims)
-    if not aimed.any():
+    if not aimed.any() and now.ramp is None:
         # No mirror shines, so all may take their best aims at once.
         return ((Move(np.flatnonzero(goes), target_aims[goes]),) if goes.any() else ()), 0
     taken = aimed & ~now.free
@@ -225,6 +239,9 @@ def steps(
     differs = have != goes
     differs |= have & goes & (np.linalg.norm(now.aims - target_aims, axis=1) > ALIKE)
     todo = np.flatnonzero(differs & ~taken)
+    if now.ramp is not None:
+        # Neighbours one after the other would heat the same cells first.
+        todo = todo[np.argsort((todo * GOLDEN) % 1.0, kind="stable")]
     flux, cap = path.flux(have), as_float(np.maximum(cap, 0.0).T)
     walk = _Walk(path, flux, cap, now)
     moves += walk.through(todo, target_aims)
@@ -253,39 +270,24 @@ class _Path:
         count = int(np.clip(np.ceil(far.max(initial=0.0)) + 1, 2, PLACES))
         at = np.linspace(0.0, 1.0, count)[:, None]
         looks = start[:, None] + at * (end - start)[:, None]
-        self._images: Images = engine.images(as_float(looks), np.zeros(len(some), dtype=np.int64))
+        self.images: Images = engine.images(as_float(looks), np.zeros(len(some), dtype=np.int64))
         self.aimed, self.goes = aimed, goes
 
     def flux(self, which: Mask) -> FloatArray:
         """Return the flux of mirrors at their present aims, (columns, rows)."""
-        total = np.zeros(self._images.shape[::-1])
+        total = np.zeros(self.images.shape[::-1])
         for row in np.flatnonzero(which):
-            total += self.image(int(row), 0)
+            total += self.images.of(int(row))
         return total
-
-    def image(self, row: int, place: int) -> FloatArray:
-        """Return the image of a mirror at a position on its path, W/m², (columns, rows)."""
-        images = self._images
-        rows, wide = images.shape
-        j = row * images.looks + place % images.looks
-        first, columns, bottom, tall = (int(n) for n in images.box[j])
-        out = np.zeros((wide, rows))
-        low, high = max(bottom, 0), min(bottom + tall, rows)
-        if columns <= 0 or high <= low:
-            return out
-        begin = int(images.begin[j])
-        block = images.values[begin : begin + columns * tall].reshape(columns, tall)
-        out[(first + np.arange(columns)) % wide, low:high] = block[:, low - bottom : high - bottom]
-        return out
 
     def most(self, row: int, *, shines: bool) -> PathImages:
         """Return a mirror's image before, its maximum on the path, and its image after."""
-        before = self.image(row, 0) if self.aimed[row] else np.zeros(self._images.shape[::-1])
-        after = self.image(row, -1) if self.goes[row] else np.zeros_like(before)
+        before = self.images.of(row) if self.aimed[row] else np.zeros(self.images.shape[::-1])
+        after = self.images.of(row, -1) if self.goes[row] else np.zeros_like(before)
         greatest = np.maximum(before, after)
         if shines and self.aimed[row] and self.goes[row]:
-            for place in range(1, self._images.looks - 1):
-                greatest = np.maximum(greatest, self.image(row, place))
+            for place in range(1, self.images.looks - 1):
+                greatest = np.maximum(greatest, self.images.of(row, place))
         return before, greatest, after
 
 
@@ -347,22 +349,25 @@ class _Walk:
         return stuck[: min(self._now.together, self._now.most - self._moved)]
 
     def relieved(self, rows: Rows) -> list[Move]:
-        """Rest a few mirrors while cells are above the limit, the most effective first."""
-        moves: list[Move] = []
-        while len(rows):
+        """Rest mirrors while cells are above the limit, the most effective first, all at once."""
+        gone: list[int] = []
+        left = [int(row) for row in rows]
+        while left:
             over = np.maximum(self._flux - (1.0 + HOLDS) * self._cap, 0.0)
             if not over.any():
                 break
-            share = [float((self._path.image(int(row), 0) * over).sum()) for row in rows]
-            k = int(np.argmax(share))
-            if share[k] <= 0.0:
-                break
-            row = rows[k : k + 1]
-            self._flux = self._flux - self._path.image(int(row[0]), 0)
-            moves.append(_rest(row))
-            self.done = np.union1d(self.done, row).astype(np.intp)
-            rows = np.delete(rows, k)
-        return moves
+            share = {row: float((self._path.images.of(row) * over).sum()) for row in left}
+            left.sort(key=share.__getitem__)
+            for _ in range(1 + int(SHED * len(left))):
+                if not left or share[left[-1]] <= 0.0:
+                    break
+                self._flux = self._flux - self._path.images.of(left[-1])
+                gone.append(left.pop())
+            else:
+                continue
+            break
+        self.done = np.union1d(self.done, gone).astype(np.intp)
+        return [_rest(np.array(gone, dtype=np.intp))] if gone else []
 
 
 def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
@@ -394,7 +399,7 @@ def _alike(scene: Scene, other: Scene) -> bool:
 
 def _safe(now: Round, room: FloatArray, light: dict[str, Any]) -> FloatArray:
     """Return the plant file's aims of as many free mirrors as hold the limit, (H, 3)."""
-    turn = (np.arange(len(now.free)) * 0.6180339887498949) % 1.0
+    turn = (np.arange(len(now.free)) * GOLDEN) % 1.0
     share = 1.0
     while share > 0.5 / len(now.free):
         aims = np.where((now.free & (turn < share))[:, None], now.spread, np.nan)

@@ -36,6 +36,8 @@ LEAST, HOLDS = 0.02, 1e-3
 AGAIN = 2
 #: A cell binds if its quantile is within this share of the limit.
 BINDS = 0.01
+#: Ratio of two levels of a wanted map between which no further one is tried.
+CLOSE = 1.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,11 @@ class Demand:
         Unit vector along the Earth's axis, northwards, (3,).
     keep
         Whether no mirror may be defocused.
+    wanted
+        Wanted flux, a map or a number (uniform); only the ratios between cells count. None: most
+        power, wherever it is.
+    give
+        Share of the power that may be given up for the wanted map, 0 to 0.5.
     """
 
     limit: FluxLimit
@@ -64,8 +71,14 @@ class Demand:
     groups: IntArray | None = None
     pole: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     keep: bool = False
+    wanted: FluxLimit | None = None
+    give: float = 0.01
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.give <= 0.5:
+            raise InputError(
+                f"aims: {100 * self.give:g} % of the power for a wanted map; give up 0 to 50 %"
+            )
         if not 0.5 <= self.probability <= 0.9999:
             raise InputError(
                 f"aims: a probability of {self.probability:g} must be from 0.5 to 0.9999"
@@ -171,7 +184,42 @@ def aim_scene(
         power = float(field.power[np.arange(len(chosen)), chosen].sum())
         choice = Choice(chosen, np.zeros((columns, rows)), field.flux(chosen), power, np.nan)
         return _evaluated(scene, field, choice, demand, limit, light)
-    return _held(scene, field, demand, limit, start, progress, light)
+    best = _held(scene, field, demand, limit, start, progress, light)
+    return best if demand.wanted is None else _shaped(scene, best, demand, light)
+
+
+def _shaped(scene: Scene, best: SceneAims, demand: Demand, light: dict[str, Any]) -> SceneAims:
+    """Return aims whose flux is under the lowest multiple of the wanted map.
+
+    The lowest that keeps the power but for the share that may be given up. The less room there is
+    above the wanted map, the more cells are filled up to it.
+    """
+    assert demand.wanted is not None
+    wanted = demand.wanted.on(*best.limit.shape)
+    power = (1.0 - demand.give) * best.engine.powers[0]
+    low = power / float(wanted.sum() * best.field.images.area)
+    high = float((best.quantile / wanted).max())
+    found = best
+    while high > CLOSE * low:
+        level = float(np.sqrt(low * high))
+        cap = as_float(np.minimum(best.limit, level * wanted))
+        try:
+            trial = _held(scene, best.field, demand, cap, found, None, light)
+        except InputError:
+            low = level
+            continue
+        if trial.engine.powers[0] >= power:
+            found, high = trial, level
+        else:
+            low = level
+    # The bound on the power is that of the limit.
+    choice = replace(found.choice, bound=best.choice.bound)
+    return replace(found, choice=choice, limit=best.limit)
+
+
+def deviation(flux: FloatArray, wanted: FloatArray) -> float:
+    """Return the RMS difference of a flux from a wanted map of equal mean, over the mean."""
+    return float(np.sqrt(np.mean((flux / flux.mean() - wanted / wanted.mean()) ** 2)))
 
 
 def _held(

@@ -43,6 +43,7 @@ from heliotrope.errors import InputError, shown
 if TYPE_CHECKING:
     from heliotrope.aims import AimPlan, FluxLimit
     from heliotrope.aims.strategies import Strategy
+    from heliotrope.geometry import FloatArray
 
 #: Maximum number of heliostats and cells that are listed.
 NAMED = 5
@@ -53,6 +54,10 @@ def aim(
     limit: Annotated[
         str, typer.Option(help="Allowable flux: kW/m², or a file of the cells' (CSV, W/m²).")
     ],
+    panels: Annotated[
+        Path | None,
+        typer.Option(help="Panels with the fluid's state (CSV); --limit is then a table (CSV)."),
+    ] = None,
     margin: Annotated[
         float, typer.Option(min=0, max=0.5, help="Share of it kept for the model's own error.")
     ] = 0.01,
@@ -66,6 +71,16 @@ def aim(
     keep_all: Annotated[
         bool, typer.Option("--keep-all", help="Defocus no heliostat, or refuse.")
     ] = False,
+    wanted: Annotated[
+        str, typer.Option(help="Wanted flux: uniform, or a file of the cells' (CSV). Default: any.")
+    ] = "",
+    give_percent: Annotated[
+        float, typer.Option(min=0, max=50, help="Power that may be given up for it, %.")
+    ] = 1.0,
+    ramp: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=64000, help="Start-up: greatest rise of flux, kW/m² a minute."),
+    ] = None,
     drift_mrad: Annotated[
         float, typer.Option(min=0, max=50, help="Turn that all normals share, mrad per axis.")
     ] = 0.0,
@@ -102,7 +117,7 @@ def aim(
         dni, shape, air, slope_mrad, error_mrad, reflectivity, clean, focus, facets, cells, tower
     )
     _check(field, csv, picture)
-    allowed = _limit(limit, margin)
+    allowed = _limit(limit, margin, panels)
     if time is not None and sun is not None:
         raise InputError("give --time or --sun, not both")
     plant = open_plant(field, None if site is None else parse_site(site))
@@ -111,6 +126,7 @@ def aim(
     options: dict[str, Any] = {
         "sun": None if sun is None else parse_point(sun, "sun"), "light": light, "limit": allowed,
         "probability": probability, "keep": keep_all,
+        "wanted": _wanted(wanted), "give": 1e-2 * give_percent,
         "shared": SharedErrors(1e-3 * drift_mrad, clock_s, 1e-3 * cluster_mrad),
     }  # fmt: skip
     names: tuple[Strategy, ...] = STRATEGIES if strategy == "all" else (strategy,)
@@ -120,19 +136,25 @@ def aim(
             for name in names
         }
     chosen = plans[names[-1]]
+    joins = None if ramp is None else chosen.ramp_up(1e3 / 60.0 * ramp)
     if csv is not None:
         from heliotrope.aims import write_aims
 
-        write_aims(csv, chosen)
+        write_aims(csv, chosen, joins)
     if picture is not None:
         from heliotrope.calibration.plan.report import write_picture
         from heliotrope.plot import aim_figure
 
         write_picture(picture, aim_figure(chosen))
     if as_json:
-        print_json(_document(plans, chosen))
+        print_json(_document(plans, chosen) | ({} if joins is None else {"joins_s": joins}))
         return
     _print(plans, chosen)
+    if options["wanted"] is not None:
+        far = chosen.deviation(options["wanted"])
+        print(f"the flux differs from the wanted one by {100 * far:.1f} % of its mean (RMS)")
+    if joins is not None:
+        _print_ramp(chosen, joins)
     for name, path in (("csv", csv), ("picture", picture)):
         if path is not None:
             print(f"{name}: {path}")
@@ -147,13 +169,38 @@ def _check(field: Path, csv: Path | None, picture: Path | None) -> None:
     check_outputs(tuple(path for path in (csv, picture) if path is not None), field, None)
 
 
-def _limit(text: str, margin: float) -> "FluxLimit":
-    from heliotrope.aims import FluxLimit, read_limit
+def _limit(text: str, margin: float, panels: Path | None) -> "FluxLimit":
+    from heliotrope.aims import FluxLimit, read_limit, read_table_limit
 
+    if panels is not None:
+        return read_table_limit(text, panels, margin)
     if Path(text).suffix.lower() == ".csv":
         return read_limit(text, margin)
     refusal = f"--limit {shown(text)}: give kW/m² from 0.001 to 64000, or a file .csv in W/m²"
     return FluxLimit(1e3 * parse_numbers(text, refusal, least=1e-3, most=6.4e4)[0], margin)
+
+
+def _wanted(text: str) -> "FluxLimit | None":
+    from heliotrope.aims import FluxLimit, read_limit
+
+    if Path(text).suffix.lower() == ".csv":
+        return read_limit(text)
+    if text not in ("", "uniform"):
+        raise InputError(f"--wanted {shown(text)}: give uniform, or a file .csv in W/m²")
+    return FluxLimit(1.0) if text else None
+
+
+def _print_ramp(chosen: "AimPlan", joins: "FloatArray") -> None:
+    """Print how the start-up goes: a line for each quarter of the power."""
+    import numpy as np
+
+    order = np.argsort(joins)
+    order = order[np.isfinite(joins[order])]
+    power = np.cumsum(chosen.light.heliostat_power[order])
+    print(f"start-up: the last of {len(order):,} heliostats joins after {joins[order[-1]]:.0f} s")
+    for share in (0.25, 0.5, 0.75):
+        k = int(np.searchsorted(power, share * power[-1]))
+        print(f"  {100 * share:.0f} % of the power after {joins[order[k]]:.0f} s")
 
 
 def _document(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> dict[str, Any]:

@@ -31,6 +31,9 @@ class AimSettings:
     dni
         The limit must hold at this direct normal irradiance, W/m², even if less is measured,
         because a cloud may pass at any moment.
+    ramp
+        Greatest rise of the flux in a cell, W/m² per s, while the receiver is heated after standby
+        or a cloud; 0: no ramp.
     moves
         Maximum number of tracking heliostats per minute that get a new aim.
     together
@@ -55,6 +58,7 @@ class AimSettings:
     clock: float = 0.0
     cluster: float = 0.0
     dni: float = 1000.0
+    ramp: float = 0.0
     moves: float = 60.0
     together: int = 5
     every: float = 30.0
@@ -66,7 +70,7 @@ class AimSettings:
                 f"aims: strategy {self.strategy!r}; give one of {', '.join(AIM_STRATEGIES)}"
             )
         if self.strategy == "limit" and self.limit is None:
-            raise InputError('aims: strategy "limit" needs limit_kw_m2 or limit_map')
+            raise InputError('aims: strategy "limit" needs limit_kw_m2, limit_map or limit_table')
         if self.strategy == "spread" and self.limit is not None:
             raise InputError('aims: a flux limit needs strategy = "limit"; add it, or remove it')
         ranges = {
@@ -75,6 +79,7 @@ class AimSettings:
             "clock_s": (self.clock, 0.0, 600.0, " s"),
             "cluster_mrad": (1e3 * self.cluster, 0.0, 50.0, " mrad"),
             "dni_w_m2": (self.dni, 1.0, 1500.0, " W/m²"),
+            "ramp_kw_m2_min": (0.06 * self.ramp, 0.0, 64000.0, " kW/m² a minute"),
             "moves_per_minute": (self.moves, 1.0, 6000.0, ""),
             "together": (self.together, 1, 1000, ""),
             "every_s": (self.every, 5.0, 600.0, " s"),

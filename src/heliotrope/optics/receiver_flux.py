@@ -103,6 +103,20 @@ class Images:
     shape: tuple[int, int]
     area: float
 
+    def of(self, mirror: int, look: int = 0) -> FloatArray:
+        """Return one image on the whole surface, W/m², (columns, rows)."""
+        rows, wide = self.shape
+        j = mirror * self.looks + look % self.looks
+        first, columns, bottom, tall = (int(n) for n in self.box[j])
+        out = np.zeros((wide, rows))
+        low, high = max(bottom, 0), min(bottom + tall, rows)
+        if columns <= 0 or high <= low:
+            return out
+        begin = int(self.begin[j])
+        block = self.values[begin : begin + columns * tall].reshape(columns, tall)
+        out[(first + np.arange(columns)) % wide, low:high] = block[:, low - bottom : high - bottom]
+        return out
+
 
 class FieldFlux:
     """The flux of a scene on its surfaces.

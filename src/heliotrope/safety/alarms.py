@@ -312,11 +312,12 @@ FLUX_ABOVE_LIMIT = AlarmKind(
     "flux_above_limit",
     _PLANT,
     Severity.ALARM,
-    "The predicted flux with its errors is above the flux limit of the plant file.",
-    "receiver {subject}: the predicted flux is up to {excess:.1f} % above its limit",
+    "The predicted flux with its errors, or the measured flux, is above the limit of the plant "
+    "file.",
+    "receiver {subject}: the {source} flux is up to {excess:.1f} % above its limit",
     "The heliostats that heat this spot go to standby, and come back at other aims.",
     "If it stays, defocus the heliostats that a person has aimed there.",
-    over="receiver {subject}: the predicted flux is within its limit",
+    over="receiver {subject}: the flux is within its limit",
 )
 RECORDS = AlarmKind(
     "records",

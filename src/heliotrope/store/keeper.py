@@ -63,6 +63,7 @@ _LIMITS = "safety limits"
 _EMERGENCY = "emergency"
 #: Name of the document about changes that await approval.
 _CHANGES = "waiting changes"
+_AIMED = "aimed by people"
 
 
 class Keeper:
@@ -494,6 +495,14 @@ class Keeper:
     def keep_waiting_changes(self, document: str) -> None:
         """Replace the document about changes that await approval; empty: there are none."""
         self._keep_document(_CHANGES, document)
+
+    def aimed_by_people(self) -> tuple[str, ...]:
+        """Return the heliostats whose beams people have aimed, and which keep these aims."""
+        return tuple(json.loads(self._document(_AIMED) or "[]"))
+
+    def keep_aimed_by_people(self, heliostats: Sequence[str]) -> None:
+        """Replace the heliostats whose beams people have aimed."""
+        self._keep_document(_AIMED, json.dumps(list(heliostats)) if heliostats else "")
 
     def _document(self, name: str) -> str:
         about = tables.about

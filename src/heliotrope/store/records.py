@@ -592,6 +592,14 @@ class Records(Protocol):
         """Replace the document about changes that await approval; empty: there are none."""
         ...
 
+    def aimed_by_people(self) -> tuple[str, ...]:
+        """Return the heliostats whose beams people have aimed, and which keep these aims."""
+        ...
+
+    def keep_aimed_by_people(self, heliostats: Sequence[str]) -> None:
+        """Replace the heliostats whose beams people have aimed."""
+        ...
+
     async def confirm(self) -> None:
         """Wait until all earlier records are safely stored.
 

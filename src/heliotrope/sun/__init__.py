@@ -3,7 +3,7 @@
 Begin with `vector` (or `position` for the angles); `events` and `daylight` return the times of a
 day. These functions accept any number of times, in any form that `unix_seconds` reads.
 `vector_and_rate`, `fast_vector` and `broadcast_values` follow the sun at one site second by second,
-as cluster controllers broadcast it.
+as cluster controllers broadcast it. `clear_sky` estimates the direct irradiance.
 """
 
 from heliotrope.sun.broadcast import (
@@ -12,6 +12,7 @@ from heliotrope.sun.broadcast import (
     fast_vector,
     vector_and_rate,
 )
+from heliotrope.sun.clear_sky import clear_sky
 from heliotrope.sun.ephemeris import (
     UPPER_LIMB,
     Site,
@@ -36,6 +37,7 @@ __all__ = [
     "Times",
     "broadcast_values",
     "check_site",
+    "clear_sky",
     "daylight",
     "events",
     "fast_vector",

@@ -7,33 +7,11 @@ import numpy as np
 from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import Clock
 from heliotrope.plant.emergency import DNI_READING
+from heliotrope.sun import clear_sky
 from heliotrope.twin.wind import Wind
 
-#: Irradiance above the atmosphere with which the formula of `clear_sky` was fitted, W/m².
-_OUTSIDE = 1353.0
 #: Wind on a day without alarms: mean speed, and mean height of the gusts, m/s.
 _MEAN, _GUST = 3.0, 0.5
-
-
-def clear_sky(elevation: float, altitude: float) -> float:
-    """Return the direct normal irradiance under a clear sky, W/m²; 0 with the sun down.
-
-    Meinel's fit to measurements with its term for altitude, and Kasten and Young's air mass, both
-    as on https://www.pveducation.org (Air Mass; Calculation of Solar Insolation).
-
-    Parameters
-    ----------
-    elevation
-        Elevation of the sun, rad.
-    altitude
-        Altitude of the site, m; clipped to 0 to 3,000 m.
-    """
-    if elevation <= 0.0:
-        return 0.0
-    degrees = np.degrees(elevation)
-    mass = 1.0 / (np.sin(elevation) + 0.50572 * (degrees + 6.07995) ** -1.6364)
-    height = 0.14 * np.clip(1e-3 * altitude, 0.0, 3.0)
-    return float(_OUTSIDE * ((1.0 - height) * 0.7 ** (mass**0.678) + height))
 
 
 class WeatherStation:

@@ -6,6 +6,7 @@ from typing import Any
 from heliotrope.errors import InputError
 from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.flux_limit import FluxLimit, read_limit, write_limit
+from heliotrope.field.flux_table import read_table_limit
 from heliotrope.field.formats._plant_models import AimsTable
 
 #: Settings by key, and the factor from the key's unit.
@@ -15,6 +16,7 @@ _KEYS = {
     "clock_s": ("clock", 1.0),
     "cluster_mrad": ("cluster", 1e-3),
     "dni_w_m2": ("dni", 1.0),
+    "ramp_kw_m2_min": ("ramp", 1e3 / 60.0),
     "moves_per_minute": ("moves", 1.0),
     "every_s": ("every", 1.0),
     "deadline_s": ("deadline", 1.0),
@@ -22,28 +24,43 @@ _KEYS = {
 
 
 def build_aims(table: AimsTable | None, folder: Path) -> AimSettings:
-    """Return the settings of a table; a map is read from a file in a folder.
+    """Return the settings of a table; maps and tables of limits are read from a folder's files.
 
     Raises
     ------
     InputError
-        If they cannot be, or the map is no table of numbers.
+        If they cannot be, or a file is not what it should be.
     """
     if table is None:
         return AimSettings()
-    if table.limit_kw_m2 is not None and table.limit_map:
-        raise InputError("aims: limit_kw_m2 and limit_map; give one of them")
+    given = {
+        "limit_kw_m2": table.limit_kw_m2 is not None,
+        "limit_map": bool(table.limit_map),
+        "limit_table": bool(table.limit_table),
+    }
+    if sum(given.values()) > 1:
+        both = " and ".join(key for key, there in given.items() if there)
+        raise InputError(f"aims: {both}; give one of them")
+    if bool(table.limit_table) != bool(table.limit_panels):
+        raise InputError("aims: limit_table and limit_panels belong together; give both or none")
     limit = None
     if table.limit_kw_m2 is not None:
         limit = FluxLimit(1e3 * table.limit_kw_m2, table.margin)
     elif table.limit_map:
         limit = read_limit(folder / table.limit_map, table.margin)
+    elif table.limit_table:
+        files = folder / table.limit_table, folder / table.limit_panels
+        limit = read_table_limit(*files, table.margin)
     keywords = {name: scale * getattr(table, key) for key, (name, scale) in _KEYS.items()}
-    return AimSettings(table.strategy, limit, table.limit_map, together=table.together, **keywords)
+    name = table.limit_map or table.limit_table
+    return AimSettings(table.strategy, limit, name, together=table.together, **keywords)
 
 
 def aims_document(settings: AimSettings, place: Path) -> dict[str, dict[str, Any]]:
-    """Return the document's part with the table; a map is written beside the plant file."""
+    """Return the document's part with the table; a map is written beside the plant file.
+
+    A limit that was read from a table of temperatures and velocities is written as its map.
+    """
     if settings.limit is None:
         return {}
     table: dict[str, Any] = {"strategy": settings.strategy}

@@ -429,6 +429,14 @@ class AimsTable(StrictTable):
         description="Allowable flux of each cell, W/m²: a file of numbers (CSV) beside this one, "
         "highest row first.",
     )
+    limit_table: str = Field(
+        "",
+        description="Allowable flux over temperature and velocity of the fluid: a table (CSV) "
+        "beside this one; needs limit_panels.",
+    )
+    limit_panels: str = Field(
+        "", description="Panels with the state of the fluid: a table (CSV) beside this one."
+    )
     margin: Number = Field(0.05, description="Share kept for the model's own error; 0 to 0.5.")
     probability: Number = Field(
         AimSettings.probability, description="That the limit holds everywhere; 0.5 to 0.9999."
@@ -438,6 +446,11 @@ class AimsTable(StrictTable):
     cluster_mrad: Number = Field(0.0, description="Error that a cluster's normals share; 0 to 50.")
     dni_w_m2: Number = Field(
         AimSettings.dni, description="The limit holds at this irradiance at least; 1 to 1500."
+    )
+    ramp_kw_m2_min: Number = Field(
+        0.0,
+        description="Greatest rise of the flux in a cell while the receiver is heated after "
+        "standby or a cloud, kW/m² a minute; 0: no ramp.",
     )
     moves_per_minute: Number = Field(
         AimSettings.moves, description="Tracking heliostats that get another aim; 1 to 6000."

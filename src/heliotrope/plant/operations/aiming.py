@@ -6,6 +6,12 @@ with the same proofs. A heliostat at standby joins the receiver only at the aim 
 heliostat without an aim stays at standby. Beams that an operator has aimed, or that automatic
 control may not move, stay and use their share of the limit. Without new aims the last good ones
 stay in force; later the safe spread follows, with fewer heliostats at the aims of the plant file.
+
+With a ramp, the flux that the beams would bring in full sun may exceed what the receiver has had
+within the last minute only by the rise of one round. While a cloud covers the sun, heliostats leave
+the receiver therefore; they come back in steps. If the measured flux is above the limit, the limit
+of these cells is lowered by the ratio of the measured to the predicted flux, so that the same moves
+relieve them.
 """
 
 import asyncio
@@ -17,20 +23,24 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.aims import Demand, SharedErrors
+from heliotrope.aims.candidates import surface_in
 from heliotrope.aims.rounds import Answer, Move, Round, next_round
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.flux_limit import FluxLimit
-from heliotrope.geometry import FloatArray
+from heliotrope.geometry import FloatArray, as_float
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
 from heliotrope.optics.scene import Scene
 from heliotrope.optics.surfaces import surface_of
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations.automatic import AutomaticControl
+from heliotrope.plant.operations.flux_check import Beyond, FluxCheck
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.plant.operations.predicted_flux import PredictedFlux
 from heliotrope.plant.workers import Worker
 from heliotrope.safety import alarms
+from heliotrope.store.records import Records, StoreError
+from heliotrope.sun import clear_sky
 
 #: A beam without reports may still be where it was for this time, s.
 HOLD = 120.0
@@ -42,6 +52,12 @@ BLUR = 5e-4
 MOVED, SETTLED = 60.0, 4.0
 #: Time for which a heliostat keeps its old aim if its beam may not go to its new one, s.
 BLOCKED = 300.0
+#: A cell that had a flux within this time takes it again at once, s.
+WARM = 60.0
+#: In full sun the irradiance is at most this multiple of that under a usual clear sky.
+BRIGHT = 1.15
+#: Time for which a limit stays lowered after a measured flux was above it, s.
+WARY = 600.0
 #: The safe spread follows when the age of the last good aims exceeds this multiple of the deadline.
 SAFE = 5.0
 #: States from which a heliostat cannot join without an operator.
@@ -109,10 +125,12 @@ class Aiming:
         The controller, and the logbook for alarms and events.
     automatic
         Issues the commands, while it has the command authority.
-    flux
-        Flux prediction, which knows the present field.
+    check
+        The measured flux and the prediction.
     worker
         Place for the computation.
+    records
+        Store that names the beams that people have aimed after a restart; None: there is none.
     """
 
     def __init__(
@@ -120,11 +138,13 @@ class Aiming:
         plant: PlantController,
         log: Logbook,
         automatic: AutomaticControl,
-        flux: PredictedFlux,
+        check: FluxCheck,
         worker: Worker,
+        records: Records | None = None,
     ) -> None:
+        self._records = records
         self._plant, self._log, self._automatic = plant, log, automatic
-        self._flux, self._worker, self._settings = flux, worker, plant.design.aims
+        self._check, self._worker, self._settings = check, worker, plant.design.aims
         count = len(plant.field)
         self._by_person: Mask = np.zeros(count, dtype=np.bool_)
         self._blocked_until = np.full(count, -math.inf)
@@ -134,13 +154,36 @@ class Aiming:
         self._moved_at = -math.inf
         self._source = self._problem = ""
         self._above = False
+        #: Times and flux maps that the receiver has had, W/m², in the irradiance of that time.
+        self._had: list[tuple[float, FloatArray]] = []
+        #: By how much measured fluxes were above predicted ones, and when.
+        self._beyond: list[tuple[float, Beyond]] = []
 
     # -- people ----------------------------------------------------------------------------
 
     def by_person(self, heliostats: Sequence[str], *, aimed: bool) -> None:
         """Note that an operator has aimed heliostats (() for all), or returned them."""
         rows = [self._plant.field.place(name) for name in heliostats or self._plant.field.names]
+        if (self._by_person[rows] == aimed).all():
+            return
         self._by_person[rows] = aimed
+        if self._records is not None:
+            names = np.array(self._plant.field.names)[self._by_person]
+            try:
+                self._records.keep_aimed_by_people(tuple(names.tolist()))
+            except StoreError as error:
+                self._log.take_alarm(alarms.RECORDS.raised(problem=error))
+
+    def recall(self) -> None:
+        """Leave the beams where they are that people had aimed when the last program ended."""
+        if self._records is None:
+            return
+        try:
+            names = self._records.aimed_by_people()
+        except StoreError as error:
+            self._log.take_alarm(alarms.RECORDS.raised(problem=error))
+            return
+        self._by_person |= np.isin(self._plant.field.names, names)
 
     def points(self, heliostats: Sequence[str]) -> Mapping[str, FloatArray]:
         """Return the aims on the first receiver, ENU, m, (3,), by name.
@@ -221,22 +264,64 @@ class Aiming:
                 )
                 return
             self._good_at = now
-            self._take(answer)
-            await self._go(answer.moves)
+            hot = self._measure(answer, present)
+            self._take(answer, present)
+            if hot:
+                await self._step(self._plant.now())
+            else:
+                await self._go(answer.moves)
 
-    def _take(self, answer: Answer) -> None:
+    def _measure(self, answer: Answer, given: Round) -> bool:
+        """Note the flux that the receiver has, and by how much the measured one is above the limit.
+
+        Return whether the latter is news, so that the moves of this round come too late.
+        """
+        assert self._settings.limit is not None
+        self._beyond = [(at, found) for at, found in self._beyond if given.at - at <= WARY]
+        dni = self._measured_dni(given.at)
+        if not math.isfinite(dni):
+            return False
+        flux = as_float(answer.flux * (max(dni, 0.0) / given.scene.dni))
+        self._had = [(at, had) for at, had in self._had if given.at - at <= WARM]
+        self._had.append((given.at, flux))
+        found = self._check.beyond(self._settings.limit, flux)
+        if found is None:
+            return False
+        self._beyond.append((given.at, found))
+        return len(self._beyond) == 1
+
+    def _take(self, answer: Answer, given: Round) -> None:
         """Accept a result, and report what is above the limit or no longer late."""
         self._answer, self._source = answer, "optimiser"
         if self._problem:
             self._problem = ""
             self._log.take_alarm(alarms.AIMS.ended())
-        name, above = self._plant.design.receivers[0].name, answer.excess > 0.01
+        name, kind = self._plant.design.receivers[0].name, alarms.FLUX_ABOVE_LIMIT
+        seen = [found for at, found in self._beyond if at >= given.at]
+        excess, source = (seen[0].excess, "measured") if seen else (answer.excess, "predicted")
+        above = bool(seen) or excess > 0.01
         if above:
-            kind = alarms.FLUX_ABOVE_LIMIT
-            self._log.take_alarm(kind.raised(name, excess=100.0 * answer.excess))
+            self._log.take_alarm(kind.raised(name, source=source, excess=100.0 * excess))
         elif self._above:
             self._log.take_alarm(alarms.FLUX_ABOVE_LIMIT.ended(name))
         self._above = above
+
+    def _ramp(self, now: float, scene: Scene) -> FloatArray | None:
+        """Return the flux up to which the receiver may be heated, in the scene's irradiance."""
+        if self._settings.ramp <= 0.0:
+            return None
+        had = [flux for _, flux in self._had]
+        warm = np.max(had, axis=0) if had else np.zeros(surface_in(scene).shape)
+        elevation = math.asin(float(np.clip(scene.sun[2], -1.0, 1.0)))
+        sky = clear_sky(elevation, self._plant.design.site.height)
+        measured = self._measured_dni(now)
+        bright = max(BRIGHT * sky, 1.0, measured if math.isfinite(measured) else 0.0)
+        scale = scene.dni / min(scene.dni, bright)
+        return as_float(scale * (warm + self._settings.ramp * self._settings.every))
+
+    def _measured_dni(self, now: float) -> float:
+        """Return the measured irradiance, W/m²; NaN without a recent measurement."""
+        return self._plant.sentinel.table.shown(now).get(DNI_READING, math.nan)
 
     async def _failed(self, problem: str) -> None:
         """Keep the last good aims; once they are too old, go to the safe spread."""
@@ -303,9 +388,10 @@ class Aiming:
         free &= ~comes
         spread = np.stack([*plant.default_aims().values()])
         most = max(1, round(settings.moves / 60.0 * min(now - self._round_at, 60.0)))
+        scene = self._scene(now)
         return Round(
-            self._scene(now),
-            self._demand(settings.limit),
+            scene,
+            self._demand(self._allowed(settings.limit, scene)),
             now,
             np.where(free[:, None] | ~np.isfinite(fixed), aims, np.nan),
             free,
@@ -314,11 +400,19 @@ class Aiming:
             spread,
             most,
             settings.together,
+            self._ramp(now, scene),
         )
+
+    def _allowed(self, limit: FluxLimit, scene: Scene) -> FluxLimit:
+        """Return the limit, lowered where a measured flux was above it."""
+        if not self._beyond:
+            return limit
+        factor = np.max([found.factor for _, found in self._beyond], axis=0)
+        return FluxLimit(limit.on(*surface_in(scene).shape) / factor)
 
     def _scene(self, now: float) -> Scene:
         """Return the field with its receiver, in the light for which the limit must hold."""
-        scene, receiver = self._flux.scene(now), self._plant.design.receivers[0]
+        scene, receiver = self._check.flux.scene(now), self._plant.design.receivers[0]
         pointing = scene.mirrors.pointing
         size = np.sqrt(0.5 * np.trace(pointing, axis1=1, axis2=2))
         less = np.minimum(1.0, BLUR / np.maximum(size, 1e-9)) ** 2

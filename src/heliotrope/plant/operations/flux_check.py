@@ -11,19 +11,25 @@ with s_c by the errors of the calibrations. D² has the mean 1 if the standard d
 however many cells there are and however alike their errors: it is our own measure. `SCALE` (a)
 stands for irradiance, reflectivity and soiling, `SHAPE` (b, of maps) for the mirrors' figure,
 `READ` and `FLOOR` (e, f) for the measurement (from rendered frames, see *how to use cameras*).
+
+Where the measured flux is above the flux limit, the prediction was too low, and `beyond` says by
+how much, for `Aiming`. Only a plausible measurement counts: with more than `TRUST` times the
+prediction either the sensor lies, or beams are where nobody can say which they are.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
+from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.optics import surface_of
+from heliotrope.optics import Cylinder, surface_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations.logbook import Logbook
-from heliotrope.plant.operations.predicted_flux import PredictedFlux
+from heliotrope.plant.operations.predicted_flux import PredictedFlux, columns_from_outside
 from heliotrope.plant.operations.views import PredictedView
 from heliotrope.safety import FLUX_READING, alarms
 from heliotrope.safety.proof import FLUX_AGE
@@ -39,6 +45,25 @@ RAISE, CLEAR = 4.0, 3.0
 HOLD = 120.0
 #: Interval between comparisons, s.
 EVERY = 10.0
+#: Greatest ratio of a measured flux to the predicted one that is believed.
+TRUST = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Beyond:
+    """A measured flux above the flux limit.
+
+    Attributes
+    ----------
+    factor
+        Ratio of the measured flux to the predicted one in the cells where it is above the limit,
+        1 elsewhere, in the order of the limit's cells, (rows, columns).
+    excess
+        Greatest ratio of the measured flux to the limit, less 1.
+    """
+
+    factor: FloatArray
+    excess: float
 
 
 def distance(view: PredictedView, measured: FloatArray, mean: float, area: float) -> float:
@@ -86,10 +111,15 @@ class FluxCheck:
     ----------
     plant, flux, log
         The controller, the prediction, and the logbook for the alarm.
+
+    Attributes
+    ----------
+    flux
+        The prediction.
     """
 
     def __init__(self, plant: PlantController, flux: PredictedFlux, log: Logbook) -> None:
-        self._plant, self._flux, self._log = plant, flux, log
+        self._plant, self.flux, self._log = plant, flux, log
         self._receiver: Receiver | None = None
         if len(plant.design.receivers) == 1 and plant.design.receivers[0].nominal_power > 0.0:
             self._receiver = plant.design.receivers[0]
@@ -118,6 +148,39 @@ class FluxCheck:
         share = self._plant.sentinel.table.shown(now).get(FLUX_READING, math.nan)
         return as_float(self._mean * share) if math.isfinite(share) else None
 
+    def beyond(self, limit: FluxLimit, predicted: FloatArray) -> Beyond | None:
+        """Return by how much the measured flux is above a limit, its margin included; None: not.
+
+        A measured mean stands for a map of the predicted shape.
+
+        Parameters
+        ----------
+        limit
+            Of the receiver.
+        predicted
+            Flux of the beams at their aims in the present irradiance, W/m², in the order of the
+            limit's cells, (rows, columns).
+        """
+        receiver = self._receiver
+        if receiver is None or (measured := self.measured(receiver.name)) is None:
+            return None
+        surface = surface_of(receiver)
+        if measured.ndim:
+            seen = np.empty(predicted.shape)
+            order = np.arange(predicted.shape[1])
+            if isinstance(surface, Cylinder):
+                middles = 0.5 * (surface.edges[1:] + surface.edges[:-1])
+                order = columns_from_outside(receiver, as_float(middles * surface.radius))[1]
+            seen[:, order] = measured
+        else:
+            seen = measured / max(float(predicted.mean()), 1e-9) * predicted
+        allowed = limit.on(*predicted.shape) / (1.0 - limit.margin)
+        ratio = seen / np.maximum(predicted, 1e-9)
+        hot = (seen > allowed) & (ratio > 1.0) & (ratio <= TRUST)
+        if not hot.any():
+            return None
+        return Beyond(as_float(np.where(hot, ratio, 1.0)), float((seen / allowed)[hot].max()) - 1.0)
+
     async def look(self) -> None:
         """Compare, and raise or end the alarm.
 
@@ -132,7 +195,7 @@ class FluxCheck:
         now = self._plant.now()
         if not math.isfinite(self._plant.sentinel.table.shown(now).get(DNI_READING, math.nan)):
             return
-        view = (await self._flux.everywhere())[receiver.name]
+        view = (await self.flux.everywhere())[receiver.name]
         far, stands = distance(view, measured, self._mean, self._area), self._stands
         self._apart_since = min(self._apart_since, now) if far > RAISE else math.inf
         self._agrees_since = min(self._agrees_since, now) if far < CLEAR else math.inf

@@ -166,7 +166,7 @@ class Operations:
         self._records = records
         self._flux = PredictedFlux(plant, self.viewer, automatic.book, automatic.installed, worker)
         self.flux_check = FluxCheck(plant, self._flux, logbook)
-        self._aiming = Aiming(plant, logbook, automatic, self._flux, worker)
+        self._aiming = Aiming(plant, logbook, automatic, self.flux_check, worker, records)
         self._closing, self.begun = asyncio.Event(), asyncio.Event()
 
     # -- running ---------------------------------------------------------------------------
@@ -175,6 +175,7 @@ class Operations:
         """Run until closed; the owner runs the plant controller itself."""
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
         self.approvals.recall()
+        self._aiming.recall()
         self.begun.set()
         async with contextlib.aclosing(self._flux), asyncio.TaskGroup() as group:
             work = group.create_task(self.automatic.run())

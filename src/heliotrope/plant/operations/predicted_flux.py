@@ -14,6 +14,7 @@ import numpy as np
 
 from heliotrope.aims.errors import assess
 from heliotrope.field.target import Receiver
+from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics import (
     Cavity,
     FieldFlux,
@@ -27,6 +28,7 @@ from heliotrope.optics import (
 )
 from heliotrope.optics.beam import SUN_SIGMA
 from heliotrope.optics.scene import facets_of
+from heliotrope.optics.shading import IntArray
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations.calibration_book import CalibrationBook
@@ -182,18 +184,24 @@ def _uncertain(view: FluxView, engine: FieldFlux) -> PredictedView:
 
 
 def _from_outside(view: PredictedView, receiver: Receiver) -> PredictedView:
-    """Return a map whose columns run to the right as seen from outside: `Receiver.point`.
+    """Return a map whose columns run to the right as seen from outside: `Receiver.point`."""
+    right, order = columns_from_outside(receiver, view.right)
+    shown = {name: getattr(view, name)[:, order] for name in ("flux", "sigma")}
+    return replace(view, right=right, **shown)
 
-    The engine's run clockwise, a full cylinder's from the north.
+
+def columns_from_outside(receiver: Receiver, right: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return where a map's columns lie as seen from outside, m, and their order, (W,) each.
+
+    The engine's, ``right``, run clockwise, a full cylinder's from the north.
     """
     if receiver.kind == "planar":
-        return view
-    radius, right = receiver.radius or 0.5 * receiver.width, -view.right
+        return right, np.arange(len(right))
+    radius, right = receiver.radius or 0.5 * receiver.width, -right
     if receiver.kind == "external_cylinder":
         east, north = receiver.normal[:2]
         front = float(np.arctan2(east, north)) if np.hypot(east, north) > 1e-6 else 0.0
         turns = (right / radius + front + np.pi) / (2.0 * np.pi)
         right = radius * (2.0 * np.pi * (turns - np.floor(turns)) - np.pi)
     order = np.argsort(right)
-    shown = {name: getattr(view, name)[:, order] for name in ("flux", "sigma")}
-    return replace(view, right=right[order], **shown)
+    return as_float(right[order]), order

@@ -1,0 +1,61 @@
+"""Start-up along a ramp: when each heliostat joins, so that no cell is heated too fast."""
+
+import numpy as np
+
+from heliotrope.aims.scene_aims import SceneAims
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float
+
+#: Greatest number of steps of a ramp.
+MOST = 2_000
+
+
+def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
+    """Return when each mirror joins the receiver, s after the start, (H,); NaN: it has no aim.
+
+    At the start of step k, counted from 0, mirrors join as long as the flux of no cell exceeds
+    k + 1 times the rise that one step allows; a mirror whose image alone exceeds that waits. In the
+    reverse order they leave along the same ramp: at a shut-down, a time t of the start-up is the
+    last time less t.
+
+    Parameters
+    ----------
+    aims
+        Aims of the mirrors at the end of the ramp.
+    rate
+        Greatest rise of the flux in a cell, W/m² per s.
+    step
+        Time between two steps, s.
+
+    Raises
+    ------
+    InputError
+        If rate or step are not above 0, or the ramp has more than 2,000 steps.
+    """
+    if not (np.isfinite(rate) and rate > 0.0 and np.isfinite(step) and step > 0.0):
+        raise InputError(f"ramp: {rate:g} W/m² per s in steps of {step:g} s; both must be above 0")
+    count = len(aims.aims)
+    images = aims.engine.images(aims.aims[:, None, :], np.zeros(count, dtype=np.int64))
+    joins = np.full(count, np.nan)
+    here = ~aims.defocused & (aims.engine.leaving > 0.0)
+    turn = (np.arange(count) * 0.6180339887498949) % 1.0
+    # Neighbours one after the other would fill the same cells first.
+    waiting = [int(row) for row in np.argsort(turn, kind="stable") if here[row]]
+    flux, peak = np.zeros(images.shape[::-1]), float(aims.engine.maps[0].max())
+    if peak > MOST * rate * step:
+        raise InputError(
+            f"ramp: {1e-3 * peak:.4g} kW/m² take {peak / rate:.3g} s, more than {MOST} steps of "
+            f"{step:g} s; raise the rate or the step"
+        )
+    k = 0
+    while waiting:
+        allowed, left = (k + 1) * rate * step, []
+        for row in waiting:
+            image = images.of(row)
+            if (flux + image > allowed)[image > 0.0].any():
+                left.append(row)
+                continue
+            flux += image
+            joins[row] = k * step
+        waiting, k = left, k + 1
+    return as_float(joins)

@@ -1,0 +1,261 @@
+"""The allowable flux as a table over temperature and velocity, and the fluid's path.
+
+Allowable flux densities of salt receivers are published as tables: the hotter and the slower the
+fluid in a tube, the less flux its wall endures. The panels of the receiver, in the order of the
+flow, say how hot and how fast the fluid is at each position.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from heliotrope.errors import FormatError, InputError
+from heliotrope.field.flux_limit import FluxLimit
+from heliotrope.files.cells import Rows, read_rows
+from heliotrope.geometry import FloatArray, as_float
+
+#: Columns of the two files.
+TABLE_COLUMNS = ("temperature_c", "velocity_m_s", "flux_w_m2")
+PANEL_COLUMNS = ("path", "begin", "end", "flow", "inlet_c", "outlet_c", "velocity_m_s")
+#: Rows and columns of the map that stands for a table.
+_ROWS, _COLUMNS = 60, 360
+
+
+@dataclass(frozen=True, eq=False)
+class FluxTable:
+    """The allowable flux at temperatures and velocities of the fluid.
+
+    Attributes
+    ----------
+    temperature
+        °C, ascending, (T,).
+    velocity
+        m/s, ascending, (V,).
+    flux
+        W/m², (T, V).
+    """
+
+    temperature: FloatArray
+    velocity: FloatArray
+    flux: FloatArray
+
+    def __post_init__(self) -> None:
+        shape = (len(self.temperature), len(self.velocity))
+        if self.flux.shape != shape or min(shape) < 1:
+            raise InputError(
+                f"flux table: {self.flux.shape} values for {shape[0]} temperatures and {shape[1]} "
+                "velocities; give one for each pair"
+            )
+        for name, axis in (("temperature", self.temperature), ("velocity", self.velocity)):
+            if not (np.isfinite(axis).all() and (np.diff(axis) > 0.0).all()):
+                raise InputError(f"flux table: each {name} must be finite and above the one before")
+        FluxLimit(self.flux)
+
+    def at(self, temperature: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the allowable flux by bilinear interpolation, W/m²; arguments (...,).
+
+        Raises
+        ------
+        InputError
+            If a temperature or velocity is outside the table.
+        """
+        places = []
+        for axis, value, name, unit in (
+            (self.temperature, temperature, "temperature", "°C"),
+            (self.velocity, velocity, "velocity", "m/s"),
+        ):
+            wrong = ~((value >= axis[0]) & (value <= axis[-1]))
+            if wrong.any():
+                raise InputError(
+                    f"flux table: a {name} of {np.asarray(value)[wrong].flat[0]:g} {unit} is "
+                    f"outside its {axis[0]:g} to {axis[-1]:g} {unit}; extend the table"
+                )
+            places.append(np.interp(value, axis, np.arange(len(axis))))
+        low = [
+            np.minimum(at.astype(np.int64), max(n - 2, 0))
+            for at, n in zip(places, self.flux.shape, strict=True)
+        ]
+        high = [np.minimum(k + 1, n - 1) for k, n in zip(low, self.flux.shape, strict=True)]
+        share = [at - k for at, k in zip(places, low, strict=True)]
+        near = (1 - share[1]) * self.flux[low[0], low[1]] + share[1] * self.flux[low[0], high[1]]
+        far = (1 - share[1]) * self.flux[high[0], low[1]] + share[1] * self.flux[high[0], high[1]]
+        return as_float((1 - share[0]) * near + share[0] * far)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A panel of a receiver, through which the fluid flows up or down.
+
+    Attributes
+    ----------
+    path
+        Name of the flow path.
+    begin, end
+        Its edges as shares of the receiver's width, 0 to 1, in the order of the columns.
+    up
+        Whether the fluid flows upwards.
+    inlet, outlet
+        Temperature of the fluid, °C; linear in between.
+    velocity
+        Of the fluid, m/s.
+    """
+
+    path: str
+    begin: float
+    end: float
+    up: bool
+    inlet: float
+    outlet: float
+    velocity: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.begin < self.end <= 1.0:
+            raise InputError(
+                f"panel of path {self.path}: from {self.begin:g} to {self.end:g} of the width; "
+                "the edges must ascend and lie from 0 to 1"
+            )
+
+
+def limit_of(table: FluxTable, panels: tuple[Panel, ...], margin: float = 0.0) -> FluxLimit:
+    """Return the limit that a table sets on a receiver with these panels, as a fine map.
+
+    A cell of the map gets the least allowable flux at its two ends along the flow, of all panels
+    that it overlaps.
+
+    Parameters
+    ----------
+    table, panels
+        The allowable flux, and the state of the fluid.
+    margin
+        As for `FluxLimit`.
+
+    Raises
+    ------
+    InputError
+        If panels leave a part of the width without a limit or overlap, two panels of a path do not
+        join, or a state of the fluid is outside the table.
+    """
+    _check(panels)
+    flux = np.full((_ROWS, _COLUMNS), np.inf)
+    height = np.linspace(0.0, 1.0, _ROWS + 1)
+    for panel in panels:
+        along = height if panel.up else 1.0 - height
+        temperature = panel.inlet + (panel.outlet - panel.inlet) * along
+        edges = table.at(as_float(temperature), np.full(_ROWS + 1, panel.velocity))
+        least = np.minimum(edges[:-1], edges[1:])[:, None]
+        first = int(np.floor(panel.begin * _COLUMNS + 1e-6))
+        here = slice(first, int(np.ceil(panel.end * _COLUMNS - 1e-6)))
+        flux[:, here] = np.minimum(flux[:, here], least)
+    return FluxLimit(flux, margin)
+
+
+def _check(panels: tuple[Panel, ...]) -> None:
+    """Refuse panels that do not cover the width once, or paths with a step in temperature."""
+    at = 0.0
+    for panel in sorted(panels, key=lambda each: each.begin):
+        if abs(panel.begin - at) > 1e-6:
+            wrong = "without a limit" if panel.begin > at else "on two panels"
+            low, high = sorted((at, panel.begin))
+            raise InputError(
+                f"panels: the receiver's width from {low:g} to {high:g} is {wrong}; let each panel "
+                "begin where another ends"
+            )
+        at = panel.end
+    if abs(at - 1.0) > 1e-6:
+        raise InputError(
+            f"panels: the receiver's width from {at:g} to 1 is without a limit; add a panel"
+        )
+    outlets: dict[str, float] = {}
+    for panel in panels:
+        before = outlets.get(panel.path, panel.inlet)
+        if abs(panel.inlet - before) > 1.0:
+            raise InputError(
+                f"panels: path {panel.path} enters a panel at {panel.inlet:g} °C and left the one "
+                f"before at {before:g} °C; list its panels in the order of the flow"
+            )
+        outlets[panel.path] = panel.outlet
+
+
+def read_flux_table(path: str | Path) -> FluxTable:
+    """Return the table in a CSV file with the columns `TABLE_COLUMNS`, a line for each pair.
+
+    Raises
+    ------
+    FormatError
+        If a column or a pair is missing, or a value cannot be.
+    """
+    rows = _rows(path, "a table of allowable fluxes", TABLE_COLUMNS)
+    temperature, velocity, flux = (
+        rows.numbers(name, what)
+        for name, what in zip(TABLE_COLUMNS, ("°C", "m/s", "W/m²"), strict=True)
+    )
+    rows.refuse_bad()
+    axes = [np.unique(temperature), np.unique(velocity)]
+    table = np.full((len(axes[0]), len(axes[1])), np.nan)
+    pairs = [
+        np.searchsorted(axis, value)
+        for axis, value in zip(axes, (temperature, velocity), strict=True)
+    ]
+    for i, pair in enumerate(zip(*pairs, strict=True)):
+        if np.isfinite(table[pair]):
+            rows.refuse(i, "", "this temperature and velocity are there twice; remove one")
+        table[pair] = flux[i]
+    rows.refuse_bad()
+    if np.isnan(table).any():
+        t, v = np.argwhere(np.isnan(table))[0]
+        raise FormatError(
+            rows.path, f"no flux for {axes[0][t]:g} °C at {axes[1][v]:g} m/s; add the line"
+        )
+    try:
+        return FluxTable(as_float(axes[0]), as_float(axes[1]), table)
+    except InputError as error:
+        raise FormatError(rows.path, str(error)) from None
+
+
+def read_panels(path: str | Path) -> tuple[Panel, ...]:
+    """Return the panels in a CSV file with the columns `PANEL_COLUMNS`, a line for each panel.
+
+    The column ``flow`` says "up" or "down"; the panels of a path are in the order of the flow.
+
+    Raises
+    ------
+    FormatError
+        If a column is missing, or a value cannot be.
+    """
+    rows = _rows(path, "a table of panels", PANEL_COLUMNS)
+    units = {"begin": "a share of the width", "end": "a share of the width", "inlet_c": "°C",
+             "outlet_c": "°C", "velocity_m_s": "m/s"}  # fmt: skip
+    values = [rows.numbers(name, what) for name, what in units.items()]
+    ways = rows.texts("flow")
+    for i, way in enumerate(ways):
+        if way not in ("up", "down"):
+            rows.refuse(i, "flow", f"{way!r} is neither up nor down; give one")
+    rows.refuse_bad()
+    panels = []
+    for i, (name, way) in enumerate(zip(rows.texts("path"), ways, strict=True)):
+        begin, end, *state = (float(value[i]) for value in values)
+        try:
+            panels.append(Panel(name, begin, end, way == "up", *state))
+        except InputError as error:
+            raise FormatError(rows.path, str(error), rows.places[i]) from None
+    return tuple(panels)
+
+
+def read_table_limit(table: str | Path, panels: str | Path, margin: float = 0.0) -> FluxLimit:
+    """Return the limit that a file of `read_flux_table` sets on the panels of `read_panels`.
+
+    Raises
+    ------
+    FormatError, InputError
+        As these functions and `limit_of`.
+    """
+    return limit_of(read_flux_table(table), read_panels(panels), margin)
+
+
+def _rows(path: str | Path, what: str, columns: tuple[str, ...]) -> Rows:
+    rows = read_rows(Path(path), what, columns)
+    rows.need(columns)
+    if not len(rows):
+        raise FormatError(rows.path, f"no rows; it should be {what}")
+    return rows

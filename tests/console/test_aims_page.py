@@ -1,0 +1,91 @@
+"""How aims hold the flux limit: on the page, and by ``heliotrope ctl aims``."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from heliotrope.cli import app
+from heliotrope.plant.operations.aiming import Aiming, AimsView
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from support.live_console import LiveConsole
+from support.pages import NEEDS_BROWSER
+
+VIEW = AimsView(
+    "limit", "last good aims", 42.0, 570e3, 551e3, 0.033, 17, 1.61e6, 1.66e6, 0.002, 5, 1, 2,
+    ("P0001A", "P0002A"), 12.0, "no answer within 60 s",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """A plant whose aims nobody has limited."""
+    work = AutomaticSettings(wanted=True, calibrate=False)
+    made = LiveConsole(tmp_path_factory.mktemp("aims"), 6, speed=20.0, work=work)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the plant's aiming tell what it would under a limit."""
+    monkeypatch.setattr(Aiming, "view", lambda _: VIEW)
+
+
+@NEEDS_BROWSER
+def test_the_page_shows_limit_flux_and_who_moved(
+    limited: None, enter: Callable[..., Any]
+) -> None:
+    page = enter("viewer", viewport={"width": 820, "height": 900})
+    page.click(".hx-tabs >> text=Plant")
+    page.get_by_text("Flux limit", exact=True).wait_for()
+    shown = " ".join(page.locator("body").inner_text().split())
+    for text in (
+        "no answer within 60 s", "last good aims", "570, 551 kW/m²", "3.3 %", "17",
+        "1,610, 1,660 kW", "5, 1, 2", "P0001A, P0002A",
+    ):  # fmt: skip
+        assert text in shown, text
+    assert page.evaluate("document.documentElement.scrollWidth") <= 820
+
+
+@NEEDS_BROWSER
+def test_without_a_limit_the_page_says_nothing(enter: Callable[..., Any]) -> None:
+    page = enter("viewer")
+    page.click(".hx-tabs >> text=Plant")
+    page.wait_for_timeout(1500)
+    assert page.get_by_text("Flux limit", exact=True).count() == 0
+
+
+@pytest.fixture
+def ctl(field: LiveConsole, tmp_path: Path) -> Callable[..., str]:
+    """Run `heliotrope ctl aims` at the plant."""
+
+    def run(*words: str) -> str:
+        found = CliRunner().invoke(app, ["ctl", "--data", str(field.folder), "aims", *words])
+        assert found.exit_code == 0, (found.output, found.exception)
+        return found.output
+
+    return run
+
+
+def test_ctl_says_that_there_is_no_limit(ctl: Callable[..., str]) -> None:
+    assert ctl() == "aims of the plant file; it has no flux limit\n"
+    assert json.loads(ctl("--json"))["strategy"] == "spread"
+
+
+def test_ctl_prints_what_the_page_shows(limited: None, ctl: Callable[..., str]) -> None:
+    lines = ctl().splitlines()
+    assert lines == [
+        "no answer within 60 s",
+        "aims by last good aims",
+        "limit 570 kW/m², flux with its errors up to 551 kW/m², 3.3 % left, 17 cells at the limit",
+        "1610 kW of 1660 kW",
+        "5 heliostats have an aim, 1 rest for the limit, 2 still have to move",
+        "2 moved 12 s ago: P0001A, P0002A",
+    ]
+    told = json.loads(ctl("--json"))
+    assert told["problem"] == "no answer within 60 s"
+    assert told["peak"] == 551e3
