@@ -108,12 +108,12 @@ class MirrorShape:
     @cached_property
     def axes(self) -> FloatArray:
         """Each facet's unit axes right, up and outwards, as rows, (F, 3, 3)."""
-        return self.facets.axes[0]
+        return as_float(self.facets.axes[0])
 
     @cached_property
     def half_size(self) -> FloatArray:
         """Half the width and the height of each facet, m, (F, 2)."""
-        return self.facets.half_size[0]
+        return as_float(self.facets.half_size[0])
 
     @cached_property
     def corners(self) -> FloatArray:

@@ -99,8 +99,7 @@ class Facets(Value):
         grid = self.grid
         if grid is not None:
             grid = replace(grid, canting=grid.canting.take(index))
-        arrays = (self.center, self.half_width, self.half_height)
-        return Facets(*(array[index] for array in arrays), grid)
+        return Facets(self.center[index], self.half_width[index], self.half_height[index], grid)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

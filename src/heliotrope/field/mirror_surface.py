@@ -39,9 +39,9 @@ class Canting:
         needed = {"focal": self.focal, "off_axis": self.sun}
         for kind, value in needed.items():
             if (self.kind == kind) != (value is not None):
-                what = "a focal length" if kind == "focal" else "a time or a sun vector"
-                text = "needs" if self.kind == kind else "takes no"
-                raise InputError(f"canting {self.kind} {text} {what.removeprefix('a ')}")
+                what = "focal length" if kind == "focal" else "time or sun vector"
+                text = "needs a" if self.kind == kind else "takes no"
+                raise InputError(f"canting {self.kind} {text} {what}")
         if self.focal is not None and not (self.focal > 0.0).all():
             raise InputError(
                 f"canting: a focal length of {self.focal.min():g} m must be above 0; kind none "
