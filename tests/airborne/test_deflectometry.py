@@ -7,10 +7,10 @@ import h5py
 import numpy as np
 import pytest
 
-from heliotrope.airborne.deflectometry import find_deflectometry, read_deflectometry
 from heliotrope.airborne.mirror import tiled
 from heliotrope.airborne.slopes import smooth_slopes
 from heliotrope.errors import FormatError
+from heliotrope.field.formats.deflectometry import find_deflectometry, read_deflectometry
 from heliotrope.geometry import MRAD
 from support.deflectometry_files import write_deflectometry
 
@@ -22,7 +22,9 @@ def test_the_slopes_of_a_surface_come_back(tmp_path: Path) -> None:
     # Facet 3 is canted off too: that is a part of its slopes.
     slope[3] += [2.0 * MRAD, -1.0 * MRAD]
     real = SHAPE.with_slopes(slope)
-    found = read_deflectometry(write_deflectometry(tmp_path / "A.h5", real), SHAPE)
+    found = read_deflectometry(
+        write_deflectometry(tmp_path / "A.h5", real), SHAPE.facets, SHAPE.focal
+    )
     again = SHAPE.with_slopes(found)
     assert found.shape == (4, 31, 31, 2)
     rng = np.random.default_rng(2)
@@ -36,7 +38,9 @@ def test_the_slopes_of_a_surface_come_back(tmp_path: Path) -> None:
 
 def test_a_canted_facet_is_measured_in_the_axes_of_the_mirror(tmp_path: Path) -> None:
     turned = SHAPE.canted([[0.0, 0.0], [1.0 * MRAD, 0.0], [0.0, 2.0 * MRAD], [0.0, 0.0]])
-    found = read_deflectometry(write_deflectometry(tmp_path / "A.h5", turned), SHAPE)
+    found = read_deflectometry(
+        write_deflectometry(tmp_path / "A.h5", turned), SHAPE.facets, SHAPE.focal
+    )
     # A turn about the axis to the right lifts the upper edge; one about the upward axis lowers
     # the right one.
     wanted = np.array([[0.0, 0.0], [0.0, 1.0], [-2.0, 0.0], [0.0, 0.0]]) * MRAD
@@ -86,14 +90,14 @@ def test_a_wrong_file_is_refused(
 ) -> None:
     path = write_deflectometry(tmp_path / "A.h5", SHAPE, change=change)
     with pytest.raises(FormatError, match=said):
-        read_deflectometry(path, SHAPE)
+        read_deflectometry(path, SHAPE.facets, SHAPE.focal)
 
 
 def test_a_file_that_is_no_hdf5_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "A.h5"
     path.write_bytes(b"\x89HDF\r\n\x1a\nnothing more")
     with pytest.raises(FormatError, match="no readable HDF5"):
-        read_deflectometry(path, SHAPE)
+        read_deflectometry(path, SHAPE.facets, SHAPE.focal)
 
 
 def test_the_newest_filled_file_of_a_heliostat_is_found(tmp_path: Path) -> None:

@@ -17,8 +17,9 @@ from heliotrope.airborne.mirror import (
     reflection_points,
     tiled,
 )
-from heliotrope.airborne.slopes import read_slopes, smooth_slopes, write_slopes
+from heliotrope.airborne.slopes import smooth_slopes
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats.slopes import read_slopes, write_slopes
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.geometry import MRAD, angle_between, normalize, rotation
 from heliotrope.mechanism.kinds import azimuth_elevation

@@ -26,11 +26,11 @@ from heliotrope.airborne.mirror import ideal
 from heliotrope.airborne.simulate.rendering import render_flight
 from heliotrope.airborne.simulate.simulation import Errors
 from heliotrope.airborne.simulate.trial import TrialConditions, four_facets, trial_mirror
-from heliotrope.airborne.slopes import read_slopes
 from heliotrope.cli.drone import simulate
 from heliotrope.cli.drone.evaluate import evaluate as evaluate_command
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.formats import plant_file
+from heliotrope.field.formats.slopes import read_slopes
 from heliotrope.geometry import direction, normalize
 from support.deflectometry_files import write_deflectometry
 from support.drone_case import ORIGIN, camera, field, flight, plant

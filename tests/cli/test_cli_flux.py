@@ -11,7 +11,7 @@ import pytest
 
 import heliotrope as ht
 from heliotrope.cli import main
-from heliotrope.optics.scene import Tower
+from heliotrope.field.tower import Tower
 
 SUN = "--sun=0.1,0.6,0.8"
 
@@ -109,7 +109,7 @@ def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
         ((SUN, "--dni=-1"), "--dni"),
         ((SUN, "--air=fog"), "air 'fog': known models"),
         ((SUN, "--sun-shape=disk"), "sun shape 'disk'; known"),
-        ((SUN, "--focus=near"), "--focus 'near': give slant, flat, or a focal length"),
+        ((SUN, "--focus=near"), "--focus 'near': give plant, slant, flat, or a focal"),
         ((SUN, "--facets=5"), "--facets '5': give columns and rows such as 5x7"),
         ((SUN, "--facets=5x7", "--canting=noon"), "time 'noon' is not ISO 8601"),
         ((SUN, "--cells=0x4"), "--cells '0x4': give rows and columns such as 20x56"),
@@ -131,3 +131,26 @@ def test_bad_input_ends_in_one_line(flux: Any, words: tuple[str, ...], line: str
     assert (code, out) == (2, "")
     assert line in err
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("more", "words", "text"),
+    [
+        ("[groups.azel.mirror]\nfacets = [2, 0]\n", (), "groups.azel.mirror.facets"),
+        ("[groups.azel.mirror]\nslope_maps = 'maps'\n", (), "there is no such folder"),
+        ("[groups.azel.mirror]\ncanting = 'slant'\n", (), "add facets = [columns, rows]"),
+        ("[[towers]]\neast_m = 0\nnorth_m = 0\nradius_m = 900\ntop_m = 9\n", (), "of a tower of"),
+        ("", ("--tower=0,0,900,9",), "inside a tower of radius 900"),
+        ("", ("--dni=-1",), "--dni"),
+    ],
+)
+def test_a_plant_that_cannot_be_is_one_line(
+    more: str, words: tuple[str, ...], text: str, flux: Any
+) -> None:
+    file = Path("plant.toml")
+    (group,) = ht.open("plant.toml").groups
+    file.write_text(file.read_text() + more.replace("azel", group))
+    code, _, err = flux(SUN, *words)
+    assert code == 2
+    assert text.replace("azel", group) in " ".join(err.split())
+    assert "Traceback" not in err

@@ -151,10 +151,10 @@ GROWN: list[tuple[str, str, Maker, tuple[str, str], list[Any], str]] = [
      "51,000,000 cells exceed the limit of 50,000,000; divide it"),
     ("arrays that expand to 320 MiB", "a.npz",
      lambda path: _npz(path, (1, 4_000, 5_000, 2), 320 * 2**20),
-     ("heliotrope.airborne.slopes", "read_slopes"), [1],
+     ("heliotrope.field.formats.slopes", "read_slopes"), [1],
      "expand to 320 MiB, above the limit of 256 MiB; it should be a slope map: an .npz"),
     ("an array that claims 800 GB", "a.npz", lambda path: _npz(path, (1, 10**5, 10**6, 1), 2**20),
-     ("heliotrope.airborne.slopes", "read_slopes"), [1],
+     ("heliotrope.field.formats.slopes", "read_slopes"), [1],
      "slope.npy: no array written by NumPy (1048576 bytes for shape"),
     ("a KMZ that expands to 200 MiB", "a.kmz", _kmz,
      ("tests.support.waypoint_files", "read_wpml"), [],
@@ -170,7 +170,7 @@ GROWN: list[tuple[str, str, Maker, tuple[str, str], list[Any], str]] = [
     ("a KMZ that lies about its size", "a.kmz", _lying_kmz,
      ("tests.support.waypoint_files", "read_wpml"), [], "not a readable archive (Bad CRC-32"),
     ("an archive of 20,000 members", "a.npz", _contents,
-     ("heliotrope.airborne.slopes", "read_slopes"), [1],
+     ("heliotrope.field.formats.slopes", "read_slopes"), [1],
      "its table of contents exceeds the limit of 128 KiB"),
     ("a photograph of 4 Gpx", "a.jpg", _jpeg,
      ("heliotrope.airborne.evaluate.detection", "decode"), [],
@@ -178,7 +178,7 @@ GROWN: list[tuple[str, str, Maker, tuple[str, str], list[Any], str]] = [
     ("a pipe that nobody writes", "a.toml", os.mkfifo, _MAIN, [],
      "this is a device or a pipe; give a file"),
     ("a device without an end", "a.npz", lambda path: path.symlink_to("/dev/zero"),
-     ("heliotrope.airborne.slopes", "read_slopes"), [1], "this is a device or a pipe"),
+     ("heliotrope.field.formats.slopes", "read_slopes"), [1], "this is a device or a pipe"),
 ]  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import heliotrope as ht
 from heliotrope.errors import InputError
 from heliotrope.geometry import direction, normalize, reflect
 from heliotrope.optics.canting import canted
-from heliotrope.optics.scene import scene_of
+from heliotrope.optics.plant_scene import scene_of
 
 PLANT = ht.example_plant()
 NOON, LATE = (direction(np.radians(a), np.radians(e)) for a, e in ((5.0, 55.0), (300.0, 20.0)))

@@ -13,11 +13,11 @@ from scipy.io import netcdf_file
 import heliotrope as ht
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
+from heliotrope.field.tower import Tower
 from heliotrope.geometry import direction
 from heliotrope.optics import EFFICIENCIES, FieldOptics, FluxTable, PlantFlux
 from heliotrope.optics import flux_files as files
 from heliotrope.optics.plant_flux import sun_at
-from heliotrope.optics.scene import Tower
 
 SUN = direction(np.radians(10.0), np.radians(50.0))  # in the north, for a southern plant
 LIGHT = FieldOptics(dni=850.0, clean=0.95, slope=1.5e-3)

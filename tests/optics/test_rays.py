@@ -6,13 +6,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from heliotrope.errors import InputError
+from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.mirror_surface import MirrorSurface
+from heliotrope.field.plant import Plant
+from heliotrope.field.tower import Tower
 from heliotrope.geometry import bisector, direction, normalize
-from heliotrope.optics import SunShape
+from heliotrope.mechanism.kinds import azimuth_elevation
+from heliotrope.optics import FieldFlux, SunShape
+from heliotrope.optics.plant_scene import scene_of
 from heliotrope.optics.rays import trace
-from heliotrope.optics.scene import FacetTable, Mirrors, Scene, Tower
+from heliotrope.optics.scene import FacetTable, Mirrors, Scene
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate
+from heliotrope.sun import Site
 from support import dunhuang
 
 pytest.importorskip("embreex", reason="the extra `rays` is not installed")
@@ -173,3 +181,35 @@ def test_the_number_of_rays_and_the_extra_are_checked(monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     with pytest.raises(InputError, match=r"embreex is not installed; say pip install 'helio"):
         trace(given, 1e4)
+
+
+def test_a_map_of_slopes_gives_the_image_of_its_rays() -> None:
+    """Facets with slope maps, curvatures and errors of their own, against rays."""
+    site = Site(37.0, -2.0, 0.0)
+    place = np.array([[0.0, 120.0, 0.0], [25.0, 110.0, 0.0]])
+    rough = np.random.default_rng(5).normal(size=(2, 24, 24, 2))
+    smooth = gaussian_filter(rough, (0.0, 3.0, 3.0, 0.0))
+    maps = 1.5 * MRAD * smooth / smooth.std()
+    center = np.array([[[-0.8, 0.0], [0.8, 0.0]]] * 2)
+    half = np.array([[[0.75, 1.0]] * 2] * 2)
+    surface = MirrorSurface(
+        focal=np.array([[130.0, np.inf], [120.0, 140.0]]),
+        slope=np.array([[0.5, 1.5], [1.0, 1.0]]) * MRAD,
+        maps=(maps, None),
+    )
+    facets = Facets.of(center, half, -center / 260.0)
+    group = Heliostats(
+        ("A", "B"), azimuth_elevation(place), np.full(2, 3.2), np.full(2, 2.0), facets=facets,
+        surface=surface,
+    )  # fmt: skip
+    fine = replace(PLATE, width=4.0, height=4.0, shape=(20, 20))
+    given = scene_of(Plant("p", site, {"g": group}), SUN, MIDDLE, receivers=(fine,))
+    traced, found = trace(given, 1e6, air="none", seed=2), FieldFlux(given, air="none")
+    away = np.sqrt(np.mean((found.maps[0] - traced.flux[0]) ** 2)) / traced.flux[0].max()
+    assert away < 0.005
+    assert found.powers[0] == pytest.approx(traced.power[0], rel=3e-3)
+    # Without the map and the errors of single facets the image is another one.
+    plain = replace(group, surface=None)
+    other = scene_of(Plant("p", site, {"g": plain}), SUN, MIDDLE, receivers=(fine,))
+    apart = np.sqrt(np.mean((FieldFlux(other, air="none").maps[0] - traced.flux[0]) ** 2))
+    assert apart / traced.flux[0].max() > 0.05

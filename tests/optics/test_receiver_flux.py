@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import InputError
+from heliotrope.field.tower import Tower
 from heliotrope.geometry import bisector, normalize
 from heliotrope.optics.receiver_flux import FieldFlux
-from heliotrope.optics.scene import FacetTable, Mirrors, Scene, Tower
+from heliotrope.optics.scene import FacetTable, Mirrors, Scene
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 from support import dunhuang
 

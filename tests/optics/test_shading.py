@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from heliotrope.field.tower import Tower
 from heliotrope.geometry import bisector, direction, normalize
-from heliotrope.optics.scene import FacetTable, Mirrors, Scene, Tower
+from heliotrope.optics.scene import FacetTable, Mirrors, Scene
 from heliotrope.optics.shading import Shading
 from support import dunhuang
 

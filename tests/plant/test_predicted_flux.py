@@ -8,6 +8,7 @@ import pytest
 
 import heliotrope as ht
 from heliotrope.errors import InputError
+from heliotrope.field.mirror_surface import MirrorSurface
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, normalize
 from heliotrope.optics import (
@@ -26,8 +27,12 @@ from heliotrope.plant.operations.views import PredictedView
 from heliotrope.plant.refusals import RefusedError
 from support.live import LivePlant, live
 
+#: What a plant file may say of four mirrors: flatter and rougher than usual.
+SURFACE = MirrorSurface(np.full(4, 80.0), np.full(4, 3e-3), np.full(4, 0.8))
 
-def test_it_is_what_the_library_says_of_the_same_mirrors() -> None:
+
+@pytest.mark.parametrize("surface", [None, SURFACE])
+def test_it_is_what_the_library_says_of_the_same_mirrors(surface: MirrorSurface | None) -> None:
     async def scene(made: LivePlant) -> None:
         operations, plant = made.operations, made.plant
         operations.automatic.switch(on=False)  # no visit takes one away
@@ -49,7 +54,7 @@ def test_it_is_what_the_library_says_of_the_same_mirrors() -> None:
         assert np.isnan(shown.peak_sigma), "none of them was ever calibrated"
         assert 0.0 < shown.power_sigma < shown.power
 
-    live(scene, AutomaticSettings(wanted=True))
+    live(scene, AutomaticSettings(wanted=True), surface=surface)
 
 
 @pytest.mark.parametrize("error", [InputError("the process has ended"), ValueError("a defect")])

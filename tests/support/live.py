@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from heliotrope.field.layouts import lay_out
+from heliotrope.field.mirror_surface import MirrorSurface
 from heliotrope.field.plant import Plant
 from heliotrope.files.disk import Disk
 from heliotrope.geometry import FloatArray
@@ -152,11 +153,13 @@ def live(
     records: Records | None = None,
     plant: PlantSettings | None = None,
     start: datetime = START,
+    surface: MirrorSurface | None = None,
 ) -> None:
     """Run some heliostats on two clusters in virtual time."""
     design = lay_out("radial", count)
     (group,) = design.groups.values()
     group = replace(group, cluster=("C1",) * (count // 2) + ("C2",) * (count // 2))
+    group = replace(group, surface=surface)
     plant = plant or PlantSettings()
     options = LiveOptions(rendered=False, threads=0, work=settings, plant=plant)
 

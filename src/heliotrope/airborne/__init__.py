@@ -14,8 +14,8 @@ The package itself contains what all three share: mirrors and their poses, photo
 
 from heliotrope.airborne.mirror import MirrorShape, ideal, measured_normal, rectangle, tiled
 from heliotrope.airborne.photo import LedCamera, Photo, read_camera, read_photos, write_camera
-from heliotrope.airborne.slopes import read_slopes, write_slopes
 from heliotrope.airborne.standing import MirrorPoses, read_commands, write_commands
+from heliotrope.field.formats.slopes import read_slopes, write_slopes
 
 __all__ = [
     "LedCamera",

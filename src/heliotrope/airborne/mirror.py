@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.field.formats.frames import mirror_frame
-from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.geometry import FloatArray, as_float, as_vectors, bisector, normalize, rotation
 from heliotrope.mechanism.chain import Mechanism
 
@@ -100,18 +100,20 @@ class MirrorShape:
     def __len__(self) -> int:
         return len(self.center)
 
+    @property
+    def facets(self) -> Facets:
+        """The facets of this one mirror, as a plant has them."""
+        return Facets(self.center[None], self.half_width[None], self.half_height[None])
+
     @cached_property
     def axes(self) -> FloatArray:
         """Each facet's unit axes right, up and outwards, as rows, (F, 3, 3)."""
-        right = normalize(self.half_width)
-        out = normalize(np.cross(self.half_width, self.half_height))
-        return np.stack([right, np.cross(out, right), out], axis=1)
+        return as_float(self.facets.axes[0])
 
     @cached_property
     def half_size(self) -> FloatArray:
         """Half the width and the height of each facet, m, (F, 2)."""
-        up = np.sum(self.half_height * self.axes[:, 1], axis=-1)
-        return np.stack([np.linalg.norm(self.half_width, axis=-1), up], axis=-1)
+        return as_float(self.facets.half_size[0])
 
     @cached_property
     def corners(self) -> FloatArray:

@@ -11,8 +11,8 @@ from heliotrope.errors import InputError, shown
 
 if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
+    from heliotrope.field.tower import Tower
     from heliotrope.optics import FieldOptics
-    from heliotrope.optics.scene import Tower
 
 Field = Annotated[Path, typer.Argument(help="Plant file, or a field in another format.")]
 Time = Annotated[
@@ -38,17 +38,31 @@ Air = Annotated[
     ),
 ]
 Slope = Annotated[
-    float, typer.Option(min=0, max=50, help="Slope error of the surface per axis, mrad.")
+    float | None,
+    typer.Option(
+        min=0,
+        max=50,
+        help="Slope error of the surface per axis, mrad. Default: of the plant file, or 1.",
+    ),
 ]
 Error = Annotated[
     float, typer.Option(min=0, max=100, help="Expected error of the mirror normals, mrad RMS.")
 ]
-Reflectivity = Annotated[float, typer.Option(min=0, max=1, help="Reflectivity of a clean mirror.")]
+Reflectivity = Annotated[
+    float | None,
+    typer.Option(
+        min=0, max=1, help="Reflectivity of a clean mirror. Default: of the plant file, or 0.9."
+    ),
+]
 Clean = Annotated[
     float, typer.Option(min=0, max=1, help="Fraction of the reflectivity that soiling leaves.")
 ]
 Focus = Annotated[
-    str, typer.Option(help="Focus: slant, flat, or the focal length of all mirrors, m.")
+    str,
+    typer.Option(
+        help="Focus: plant (as in the plant file, or slant), slant, flat, or the focal length of "
+        "all mirrors, m."
+    ),
 ]
 FacetOption = Annotated[
     str | None, typer.Option(help="Columns and rows of equal facets, such as 5x7.")
@@ -73,9 +87,9 @@ def light_of(
     dni: float,
     shape: str,
     air: str,
-    slope_mrad: float,
+    slope_mrad: float | None,
     error_mrad: float,
-    reflectivity: float,
+    reflectivity: float | None,
     clean: float,
     focus: str,
     facets: str | None,
@@ -89,7 +103,7 @@ def light_of(
         dni=dni,
         shape=shape,
         air=air,
-        slope=1e-3 * slope_mrad,
+        slope=None if slope_mrad is None else 1e-3 * slope_mrad,
         error=1e-3 * error_mrad,
         reflectivity=reflectivity,
         clean=clean,
@@ -100,10 +114,12 @@ def light_of(
     )
 
 
-def _focus(text: str) -> Literal["slant", "flat"] | float:
-    if text in ("slant", "flat"):
-        return "slant" if text == "slant" else "flat"
-    refusal = f"--focus {shown(text)}: give slant, flat, or a focal length from 0.1 to 1e5 m"
+def _focus(text: str) -> Literal["plant", "slant", "flat"] | float:
+    words: dict[str, Literal["plant", "slant", "flat"]]
+    words = {"plant": "plant", "slant": "slant", "flat": "flat"}
+    if text in words:
+        return words[text]
+    refusal = f"--focus {shown(text)}: give plant, slant, flat, or a focal length from 0.1 to 1e5 m"
     (length,) = parse_numbers(text, refusal, least=0.1, most=1e5)
     return length
 
@@ -140,7 +156,7 @@ def _cells(text: str | None) -> tuple[int, int] | None:
 
 
 def _tower(text: str) -> "Tower":
-    from heliotrope.optics.scene import Tower
+    from heliotrope.field.tower import Tower
 
     refusal = f"--tower {shown(text)}: give four numbers in m, east,north,radius,top"
     east, north, radius, top = parse_numbers(text, refusal, count=4)

@@ -33,6 +33,11 @@ from heliotrope.field.heliostats import (
 from heliotrope.field.marks import (
     Mark,
 )
+from heliotrope.field.mirror_surface import (
+    Canting,
+    FacetGrid,
+    MirrorSurface,
+)
 from heliotrope.field.plant import (
     Plant,
 )
@@ -45,6 +50,9 @@ from heliotrope.field.target import (
 )
 from heliotrope.field.timetable import (
     TimetableEntry,
+)
+from heliotrope.field.tower import (
+    Tower,
 )
 from heliotrope.field.volumes import (
     Box,
@@ -59,12 +67,15 @@ __all__ = [
     "ApprovalSettings",
     "Box",
     "Camera",
+    "Canting",
     "Cylinder",
+    "FacetGrid",
     "Facets",
     "Heliostat",
     "Heliostats",
     "JointSettings",
     "Mark",
+    "MirrorSurface",
     "Plant",
     "Prism",
     "Receiver",
@@ -72,6 +83,7 @@ __all__ = [
     "Sphere",
     "Target",
     "TimetableEntry",
+    "Tower",
     "TrackedDay",
     "Volume",
     "example_plant",

@@ -3,14 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.mirror_surface import FacetGrid, MirrorSurface
 from heliotrope.files.cells import check_names
 from heliotrope.frames import ENU, Framed, Labelled, Variable
-from heliotrope.geometry import FloatArray, as_float
+from heliotrope.geometry import FloatArray, as_float, normalize
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Calibrated, Mechanism, check_calibration
 from heliotrope.mechanism.drives import Drive
@@ -30,11 +32,14 @@ class Facets(Value):
     half_width, half_height
         Vectors from the centre of a facet to the midpoints of its right and its upper edge, m, (N,
         F, 3); their cross product is along the facet normal.
+    grid
+        The grid from which they were made, with its canting; None: each is specified by itself.
     """
 
     center: FloatArray
     half_width: FloatArray
     half_height: FloatArray
+    grid: FacetGrid | None = None
 
     def __post_init__(self) -> None:
         shapes = {a.shape for a in (self.center, self.half_width, self.half_height)}
@@ -43,6 +48,58 @@ class Facets(Value):
 
     def _card(self) -> Card:
         return card_of_arrays(self)
+
+    @classmethod
+    def of(
+        cls,
+        center: FloatArray,
+        half: FloatArray,
+        tilt: FloatArray,
+        grid: FacetGrid | None = None,
+    ) -> Self:
+        """Return facets whose centres lie in the plane of the mirror.
+
+        Parameters
+        ----------
+        center, half
+            Centres and half sizes, right and up, m, (N, F, 2).
+        tilt
+            Canting: x and y of the facets' normals, whose z is near 1, rad, (N, F, 2).
+        grid
+            As the attribute.
+        """
+        level = np.zeros_like(center[..., :1])
+        normal = normalize(np.concatenate([tilt, level + 1.0], axis=-1), "facets: normal")
+        right = normalize(np.cross([0.0, 1.0, 0.0], normal), "facets: right")
+        up = np.cross(normal, right)
+        middle = np.concatenate([center, level], axis=-1)
+        return cls(middle, half[..., :1] * right, half[..., 1:] * up, grid)
+
+    @cached_property
+    def axes(self) -> FloatArray:
+        """Unit axes right, up and outwards of each facet, as rows, (N, F, 3, 3)."""
+        right = normalize(self.half_width, "facets: half width")
+        out = normalize(np.cross(self.half_width, self.half_height), "facets: normal")
+        return np.stack([right, np.cross(out, right), out], axis=-2)
+
+    @cached_property
+    def half_size(self) -> FloatArray:
+        """Half the width and the height of each facet, m, (N, F, 2)."""
+        up = np.sum(self.half_height * self.axes[..., 1, :], axis=-1)
+        return np.stack([np.linalg.norm(self.half_width, axis=-1), up], axis=-1)
+
+    @property
+    def tilt(self) -> FloatArray:
+        """Canting: x and y of each facet's normal, whose z is 1, (N, F, 2)."""
+        out = self.axes[..., 2, :]
+        return as_float(out[..., :2] / out[..., 2:])
+
+    def take(self, index: npt.NDArray[np.intp]) -> "Facets":
+        """Return the facets of some of the mirrors."""
+        grid = self.grid
+        if grid is not None:
+            grid = replace(grid, canting=grid.canting.take(index))
+        return Facets(self.center[index], self.half_width[index], self.half_height[index], grid)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,6 +126,8 @@ class Heliostats(Value, Framed):
     machines
         Motor limits and rest positions of each heliostat, or () if the plant file does not specify
         them.
+    surface
+        Curvature, errors and measured slopes of the mirrors, if known.
     """
 
     names: tuple[str, ...]
@@ -80,6 +139,7 @@ class Heliostats(Value, Framed):
     aim: FloatArray | None = None
     cluster: tuple[str, ...] = ()
     machines: tuple[Machine, ...] = ()
+    surface: MirrorSurface | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -114,6 +174,31 @@ class Heliostats(Value, Framed):
             raise InputError(f"heliostats: aim of shape {self.aim.shape}; it must be ({count}, 3)")
         if self.facets is not None and len(self.facets.center) != count:
             raise InputError(f"heliostats: {len(self.facets.center)} rows of facets for {count}")
+        if self.surface is not None:
+            each = 1 if self.facets is None else self.facets.center.shape[1]
+            self.surface.check(self.names, each)
+
+    def check_facets(self) -> None:
+        """Check that every facet lies on its mirror.
+
+        Raises
+        ------
+        InputError
+            If one does not; the message names the heliostat and the facet.
+        """
+        if self.facets is None:
+            return
+        reach = np.abs(self.facets.center[..., :2]) + self.facets.half_size
+        half = 0.5 * np.stack([self.width, self.height], axis=-1)
+        outside = (reach > half[:, None] * 1.001 + 1e-3).any(axis=-1)
+        if outside.any():
+            i, k = np.argwhere(outside)[0].tolist()
+            right, up = reach[i, k]
+            raise InputError(
+                f"heliostat {self.names[i]}: facet {k} reaches {right:.3f} m to a side and "
+                f"{up:.3f} m up or down from the middle, but the mirror is {self.width[i]:.3f} × "
+                f"{self.height[i]:.3f} m; correct either"
+            )
 
     def _card(self) -> Card:
         count = len(self.parameters)
@@ -220,16 +305,14 @@ class Heliostats(Value, Framed):
             raise InputError(
                 f"rows: {index[outside][0]} is not there; rows go from 0 to {len(self) - 1}"
             )
-        facets = self.facets
         return replace(
             self,
             names=tuple(self.names[i] for i in index),
             mechanism=self.mechanism[index],
             width=self.width[index],
             height=self.height[index],
-            facets=None
-            if facets is None
-            else Facets(facets.center[index], facets.half_width[index], facets.half_height[index]),
+            facets=None if self.facets is None else self.facets.take(index),
+            surface=None if self.surface is None else self.surface.take(index),
             parameters={name: values[index] for name, values in self.parameters.items()},
             aim=None if self.aim is None else self.aim[index],
             cluster=tuple(self.cluster[i] for i in index) if self.cluster else (),

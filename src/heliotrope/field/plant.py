@@ -16,6 +16,7 @@ from heliotrope.field.heliostat import Heliostat
 from heliotrope.field.heliostats import Heliostats, rows_in
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.timetable import TimetableEntry, check_timetable
+from heliotrope.field.tower import Tower
 from heliotrope.field.volumes import Volume
 from heliotrope.files.cells import check_names
 from heliotrope.frames import ENU, Framed, Labelled, Variable
@@ -69,6 +70,8 @@ class Plant(Value, Framed):
         Changes by an operator or engineer that need a second approval.
     aims
         How the heliostats' aims on the receiver are chosen.
+    towers
+        Towers and masts that shade and block heliostats.
     """
 
     name: str
@@ -86,6 +89,7 @@ class Plant(Value, Framed):
     safety: Limits = field(default_factory=dict)
     approval: ApprovalSettings = field(default_factory=ApprovalSettings)
     aims: AimSettings = field(default_factory=AimSettings)
+    towers: tuple[Tower, ...] = ()
 
     def __post_init__(self) -> None:
         check_site(self.site)
@@ -110,8 +114,27 @@ class Plant(Value, Framed):
                 f'aims: strategy "limit" needs one receiver, and the plant has '
                 f"{len(self.receivers)}; leave [aims] out"
             )
+        if self.aims.limit is not None and self.receivers[0].mesh is not None:
+            raise InputError(
+                f'aims: strategy "limit" needs a planar or cylindrical receiver, and '
+                f"{self.receivers[0].name} is a {self.receivers[0].kind}; leave [aims] out"
+            )
+        self._check_towers()
         if self.timetable:
             check_timetable(self.timetable, self.names, (t.name for t in self.targets))
+
+    def _check_towers(self) -> None:
+        """Refuse a heliostat inside a tower."""
+        for tower in self.towers:
+            east, north, up = self.position.T
+            away = np.hypot(east - tower.east, north - tower.north)
+            inside = (away < tower.radius) & (up < tower.top)
+            if inside.any():
+                k = int(np.flatnonzero(inside)[0])
+                raise InputError(
+                    f"heliostat {self.names[k]} stands {away[k]:.2f} m from the axis of a tower "
+                    f"of radius {tower.radius:g} m, inside it; correct either"
+                )
 
     def _check_places(self) -> None:
         """Refuse two heliostats at one place: a row that was copied, or a wrong position."""

@@ -9,11 +9,14 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.marks import Mark
+from heliotrope.field.mesh import TriangleMesh
 from heliotrope.geometry import FloatArray, as_vectors, normalize
 from heliotrope.values import Card, Value, amount
 
 #: A target's aim point lies no further in front of or behind its corners, m.
 _DEPTH = 0.5
+#: The inner surface of a cavity may touch the plane of its aperture, m.
+_BEFORE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -160,19 +163,22 @@ class Receiver(Value):
     name
         Unique in the plant.
     kind
-        "planar", "convex_cylinder" or "external_cylinder".
+        "planar", "convex_cylinder", "external_cylinder", "cavity" or "mesh".
     center
         ENU metres, (3,).
     normal
         Unit normal of the aperture, pointing outwards, (3,).
     width, height
-        Size of the aperture, m; diameter and height of an external cylinder.
+        Size of the aperture, m; diameter and height of an external cylinder; largest extent of a
+        mesh.
     corners
         Corners of the aperture in the order of `Target`, (4, 3), if known.
     radius, opening_angle
         Curvature, m and rad; 0 if flat.
     nominal_power
         Power on it to which readings of its flux refer, W; 0: not known.
+    mesh
+        Surface of a mesh, or inner surface of a cavity, in the axes `frame` about the centre, m.
     """
 
     name: str
@@ -185,6 +191,7 @@ class Receiver(Value):
     radius: float = 0.0
     opening_angle: float = 0.0
     nominal_power: float = 0.0
+    mesh: TriangleMesh | None = None
 
     def _card(self) -> Card:
         east, north, up = self.center
@@ -192,7 +199,7 @@ class Receiver(Value):
         return Card(f"{line}{east:.4g} m east, {north:.4g} m north, {up:.4g} m up")
 
     def __post_init__(self) -> None:
-        kinds = ("planar", "convex_cylinder", "external_cylinder")
+        kinds = ("planar", "convex_cylinder", "external_cylinder", "cavity", "mesh")
         if self.kind not in kinds:
             raise InputError(f"receiver {self.name}: kind {self.kind!r}; known: {', '.join(kinds)}")
         for name in ("width", "height"):
@@ -207,6 +214,30 @@ class Receiver(Value):
         object.__setattr__(self, "center", center)
         normal = normalize(self.normal, f"receiver {self.name}: normal")
         object.__setattr__(self, "normal", normal)
+        self._check_mesh()
+
+    def _check_mesh(self) -> None:
+        if (self.kind in ("cavity", "mesh")) != (self.mesh is not None):
+            wanted = "takes no mesh" if self.mesh is not None else "needs a mesh"
+            raise InputError(f"receiver {self.name}: kind {self.kind} {wanted}")
+        if self.kind != "cavity" or self.mesh is None:
+            return
+        front = float(self.mesh.vertices[:, 2].max())
+        if front > _BEFORE:
+            raise InputError(
+                f"receiver {self.name}: its inner surface reaches {front:.3f} m in front of the "
+                "aperture; the third coordinate of its vertices must be 0 or less"
+            )
+        if (np.sum(self.mesh.center * self.mesh.normal, axis=-1) >= 0.0).all():
+            raise InputError(
+                f"receiver {self.name}: no triangle of its inner surface faces the aperture; "
+                "reverse the order of their vertices"
+            )
+
+    @property
+    def frame(self) -> FloatArray:
+        """Axes right and up as seen from the front, and out of it, as rows in ENU, (3, 3)."""
+        return np.concatenate([self.aperture.axes, self.aperture.normal[None]])
 
     def point(self, right: float, up: float) -> FloatArray:
         """Return a point on the surface, ENU m, (3,), from its position on the unrolled surface.
@@ -232,7 +263,7 @@ class Receiver(Value):
                     f"give at most {most:.4g} m"
                 )
         if not turn:
-            return self.face.point((right, up))
+            return self.aperture.point((right, up))
         full = self.kind == "external_cylinder"
         upright = np.array([0.0, 0.0, 1.0])
         if full:
@@ -260,6 +291,11 @@ class Receiver(Value):
                 f"receiver {self.name}: it is {self.kind.replace('_', ' ')}, and only a planar one "
                 "has a face"
             )
+        return self.aperture
+
+    @cached_property
+    def aperture(self) -> Target:
+        """The flat rectangle of its width and height about its centre."""
         corners = self.corners
         if corners is None:
             # An aperture that looks straight up or down has no upper edge of its own.

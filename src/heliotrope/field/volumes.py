@@ -128,7 +128,10 @@ def around(receiver: Receiver, room: float) -> Volume:
         half = np.array([0.0, 0.0, 0.5 * receiver.height + room])
         ends = receiver.center - half, receiver.center + half
         return Cylinder(name, *ends, 0.5 * receiver.width + room)
-    return Sphere(name, receiver.center, 0.5 * np.hypot(receiver.width, receiver.height) + room)
+    reach = 0.5 * float(np.hypot(receiver.width, receiver.height))
+    if receiver.mesh is not None:
+        reach = max(reach, float(np.linalg.norm(receiver.mesh.vertices, axis=-1).max()))
+    return Sphere(name, receiver.center, reach + room)
 
 
 def around_target(target: Target, room: float) -> Volume:

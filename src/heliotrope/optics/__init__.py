@@ -88,9 +88,10 @@ from heliotrope.optics.plant_flux import (
     flux_views,
     flux_year,
 )
+from heliotrope.optics.plant_scene import scene_of
 from heliotrope.optics.rays import RayTrace, trace
 from heliotrope.optics.receiver_flux import Efficiencies, FieldFlux, Images
-from heliotrope.optics.scene import FacetTable, Mirrors, Scene, Tower, scene_of
+from heliotrope.optics.scene import FacetTable, Mirrors, Scene
 from heliotrope.optics.shading import Lit, Shading
 from heliotrope.optics.sun_shape import SUN_SHAPES, Gaussians, SunShape, sun_profile
 from heliotrope.optics.surfaces import Cavity, Cells, Cylinder, Mesh, Plate, Surface, surface_of
@@ -140,7 +141,6 @@ __all__ = [
     "SunShape",
     "Surface",
     "Sweep",
-    "Tower",
     "Way",
     "air_loss",
     "beam_sigma",

@@ -151,10 +151,11 @@ def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, 
         if lit[0] <= 0.0:
             continue
         x, y, _, _ = part_of(i, f, table, kind, split, row)
-        tilt_x, tilt_y = 0.0, 0.0
+        tilt_x, tilt_y, rough = 0.0, 0.0, 0.0
         if len(table):
             surface = surfaces[kind[i], f]
             tilt_x, tilt_y, curve = surface[0], surface[1], surface[2]
+            rough = surface[3] * t * t
             _spread(turn, axes, row, t, curve, spread)
         else:
             x, y = 0.0, 0.0
@@ -166,6 +167,9 @@ def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, 
         uu = a * a * lit[3] + 2.0 * a * b * lit[4] + b * b * lit[5]
         vv = p * p * lit[3] + 2.0 * p * q * lit[4] + q * q * lit[5]
         uv = a * p * lit[3] + (a * q + b * p) * lit[4] + b * q * lit[5]
+        uu += rough * (turn[0, 0] ** 2 + turn[0, 1] ** 2)
+        uv += rough * (turn[0, 0] * turn[1, 0] + turn[0, 1] * turn[1, 1])
+        vv += rough * (turn[1, 0] ** 2 + turn[1, 1] ** 2)
         u, v = place[0], place[1]
         total += power
         key_u, key_v = math.floor(u * close + 0.5), math.floor(v * close + 0.5)

@@ -1,13 +1,4 @@
-"""Canting: how the facets of a mirror are tilted towards a focus.
-
-The facets of a heliostat lie in the plane of its mirror, edge to edge. SolarPILOT's canting
-methods:
-
-- on-axis, with one focal length for the field, or with each heliostat's slant range: to first order
-  in the size of the mirror, the facets are tangent to a paraboloid;
-- off-axis, for one moment: at that moment, and only then, every facet sends the centre of the sun
-  to the aim.
-"""
+"""Mirrors of a scene divided into canted facets, whatever the plant file says of them."""
 
 from dataclasses import replace
 from typing import Literal
@@ -16,9 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
+from heliotrope.field.canting import off_axis, on_axis
+from heliotrope.field.mirror_surface import Canting as PlantCanting
+from heliotrope.field.mirror_surface import FacetGrid
 from heliotrope.field.plant import Plant
-from heliotrope.geometry import FloatArray, as_float, as_vectors, bisector, normalize
-from heliotrope.optics.scene import FacetTable, Mirrors, scene_of
+from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
+from heliotrope.optics.plant_scene import scene_of
+from heliotrope.optics.scene import FacetTable, Mirrors
 
 #: Focal length, "slant" (each heliostat's distance to its aim), or the sun, ENU, (3,).
 Canting = Literal["slant"] | float | npt.ArrayLike
@@ -53,19 +48,14 @@ def canted(
         position, or the plant is missing.
     """
     columns, rows = facets
-    if not (1 <= columns <= 50 and 1 <= rows <= 50):
-        raise InputError(f"canting: {columns} × {rows} facets; give 1 to 50 each way")
-    x = (np.arange(columns) + 0.5) / columns - 0.5
-    y = (np.arange(rows) + 0.5) / rows - 0.5
-    grid = np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=-1)
-    size = np.stack([mirrors.width, mirrors.height], axis=-1)[:, None]
-    center = as_float(size * grid)
+    center, half = FacetGrid(columns, rows, 0.0, PlantCanting("none")).places(
+        mirrors.width, mirrors.height
+    )
     if isinstance(canting, str) or np.ndim(as_float(canting)) == 0:
         focal = mirrors.slant if isinstance(canting, str) else _focal(canting, len(mirrors))
-        tilt = -center / (2.0 * focal)[:, None, None]
+        tilt = on_axis(center, focal)
     else:
         tilt, focal = _off_axis(center, canting, plant, aim), mirrors.slant
-    half = np.broadcast_to(0.5 * size / np.array([columns, rows]), center.shape)
     own = np.broadcast_to(mirrors.focal[:, None], center.shape[:2])
     # The mirror's own focal length serves to cast what its neighbours hide.
     return replace(mirrors, focal=focal).with_facets(FacetTable(center, tilt, half, own))
@@ -94,9 +84,4 @@ def _off_axis(
         raise InputError(
             f"canting: heliostat {name} cannot reach its aim at the sun of canting; choose another"
         )
-    x, y = center[..., :1], center[..., 1:]
-    place = then.center[:, None] + x * then.right[:, None] + y * then.up[:, None]
-    normal = bisector(np.broadcast_to(light, place.shape), normalize(then.aim[:, None] - place))
-    axes = np.stack([then.right, then.up, then.normal], axis=1)
-    right, up, out = np.moveaxis(np.einsum("hij,hfj->hfi", axes, normal), -1, 0)
-    return np.stack([right / out, up / out], axis=-1)
+    return off_axis(center, then.center, then.normal, light, then.aim)

@@ -16,15 +16,17 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
+from heliotrope.field.tower import Tower
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.frames import times as frame_times
 from heliotrope.geometry import FloatArray, as_float, as_vectors, azimuth_elevation, normalize
 from heliotrope.optics.attenuation import air_loss
 from heliotrope.optics.canting import Canting, canted
 from heliotrope.optics.flux import FluxView
+from heliotrope.optics.plant_scene import scene_of
 from heliotrope.optics.rays import trace
 from heliotrope.optics.receiver_flux import Efficiencies, FieldFlux
-from heliotrope.optics.scene import Scene, Tower, scene_of
+from heliotrope.optics.scene import Scene
 from heliotrope.optics.sun_shape import SunShape
 from heliotrope.optics.surfaces import Cylinder, Plate, Surface
 from heliotrope.sun import Times, unix_seconds, vector
@@ -53,15 +55,17 @@ class FieldOptics:
     air
         Atmospheric model, or the visibility, km: `heliotrope.optics.air_loss`.
     slope
-        Standard deviation of the surface normal per axis, rad.
+        Standard deviation of the surface normal per axis, rad; None: of the plant file, otherwise
+        1 mrad.
     error
         Two-dimensional standard deviation of the mirror normals expected from their calibration,
         rad, () or (N,).
     reflectivity, clean
         Reflectivity of the clean mirror, and the fraction that soiling leaves, 0 to 1, () or (N,).
+        Reflectivity None: of the plant file, otherwise 0.9.
     focus
-        "slant": each mirror is focused on its aim; "flat"; or the focal length, m. For mirrors with
-        facets it applies to each facet.
+        "plant": as the plant file specifies, otherwise "slant"; "slant": each mirror is focused on
+        its aim; "flat"; or the focal length, m. For mirrors with facets it applies to each facet.
     facets
         Columns and rows of equal facets; None: as in the plant file.
     canting
@@ -78,11 +82,11 @@ class FieldOptics:
     dni: float = 900.0
     shape: str | SunShape = "limb"
     air: str | float = "clear"
-    slope: float = 1e-3
+    slope: npt.ArrayLike | None = None
     error: npt.ArrayLike = 1e-3
-    reflectivity: npt.ArrayLike = 0.9
+    reflectivity: npt.ArrayLike | None = None
     clean: npt.ArrayLike = 1.0
-    focus: Literal["slant", "flat"] | float = "slant"
+    focus: Literal["plant", "slant", "flat"] | float = "plant"
     facets: tuple[int, int] | None = None
     canting: Canting = "slant"
     cells: tuple[int, int] | None = None

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from heliotrope.errors import InputError
+from heliotrope.field.tower import Tower
 from heliotrope.geometry import FloatArray, as_float, normalize, tangent_axes
 from heliotrope.optics.attenuation import air_loss
-from heliotrope.optics.scene import Scene, Tower
+from heliotrope.optics.scene import Scene
 from heliotrope.optics.sun_shape import SunShape
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 
@@ -123,13 +124,15 @@ class _Tracer:
             self.mirror = np.arange(len(mirrors))
             self.center, self.tilt = np.zeros((len(mirrors), 2)), np.zeros((len(mirrors), 2))
             self.half = 0.5 * np.stack([mirrors.width, mirrors.height], axis=-1)
-            self.focal = mirrors.focal
+            self.focal, self.slope = mirrors.focal, mirrors.slope
         else:
             real = facets.half.min(axis=-1)[mirrors.kind] > 0.0
             self.mirror, column = np.nonzero(real)
             row = mirrors.kind[self.mirror]
             self.center, self.tilt = facets.center[row, column], facets.tilt[row, column]
             self.half, self.focal = facets.half[row, column], facets.focal[row, column]
+            own = 0.0 if facets.slope is None else facets.slope[row, column]
+            self.slope = as_float(np.hypot(mirrors.slope[self.mirror], own))
         self.origin = mirrors.center.mean(axis=0)
         size = np.linalg.norm(mirrors.center - self.origin, axis=-1).max(initial=0.0)
         self.off = _OFF * max(100.0, float(size))
@@ -174,7 +177,7 @@ class _Tracer:
         point = m.center[k] + x * right + y * up
         # A concave mirror's normal leans back to its axis.
         tilt = self.tilt[rows] - place / (2.0 * self.focal[rows])[:, None]
-        tilt = tilt + m.slope[k][:, None] * rng.standard_normal((count, 2))
+        tilt = tilt + self.slope[rows][:, None] * rng.standard_normal((count, 2))
         lean = normalize(normal + tilt[:, :1] * right + tilt[:, 1:] * up)
         light = normalize(self.scene.sun + self.shape.sample(count, rng) @ self.axes)
         ray = 2.0 * _dot(light, lean)[:, None] * lean - light

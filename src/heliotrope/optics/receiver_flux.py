@@ -529,11 +529,13 @@ def _light(scene: Scene, transmitted: FloatArray) -> FloatArray:
 
 
 def _figure(mirrors: Mirrors) -> FloatArray:
-    """Return tilt (2) and curvature 1 / 2f of each facet, (K, F, 3)."""
+    """Return tilt (2), curvature 1 / 2f and variance of slope of each facet, (K, F, 4)."""
     facets = mirrors.facets
     if facets is None:
-        return as_input(np.empty((0, 0, 3)))
-    return as_input(np.concatenate([facets.tilt, 0.5 / facets.focal[..., None]], axis=-1))
+        return as_input(np.empty((0, 0, 4)))
+    slope = np.zeros_like(facets.focal) if facets.slope is None else facets.slope
+    columns = np.stack([0.5 / facets.focal, slope**2], axis=-1)
+    return as_input(np.concatenate([facets.tilt, columns], axis=-1))
 
 
 def _divisions(scene: Scene, sun: float = SUN_SIGMA**2) -> IntArray:

@@ -1,7 +1,7 @@
 """The input of the flux engine and the ray tracer: mirrors, surfaces, towers and a sun vector.
 
-All data are plain, immutable arrays in ENU metres and radians. `scene_of` creates a `Scene` from a
-plant, a sun vector and aims. A `Scene` contains neither the sun shape nor the atmosphere; the
+All data are plain, immutable arrays in ENU metres and radians. `plant_scene` creates a `Scene` from
+a plant, a sun vector and aims. A `Scene` contains neither the sun shape nor the atmosphere; the
 functions that compute flux take these as separate arguments.
 
 A mirror is a flat rectangle about its centre with a unit normal and two unit axes in its plane,
@@ -11,20 +11,16 @@ rectangles in this plane, each with its own tilt (canting) and focal length; the
 length is then used only for casting shadows of its neighbours.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.field.heliostats import Facets
-from heliotrope.field.plant import Plant
-from heliotrope.field.target import Receiver, Target
+from heliotrope.field.tower import Tower
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, tangent_axes
-from heliotrope.mechanism.tracking import track
-from heliotrope.optics.surfaces import Surface, surface_of
+from heliotrope.optics.surfaces import Surface
 
 #: Direction and size of a mirror's axes agree to this.
 _TOLERANCE = 1e-6
@@ -44,13 +40,17 @@ class FacetTable:
     half
         Half width and half height, m, (K, F, 2); 0 where a mirror has fewer facets.
     focal
-        Focal length of the facet's own curvature, m; infinite if flat, (K, F).
+        Focal length of the facet's own curvature, m; infinite if flat, negative if convex, (K, F).
+    slope
+        Standard deviation of the facet's normal per axis beside that of its mirror, whose
+        variance adds to it, rad, (K, F); None: 0.
     """
 
     center: FloatArray
     tilt: FloatArray
     half: FloatArray
     focal: FloatArray
+    slope: FloatArray | None = None
 
     def __post_init__(self) -> None:
         shape = self.center.shape
@@ -58,6 +58,7 @@ class FacetTable:
             shape[-1] == 2
             and self.tilt.shape == self.half.shape == shape
             and self.focal.shape == shape[:2]
+            and (self.slope is None or self.slope.shape == shape[:2])
         ):
             raise InputError(
                 f"facets: centre {self.center.shape}, tilt {self.tilt.shape}, half "
@@ -173,6 +174,23 @@ class Mirrors:
         """Distance to the aim, m, (H,)."""
         return as_float(np.linalg.norm(self.aim - self.center, axis=-1))
 
+    def with_numbers(self, **numbers: npt.ArrayLike) -> "Mirrors":
+        """Return the mirrors with other numbers, each () or (H,).
+
+        Parameters
+        ----------
+        **numbers
+            Any of ``width``, ``height``, ``focal``, ``slope``, ``reflectivity`` and ``clean``.
+
+        Raises
+        ------
+        InputError
+            If one is unknown, out of range, or of another shape.
+        """
+        count = len(self)
+        changes: dict[str, Any] = {k: _numbers(k, value, count) for k, value in numbers.items()}
+        return replace(self, **changes)
+
     def toward(self, sun: FloatArray, aim: npt.ArrayLike) -> "Mirrors":
         """Return the mirrors turned about their centres so that they send the sun to other aims.
 
@@ -217,34 +235,6 @@ class Mirrors:
                 f"mirror is {self.width[k]:.3f} × {self.height[k]:.3f} m; correct either"
             )
         return replace(self, facets=facets, kind=np.asarray(kind, dtype=np.int64))
-
-
-@dataclass(frozen=True)
-class Tower:
-    """An upright cylinder that shades and blocks.
-
-    Attributes
-    ----------
-    east, north
-        Place of its axis, m.
-    radius
-        m.
-    bottom, top
-        Heights of its ends, ENU m.
-    """
-
-    east: float
-    north: float
-    radius: float
-    bottom: float
-    top: float
-
-    def __post_init__(self) -> None:
-        if not (self.radius > 0.0 and self.top > self.bottom):
-            raise InputError(
-                f"tower: radius {self.radius} m must be above 0, and its top {self.top} m above "
-                f"its bottom {self.bottom} m"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,135 +287,6 @@ class Scene:
     def incidence(self) -> FloatArray:
         """Cosine of the angle of incidence of each mirror, (H,); 0 if the sun is behind it."""
         return as_float(np.maximum(self.mirrors.normal @ self.sun, 0.0))
-
-
-def scene_of(
-    plant: Plant,
-    sun: npt.ArrayLike,
-    aim: npt.ArrayLike | None = None,
-    *,
-    receivers: Sequence[str | Receiver | Target | Surface] = (),
-    dni: float = 900.0,
-    focus: Literal["slant"] | float = "slant",
-    towers: Sequence[Tower] = (),
-    cells: tuple[int, int] | None = None,
-    **mirrors: npt.ArrayLike,
-) -> Scene:
-    """Return the scene of a plant whose calibrated heliostats track the sun.
-
-    Parameters
-    ----------
-    plant
-        As calibrated. Heliostats that cannot reach their aim shade and block, and are dark.
-    sun
-        Unit vector, (3,).
-    aim
-        Aim points, ENU m, (3,) or (N, 3); None: each heliostat's own, else the middle of the
-        first receiver.
-    receivers
-        Names in the plant, or surfaces; none: the plant's receivers.
-    dni
-        W/m².
-    focus
-        Focal length of the mirrors, m; "slant": each its distance to the aim, infinity: flat.
-        Facets of the plant keep their tilt; this is the focal length of each facet then.
-    towers
-        Obstacles.
-    cells
-        Rows and columns on each receiver; None: as `surface_of` chooses.
-    **mirrors
-        Further arguments of `Mirrors.of`: ``slope``, ``reflectivity``, ``clean``, ``pointing``.
-
-    Raises
-    ------
-    InputError
-        If the plant has no receiver, or shapes do not fit.
-    UnknownNameError
-        If there is no receiver of a name.
-    """
-    light = as_vectors(sun, "sun")
-    if light.shape != (3,):
-        raise InputError(f"scene: a sun of shape {light.shape}; give one, (3,)")
-    chosen = tuple(receivers) or plant.receivers
-    if not chosen:
-        raise InputError(f"scene: plant {plant.name} has no receiver; add one to the plant file")
-    surfaces = tuple(_surface(plant, item, cells) for item in chosen)
-    ends = _aims(plant, surfaces[0].center, aim)
-    tracking = track(plant, light, ends)
-    vertex, normal = tracking.chosen(tracking.vertex), tracking.chosen(tracking.normal)
-    slant = np.linalg.norm(ends - vertex, axis=-1)
-    focal = slant if isinstance(focus, str) else np.broadcast_to(as_float(focus), slant.shape)
-    size = [np.concatenate([getattr(g, s) for g in plant.groups.values()]) for s in _SIZES]
-    built = Mirrors.of(vertex, normal, (size[0], size[1]), ends, focal=focal, **mirrors)
-    table = facets_of(plant, focal)
-    if table is not None:
-        built = built.with_facets(*table)
-    dark = ~np.asarray(tracking.reachable)
-    return Scene(light, dni, built, surfaces, tuple(towers), dark)
-
-
-_SIZES = ("width", "height")
-
-
-def _surface(
-    plant: Plant, item: str | Receiver | Target | Surface, cells: tuple[int, int] | None
-) -> Surface:
-    if isinstance(item, str):
-        item = plant.receiver(item)
-    return surface_of(item, cells) if isinstance(item, Receiver | Target) else item
-
-
-def _aims(plant: Plant, middle: FloatArray, aim: npt.ArrayLike | None) -> FloatArray:
-    count = len(plant)
-    if aim is not None:
-        return _vectors(as_vectors(aim, "aim"), count, "aim")
-    own = [np.full((len(g), 3), np.nan) if g.aim is None else g.aim for g in plant.groups.values()]
-    ends = np.concatenate(own)
-    return np.where(np.isfinite(ends).all(axis=-1, keepdims=True), ends, middle)
-
-
-def facets_of(plant: Plant, focal: FloatArray) -> tuple[FacetTable, npt.NDArray[np.int64]] | None:
-    """Return the facets of a plant's heliostats and the row of each; None if none has facets.
-
-    Parameters
-    ----------
-    plant
-        Facets of groups with fewer are padded with empty ones.
-    focal
-        Focal length of the facets of each heliostat, m, (N,).
-    """
-    groups = list(plant.groups.values())
-    most = max((g.facets.center.shape[1] for g in groups if g.facets is not None), default=0)
-    if most == 0:
-        return None
-    tables, start = [], 0
-    for group in groups:
-        lengths = focal[start : start + len(group)]
-        start += len(group)
-        facets = group.facets
-        if facets is None:
-            side = np.stack([group.width, group.height], axis=-1)[:, None, :]
-            tables.append(_padded(0.0 * side, 0.0 * side, 0.5 * side, lengths, most))
-        else:
-            tables.append(_padded(*_flat(facets), lengths, most))
-    parts = [np.concatenate(column) for column in zip(*tables, strict=True)]
-    return FacetTable(*parts), np.arange(len(plant))
-
-
-def _flat(facets: Facets) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return centres, tilts and half sizes, (N, F, 2)."""
-    normal = normalize(np.cross(facets.half_width, facets.half_height), "facets: normal")
-    sides = (facets.half_width, facets.half_height)
-    half = np.stack([np.linalg.norm(side, axis=-1) for side in sides], axis=-1)
-    return facets.center[..., :2], normal[..., :2] / normal[..., 2:], half
-
-
-def _padded(
-    center: FloatArray, tilt: FloatArray, half: FloatArray, focal: FloatArray, most: int
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    room = ((0, 0), (0, most - center.shape[1]), (0, 0))
-    lengths = np.broadcast_to(focal[:, None], (len(focal), most))
-    return np.pad(center, room), np.pad(tilt, room), np.pad(half, room), lengths
 
 
 def _vectors(value: FloatArray, count: int, name: str) -> FloatArray:

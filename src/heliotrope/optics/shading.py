@@ -222,6 +222,8 @@ def _parts(mirrors: Mirrors, split: IntArray) -> Any:
     else:
         table = np.concatenate([facets.center, facets.half], axis=-1)
         kind = mirrors.kind
-        counts = np.full(len(mirrors), table.shape[1])
+        # A mirror's last facets may be empty.
+        last = table.shape[1] - np.argmax(facets.half[:, ::-1].min(axis=-1) > 0.0, axis=1)
+        counts = last[kind]
     begin = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     return as_input(table), as_input(kind), as_input(split), as_input(begin)

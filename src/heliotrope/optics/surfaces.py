@@ -251,10 +251,14 @@ def surface_of(item: Receiver | Target, shape: tuple[int, int] | None = None) ->
     Parameters
     ----------
     item
-        A planar one becomes a plate, a cylinder or a sector of one a cylinder.
+        A planar one becomes a plate, a cylinder or a sector of one a cylinder. The triangles of a
+        mesh, or of a cavity's inner surface, are its cells.
     shape
         Rows and columns; None: `PLATE_CELLS` or `CYLINDER_CELLS`.
     """
+    if isinstance(item, Receiver) and item.mesh is not None:
+        mesh = Mesh(item.name, item.center + item.mesh.vertices @ item.frame, item.mesh.faces)
+        return mesh if item.kind == "mesh" else Cavity(_plate(item.aperture, PLATE_CELLS), mesh)
     if isinstance(item, Receiver) and item.kind != "planar":
         full = item.kind == "external_cylinder"
         upright = np.array([0.0, 0.0, 1.0])
@@ -269,10 +273,12 @@ def surface_of(item: Receiver | Target, shape: tuple[int, int] | None = None) ->
             center, span = item.center - radius * item.normal, (-half, half)
         cells = shape or CYLINDER_CELLS
         return Cylinder(item.name, center, axis, front, radius, item.height, span, cells)
-    face = item.face if isinstance(item, Receiver) else item
-    middle = face.corners.mean(axis=0)
-    size = (face.width, face.height)
-    return Plate(face.name, middle, face.axes[0], face.axes[1], *size, shape or PLATE_CELLS)
+    return _plate(item.face if isinstance(item, Receiver) else item, shape or PLATE_CELLS)
+
+
+def _plate(face: Target, shape: tuple[int, int]) -> Plate:
+    middle, size = face.corners.mean(axis=0), (face.width, face.height)
+    return Plate(face.name, middle, face.axes[0], face.axes[1], *size, shape)
 
 
 def _check(name: str, shape: tuple[int, int], **sizes: float) -> None:

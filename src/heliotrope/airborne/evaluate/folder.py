@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.deflectometry import find_deflectometry, read_deflectometry
 from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.mirror import MirrorShape, ideal
 from heliotrope.airborne.photo import SUFFIXES, LedCamera, Photo, read_camera, read_photos
-from heliotrope.airborne.slopes import read_slopes
 from heliotrope.airborne.standing import MirrorPoses, join_standing, read_commands, standing
 from heliotrope.errors import InputError
+from heliotrope.field.formats.deflectometry import measured_slopes
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 
@@ -230,16 +229,12 @@ class _Surfaces:
         if name not in self._known:
             shape = self._designed(name)
             if self._folder is not None:
-                files = [self._folder / f"{name}{suffix}" for suffix in (".npz", ".csv")]
-                own = next((f for f in files if f.exists()), None)
-                measured = own or find_deflectometry(self._folder, name)
-                if own is not None:
-                    shape = shape.with_slopes(read_slopes(own, len(shape)))
-                elif measured is not None:
-                    shape = shape.with_slopes(read_deflectometry(measured, shape))
-                else:
+                slopes = measured_slopes(self._folder, name, shape.facets, shape.focal)
+                if slopes is None:
                     self._without.append(name)
-                self._maps += measured is not None
+                else:
+                    shape = shape.with_slopes(slopes)
+                    self._maps += 1
             self._known[name] = shape
         return self._known[name]
 

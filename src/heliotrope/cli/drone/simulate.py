@@ -268,7 +268,7 @@ def _nearest(heliostats: "Heliostats", count: int) -> "Heliostats":
 def _write_truth(folder: Path, flight: "Flight") -> None:
     import numpy as np
 
-    from heliotrope.airborne.slopes import write_slopes
+    from heliotrope.field.formats.slopes import write_slopes
     from heliotrope.files.text import write_text
     from heliotrope.geometry import azimuth_elevation
 

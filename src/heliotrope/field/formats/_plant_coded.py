@@ -24,7 +24,7 @@ def build_joint(table: JointVisitsTable | None) -> JointSettings | None:
     return made if table is None or table.allowed else None
 
 
-def build_receiver(table: ReceiverVisitsTable | None) -> ReceiverSettings | None:
+def build_receiver_visits(table: ReceiverVisitsTable | None) -> ReceiverSettings | None:
     """Return the settings of a table, see `build_joint`; None without one."""
     return None if table is None else ReceiverSettings(**_values(table, ReceiverSettings))
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.formats._plant_mirrors import mirror_document, read_facets, read_surface
 from heliotrope.field.formats._plant_models import (
     ANGLE_UNITS,
     DRIVE_ANGLES,
@@ -18,6 +19,7 @@ from heliotrope.field.formats._plant_models import (
 )
 from heliotrope.field.formats._plant_table import HeliostatColumns
 from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.mirror_surface import Canting, FacetGrid
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import drives as drive_kinds
 from heliotrope.mechanism import kinds
@@ -70,17 +72,27 @@ def build_group(
         columns = ("aim_east_m", "aim_north_m", "aim_up_m")
         aim = np.stack([table.numbers[c][rows] for c in columns], axis=-1)
     cluster = tuple(table.cluster[i] for i in rows)
-    return Heliostats(
-        names=tuple(table.name[i] for i in rows),
+    names = tuple(table.name[i] for i in rows)
+    size = (np.broadcast_to(width, rows.shape), np.broadcast_to(height, rows.shape))
+    facets = read_facets(reader, size, site)
+    one = FacetGrid(1, 1, 0.0, Canting("none"))
+    center, half = one.places(*size)
+    parts = Facets.of(center, half, np.zeros_like(center)) if facets is None else facets
+    heliostats = Heliostats(
+        names=names,
         mechanism=mechanism,
-        width=np.broadcast_to(width, rows.shape),
-        height=np.broadcast_to(height, rows.shape),
-        facets=reader.facets(),
+        width=size[0],
+        height=size[1],
+        facets=facets,
         parameters=reader.parameters(mechanism),
         aim=aim,
         cluster=cluster if any(cluster) else (),
         machines=reader.machines(mechanism),
+        surface=read_surface(reader, names, parts, whole=facets is None),
     )
+    if group.mirror is not None:
+        heliostats.check_facets()
+    return heliostats
 
 
 class _Reader:
@@ -114,6 +126,11 @@ class _Reader:
                 f"line {i + 2}, column {key}",
             )
         return column
+
+    def columns(self, start: str) -> tuple[str, ...]:
+        """Return the table's columns whose names begin so and that hold numbers of this group."""
+        names = (name for name in self.table.numbers if name.startswith(start))
+        return tuple(name for name in names if self.column(name) is not None)
 
     def number(self, key: str, value: float | None) -> FloatArray | None:
         column = self.column(key)
@@ -256,14 +273,6 @@ class _Reader:
             vertex=self.array("chain.vertex_m", chain.vertex_m),
             normal=self.array("chain.normal", chain.normal),
         )
-
-    def facets(self) -> Facets | None:
-        if not self.group.facets:
-            return None
-        array = self.array("facets", self.group.facets)
-        if array.ndim != 4 or array.shape[2] != 3:
-            raise self.fail("each facet needs center, half width and half height", "facets")
-        return Facets(array[:, :, 0], array[:, :, 1], array[:, :, 2])
 
     def parameters(self, mechanism: Mechanism) -> dict[str, FloatArray]:
         parameters = {}
@@ -450,8 +459,13 @@ def _column(mechanism: Mechanism, name: str) -> str:
     return name if unit == "1" else f"{name}_{unit}"
 
 
-def group_document(name: str, heliostats: Heliostats) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the TOML of a group, and the columns of what differs between its heliostats."""
+def group_document(
+    name: str, heliostats: Heliostats, place: Path
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the TOML of a group, and the columns of what differs between its heliostats.
+
+    Slope maps are written beside the plant file at ``place``.
+    """
     m = heliostats.mechanism
     columns: dict[str, Any] = {"name": list(heliostats.names), "group": [name] * len(heliostats)}
     columns |= {c: m.position[:, k] for k, c in enumerate(_POSITION)}
@@ -492,11 +506,7 @@ def group_document(name: str, heliostats: Heliostats) -> tuple[dict[str, Any], d
     document: dict[str, Any] = {"kind": m.kind, "chain": chain, "drives": drives}
     if heliostats.machines:
         document["machine"] = _machine_document(heliostats, first)
-    if heliostats.facets is not None:
-        f = heliostats.facets
-        document["facets"] = first(
-            "facets", np.stack([f.center, f.half_width, f.half_height], axis=2)
-        )
+    document |= mirror_document(name, heliostats, first, place)
     own = [row.name for row in m.own if row.name in heliostats.parameters]
     if own:
         raise InputError(

@@ -101,17 +101,38 @@ class ReceiverTable(StrictTable):
     """``[[receivers]]``."""
 
     name: str = Field(min_length=1)
-    kind: Literal["planar", "convex_cylinder", "external_cylinder"] = "planar"
-    center_m: Vector
+    kind: Literal["planar", "convex_cylinder", "external_cylinder", "cavity", "mesh"] = "planar"
+    center_m: Vector = Field(description="Of a cavity: the middle of its aperture.")
     normal: Vector
-    width_m: Positive
-    height_m: Positive
+    width_m: Positive | None = Field(
+        None, description="Of the aperture, or diameter; default only of a mesh: its extent."
+    )
+    height_m: Positive | None = None
     corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
     radius_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     opening_angle_rad: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    inner_height_m: Positive | None = Field(
+        None, description="Of a cavity's cylindrical wall; default: height_m."
+    )
+    mesh: str = Field(
+        "",
+        description="File beside this one (.obj, or binary .stl) with the surface of a mesh, or "
+        "the inner surface of a cavity: m about center_m, to the right and up as seen from the "
+        "front, and out of it.",
+    )
     nominal_power_mw: Positive | None = Field(
         None, description="Power on it to which readings of its flux refer."
     )
+
+
+class TowerTable(StrictTable):
+    """``[[towers]]``: an upright cylinder that shades and blocks, such as the receiver's tower."""
+
+    east_m: Number
+    north_m: Number
+    radius_m: Positive
+    bottom_m: Number = Field(-1e4, description="Height of its foot; default: below any ground.")
+    top_m: Number
 
 
 class CameraTable(StrictTable):
@@ -318,6 +339,75 @@ class MachineTable(StrictTable):
     )
 
 
+Length = Annotated[float, Field(gt=0)]
+SlopeError = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+
+
+class FacetTable(StrictTable):
+    """``[[groups.NAME.mirror.facet]]``: one facet, in the plane of the mirror."""
+
+    center_m: Pair = Field(description="Right of and above the mirror's middle, from its front.")
+    size_m: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    tilt_mrad: Pair = Field(
+        default_factory=lambda: [0.0, 0.0],
+        description="Canting: by how much its normal leans to the right, and up.",
+    )
+    focal_m: Length | None = Field(None, description="Default: focal_m of the mirror.")
+    slope_error_mrad: SlopeError | None = Field(
+        None, description="Default: slope_error_mrad of the mirror."
+    )
+
+
+class MirrorTable(StrictTable):
+    """``[groups.NAME.mirror]``: the surface of the mirrors; without: see `heliotrope flux`."""
+
+    facets: (
+        Annotated[list[Annotated[int, Field(ge=1, le=50)]], Field(min_length=2, max_length=2)]
+        | None
+    ) = Field(None, description="Columns and rows of equal facets.")
+    gap_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
+        0.0, description="Between neighbouring facets."
+    )
+    canting: Literal["none", "slant", "focal", "off_axis"] | None = Field(
+        None,
+        description="Of equal facets. slant (default): on axis, each mirror for its distance to "
+        "its aim. focal: for canting_focal_m. off_axis: for canting_time.",
+    )
+    canting_focal_m: Length | None = Field(None, description="Focal length of on-axis canting.")
+    canting_time: str | None = Field(
+        None, description="Time of off-axis canting, ISO 8601 with its zone."
+    )
+    canting_sun: Vector | None = Field(
+        None, description="Instead of the time: vector to the sun, ENU."
+    )
+    facet: list[FacetTable] = Field(
+        default_factory=list, description="Single facets, instead of equal ones."
+    )
+    focal_m: Length | None = Field(
+        None,
+        description="Focal length of each facet's own curvature, or of a mirror without facets; "
+        "1e9 or more: flat. Default: the distance to the aim.",
+    )
+    slope_error_mrad: SlopeError | None = Field(
+        None, description="Standard deviation of the surface's normal per axis."
+    )
+    reflectivity: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] | None = Field(
+        None, description="Of the clean mirror."
+    )
+    slope_maps: str = Field(
+        "",
+        description="Folder beside this file with a measured slope map of each heliostat: "
+        "NAME.npz, NAME.csv, or NAME.h5 as PAINT publishes it.",
+    )
+    slope_error_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    facet_focal_m: list[Length] | None = Field(
+        None, description="Of each facet, as the program writes it."
+    )
+    facet_slope_error_rad: list[Number] | None = Field(
+        None, description="Of each facet, as the program writes it."
+    )
+
+
 class GroupTable(StrictTable):
     """``[groups.NAME]``: heliostats of one kind."""
 
@@ -345,6 +435,9 @@ class GroupTable(StrictTable):
     drives: dict[str, AnyDrive] = Field(default_factory=dict)
     machine: MachineTable | None = Field(
         None, description="Motor limits and resting places; needed to run and to configure."
+    )
+    mirror: MirrorTable | None = Field(
+        None, description="Facets, curvature and errors of the mirrors."
     )
     facets: list[list[Vector]] | None = Field(
         None, description="Centre, half width and half height of each, in the mirror's frame, m."
@@ -479,6 +572,9 @@ class PlantDocument(StrictTable):
     groups: dict[str, GroupTable] = Field(min_length=1)
     targets: list[TargetTable] = Field(default_factory=list)
     receivers: list[ReceiverTable] = Field(default_factory=list)
+    towers: list[TowerTable] = Field(
+        default_factory=list, description="Obstacles that shade and block heliostats."
+    )
     cameras: list[CameraTable] = Field(default_factory=list)
     keep_out: list[AnyVolume] = Field(
         default_factory=list, description="Volumes where no beam may be."

@@ -303,6 +303,11 @@ class _Files:
         """Check the changed file as a whole; yield its warnings."""
         with tempfile.TemporaryDirectory(dir=self.place.parent, prefix=".plant-") as folder:
             self.write(Path(folder))
+            for name in _named_files(self.document, self.place.parent):
+                link = Path(folder) / name
+                link.parent.mkdir(parents=True, exist_ok=True)
+                if not link.exists():
+                    link.symlink_to((self.place.parent / name).resolve())
             findings = check_plant(Path(folder) / self.place.name)
         texts = [entry.text.replace(f"{folder}/", f"{self.place.parent}/") for entry in findings]
         for finding, text in zip(findings, texts, strict=True):
@@ -323,6 +328,19 @@ class _Files:
             self.cells.to_csv(text, index=False, lineterminator="\n")
             write_text(table, text.getvalue())
         write_text(home / self.place.name, tomlkit.dumps(self.document))
+
+
+def _named_files(table: Any, home: Path) -> Iterator[PurePath]:
+    """Yield the files and folders beside a plant file that it names, such as maps and meshes."""
+    if isinstance(table, Mapping):
+        table = list(table.values())
+    if isinstance(table, list):
+        for value in table:
+            yield from _named_files(value, home)
+    elif isinstance(table, str) and table.strip("./") and len(table) < 256:
+        name = PurePath(str(table))
+        if not name.is_absolute() and ".." not in name.parts and (home / name).exists():
+            yield name
 
 
 def _parameters(group: Heliostats) -> dict[str, tuple[float, str]]:

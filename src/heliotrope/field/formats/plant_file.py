@@ -15,6 +15,7 @@ import numpy as np
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.approval import ApprovalSettings
+from heliotrope.field.canting import cant
 from heliotrope.field.formats._plant_aims import aims_document, build_aims
 from heliotrope.field.formats._plant_cameras import (
     build_camera,
@@ -22,21 +23,23 @@ from heliotrope.field.formats._plant_cameras import (
     camera_document,
     mark_document,
 )
-from heliotrope.field.formats._plant_coded import build_joint, build_receiver, coded_document
+from heliotrope.field.formats._plant_coded import build_joint, build_receiver_visits, coded_document
 from heliotrope.field.formats._plant_groups import build_group, group_document
 from heliotrope.field.formats._plant_models import (
     ApprovalTable,
     PlantDocument,
-    ReceiverTable,
     TargetTable,
     TimetableTable,
+    TowerTable,
 )
+from heliotrope.field.formats._plant_receivers import build_receiver, receiver_document
 from heliotrope.field.formats._plant_table import HeliostatColumns, read_table, write_table
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.timetable import TimetableEntry
+from heliotrope.field.tower import Tower
 from heliotrope.files import write_text
 from heliotrope.files.documents import read_document
 from heliotrope.geometry import FloatArray, direction
@@ -88,9 +91,12 @@ def _models() -> list[Any]:
         models.TargetTable,
         models.MarkTable,
         models.ReceiverTable,
+        models.TowerTable,
         models.CameraTable,
         models.GroupTable,
         models.ChainTable,
+        models.MirrorTable,
+        models.FacetTable,
         models.MachineTable,
         models.AxisTable,
         models.RotaryDrive,
@@ -124,13 +130,16 @@ def _assemble(
     )
     groups = _groups(path, document, table, site, problems)
     targets = _all_built(path, "targets", document.targets, _target, problems)
-    receivers = _all_built(path, "receivers", document.receivers, _receiver, problems)
+    receivers = _all_built(
+        path, "receivers", document.receivers, lambda t: build_receiver(t, path.parent), problems
+    )
+    towers = _all_built(path, "towers", document.towers, _tower, problems)
     cameras = _all_built(path, "cameras", document.cameras, build_camera, problems)
     keep_outs = _all_built(path, "keep_out", document.keep_out, build_volume, problems)
     eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
     joint = _built(path, "joint_visits", document.joint_visits, build_joint, problems)
     settings = document.receiver_visits
-    receiver = _built(path, "receiver_visits", settings, build_receiver, problems)
+    receiver = _built(path, "receiver_visits", settings, build_receiver_visits, problems)
     timetable = _all_built(path, "timetable", document.timetable, _timetable_entry, problems)
     approval = _built(path, "approval", document.approval, _approval, problems)
     aims = _built(path, "aims", document.aims, lambda t: build_aims(t, path.parent), problems)
@@ -144,7 +153,7 @@ def _assemble(
     if problems or approval is None or aims is None:
         return None
     try:
-        return Plant(
+        plant = Plant(
             document.plant.name,
             site,
             groups,
@@ -159,7 +168,9 @@ def _assemble(
             safety=document.safety,
             approval=approval,
             aims=aims,
+            towers=towers,
         )
+        return cant(plant)
     except InputError as error:
         problems.append(FormatError(path, str(error)))
         return None
@@ -233,19 +244,12 @@ def _approval(table: ApprovalTable | None) -> ApprovalSettings:
     return ApprovalSettings(table.parameters, table.within_s)
 
 
-def _receiver(table: ReceiverTable) -> Receiver:
-    return Receiver(
-        table.name,
-        table.kind,
-        np.array(table.center_m),
-        np.array(table.normal),
-        table.width_m,
-        table.height_m,
-        None if table.corners_m is None else np.array(table.corners_m),
-        table.radius_m,
-        table.opening_angle_rad,
-        1e6 * (table.nominal_power_mw or 0.0),
-    )
+def _tower(table: TowerTable) -> Tower:
+    return Tower(table.east_m, table.north_m, table.radius_m, table.bottom_m, table.top_m)
+
+
+def _tower_document(tower: Tower) -> dict[str, float]:
+    return {f"{key}_m": value for key, value in vars(tower).items()}
 
 
 def _target(table: TargetTable) -> Target:
@@ -305,7 +309,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
     columns: list[Mapping[str, Any]] = []
     groups = {}
     for name, heliostats in plant.groups.items():
-        groups[name], varying = group_document(name, heliostats)
+        groups[name], varying = group_document(name, heliostats, place)
         columns.append(varying)
     write_table(columns, other)
     document = {
@@ -332,7 +336,8 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
             }
             for t in plant.targets
         ],
-        "receivers": [_receiver_document(r) for r in plant.receivers],
+        "receivers": [receiver_document(r, k, place) for k, r in enumerate(plant.receivers)],
+        **({"towers": [_tower_document(t) for t in plant.towers]} if plant.towers else {}),
         "cameras": [camera_document(camera) for camera in plant.cameras],
         "keep_out": [volume_document(volume) for volume in plant.keep_outs],
         "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
@@ -344,22 +349,6 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         "groups": groups,
     }
     write_text(place, tomli_w.dumps(document))
-
-
-def _receiver_document(r: Receiver) -> dict[str, Any]:
-    corners = {} if r.corners is None else {"corners_m": r.corners.tolist()}
-    return {
-        "name": r.name,
-        "kind": r.kind,
-        "center_m": r.center.tolist(),
-        "normal": r.normal.tolist(),
-        "width_m": r.width,
-        "height_m": r.height,
-        **corners,
-        "radius_m": r.radius,
-        "opening_angle_rad": r.opening_angle,
-        **({"nominal_power_mw": 1e-6 * r.nominal_power} if r.nominal_power else {}),
-    }
 
 
 def json_schema() -> dict[str, Any]:

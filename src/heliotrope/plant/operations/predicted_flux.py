@@ -27,7 +27,7 @@ from heliotrope.optics import (
     surface_of,
 )
 from heliotrope.optics.beam import SUN_SIGMA
-from heliotrope.optics.scene import facets_of
+from heliotrope.optics.plant_scene import shaped
 from heliotrope.optics.shading import IntArray
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
@@ -131,16 +131,14 @@ class PredictedFlux:
         spread = np.where(known, self._book.spread, unknown)
         size = self._viewer.sizes
         mirrors = Mirrors.of(
-            center, normal, (size[:, 0], size[:, 1]), aims, slope=_LIGHT.slope,
-            reflectivity=_LIGHT.reflectivity, pointing=spread,
+            center, normal, (size[:, 0], size[:, 1]), aims, pointing=spread,
         )  # fmt: skip
-        table = facets_of(plant.design, mirrors.slant[np.argsort(self._rows)])
-        if table is not None:
-            mirrors = mirrors.with_facets(table[0], self._rows)
+        mirrors = shaped(mirrors, plant.design, self._rows)
         dark = ~(plant.field.sure(now) & (frame.on >= 1) & (frame.on <= len(self._surfaces)))
         measured = plant.sentinel.table.shown(now).get(DNI_READING, np.nan)
         dni = float(measured) if np.isfinite(measured) else _LIGHT.dni
-        return Scene(plant.sun_vector(), max(dni, 0.0), mirrors, self._surfaces, dark=dark)
+        towers = plant.design.towers
+        return Scene(plant.sun_vector(), max(dni, 0.0), mirrors, self._surfaces, towers, dark)
 
 
 def predicted(scene: Scene, light: FieldOptics) -> list[PredictedView]:
@@ -195,7 +193,7 @@ def columns_from_outside(receiver: Receiver, right: FloatArray) -> tuple[FloatAr
 
     The engine's, ``right``, run clockwise, a full cylinder's from the north.
     """
-    if receiver.kind == "planar":
+    if receiver.kind not in ("external_cylinder", "convex_cylinder"):
         return right, np.arange(len(right))
     radius, right = receiver.radius or 0.5 * receiver.width, -right
     if receiver.kind == "external_cylinder":

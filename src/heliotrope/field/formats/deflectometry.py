@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
-from heliotrope.airborne.mirror import MirrorShape
-from heliotrope.airborne.slopes import checked_slopes
 from heliotrope.errors import FormatError
+from heliotrope.field.formats.slopes import checked_slopes, read_slopes
+from heliotrope.field.heliostats import Facets
 from heliotrope.files.limits import EXPANDED, MIB, check_file
 from heliotrope.geometry import FloatArray, as_float
 
@@ -48,8 +49,38 @@ def find_deflectometry(folder: Path, name: str) -> Path | None:
     return None
 
 
-def read_deflectometry(path: str | Path, shape: MirrorShape) -> FloatArray:
-    """Return the slope deviations of a measured surface from a shape, (F, H, W, 2), rad.
+def measured_slopes(
+    folder: Path, name: str, facets: Facets, focal: npt.ArrayLike = np.inf
+) -> FloatArray | None:
+    """Return the slope map of a heliostat in a folder, (F, H, W, 2), rad; None if it has none.
+
+    Parameters
+    ----------
+    folder
+        With files NAME.npz or NAME.csv (`heliotrope.field.formats.slopes.read_slopes`), or as
+        `find_deflectometry`.
+    name
+        The heliostat.
+    facets, focal
+        Of the one heliostat; see `read_deflectometry`.
+
+    Raises
+    ------
+    FormatError
+        As `heliotrope.field.formats.slopes.read_slopes` and `read_deflectometry`.
+    """
+    for suffix in (".npz", ".csv"):
+        own = folder / f"{name}{suffix}"
+        if own.exists():
+            return read_slopes(own, facets.center.shape[1])
+    measured = find_deflectometry(folder, name)
+    return None if measured is None else read_deflectometry(measured, facets, focal)
+
+
+def read_deflectometry(
+    path: str | Path, facets: Facets, focal: npt.ArrayLike = np.inf
+) -> FloatArray:
+    """Return the slope deviations of a measured surface from the designed one, (F, H, W, 2), rad.
 
     The normals in each cell of a grid are averaged, and holes are filled from the nearest cell.
 
@@ -57,34 +88,36 @@ def read_deflectometry(path: str | Path, shape: MirrorShape) -> FloatArray:
     ----------
     path
         The file.
-    shape
-        The mirror as designed.
+    facets
+        Facets of the one heliostat, as designed.
+    focal
+        Their focal lengths, m, () or (F,); infinity: flat.
 
     Raises
     ------
     FormatError
         If it cannot be read, is for another number of facets, has points beside its facets or
-        normals that look backwards, or as `heliotrope.airborne.slopes.read_slopes`.
+        normals that look backwards, or as `heliotrope.field.formats.slopes.read_slopes`.
     """
     import h5py
 
     file = check_file(path, _WHAT, binary=True)
+    count = facets.center.shape[1]
+    curve = 0.5 / np.broadcast_to(as_float(focal), (count,))
     try:
         with h5py.File(file, "r") as root:
             names = [name for name in root if str(name).startswith("facet")]
-            if len(names) != len(shape):
-                raise FormatError(
-                    file, f"a map of {len(names)} facets, but the mirror has {len(shape)}"
-                )
-            clouds = [_cloud(file, root, f"facet{k + 1}") for k in range(len(shape))]
+            if len(names) != count:
+                raise FormatError(file, f"a map of {len(names)} facets, but the mirror has {count}")
+            clouds = [_cloud(file, root, f"facet{k + 1}") for k in range(count)]
     except (OSError, RuntimeError, KeyError) as error:
         raise FormatError(
             file, f"no readable HDF5 ({str(error)[:80]}); it should be {_WHAT}"
         ) from None
     fewest = min(len(points) for points, _ in clouds)
     cells = int(np.clip(np.sqrt(fewest / _POINTS), 1, _CELLS))
-    maps = [_gridded(file, shape, k, *cloud, cells) for k, cloud in enumerate(clouds)]
-    return checked_slopes(file, np.stack(maps), len(shape))
+    maps = [_gridded(file, (facets, curve), k, *cloud, cells) for k, cloud in enumerate(clouds)]
+    return checked_slopes(file, np.stack(maps), count)
 
 
 def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, FloatArray]:
@@ -119,11 +152,18 @@ def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, Float
 
 
 def _gridded(
-    file: Path, shape: MirrorShape, k: int, points: FloatArray, normals: FloatArray, cells: int
+    file: Path,
+    mirror: tuple[Facets, FloatArray],
+    k: int,
+    points: FloatArray,
+    normals: FloatArray,
+    cells: int,
 ) -> FloatArray:
     """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2); NaN without any."""
-    own, half = normals @ shape.axes[k].T, shape.half_size[k]
-    uv = ((points - shape.center[k]) @ shape.axes[k].T)[:, :2]
+    facets, curve = mirror
+    axes, half = facets.axes[0, k], facets.half_size[0, k]
+    own = normals @ axes.T
+    uv = ((points - facets.center[0, k]) @ axes.T)[:, :2]
     inside = (np.abs(uv) <= half).all(axis=-1)
     if not len(points) or inside.mean() < _ON_FACET:
         raise FormatError(
@@ -136,7 +176,7 @@ def _gridded(
             file, f"facet{k + 1}: a normal looks backwards; it must look to the front"
         )
     uv, own = uv[inside], own[inside]
-    deviation = -own[:, :2] / own[:, 2:] - uv / (2.0 * shape.focal[k])
+    deviation = -own[:, :2] / own[:, 2:] - uv * curve[k]
     at = np.minimum(((uv / half + 1.0) * 0.5 * cells).astype(np.intp), cells - 1)
     cell = at[:, 1] * cells + at[:, 0]
     count = np.bincount(cell, minlength=cells**2)
