@@ -208,7 +208,7 @@ def test_the_command_compares(folder: Path, tmp_path: Path) -> None:
     ]
     done = CliRunner().invoke(app, [str(a) for a in (folder, *options, "--out", tmp_path)])
     assert done.exit_code == 0, done.output
-    assert "Orientation less reference, mrad" in done.stdout
+    assert "Orientation minus reference, mrad" in done.stdout
     assert (tmp_path / "reference.csv").exists()
     assert not (tmp_path / "reference.html").exists()
 

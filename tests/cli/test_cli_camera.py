@@ -301,7 +301,10 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
             "--sigma-px '0': give a number from 0.001 to 1,000",
         ),
         ((*TEACH, *points(), "--out", "plant.xml"), "plant.xml: only plant files (TOML)"),
-        ((*TEACH, *points(), "--out", "no/plant.toml"), "folder no does not exist; make it first"),
+        (
+            (*TEACH, *points(), "--out", "no/plant.toml"),
+            "folder no does not exist; create it first",
+        ),
         (
             ("teach", "tower-measurements.json", "south.png", "--target", "t"),
             "tower-measurements.json: a tower file alone is not a plant; give the",
@@ -409,7 +412,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         (("calibrate", "bare.toml", "south.png", "--camera", "c"), "has marks; teach them first"),
         (
             ("calibrate", "marked.toml", "south.png", "small.png", "--camera", "c"),
-            "camera c: frames of 320 × 240, 640 × 480 px; give pictures of one size",
+            "camera c: frames of 320 × 240, 640 × 480 px; use pictures of one size",
         ),
         (
             ("calibrate", "seen.toml", "small.png", "--camera", "south"),
@@ -470,7 +473,9 @@ def pictures_of(folder: Path) -> list[object]:
 def test_receiver_takes_a_reference_that_measures(call: Any, lit: Path, tmp_path: Path) -> None:
     out = tmp_path / "receiver.toml"
     text = call("receiver", lit / "plant.toml", *pictures_of(lit), "--out", out)
-    assert re.search(r"nominal flux fills \d+ % of the scale; daylight on it counts as \d", text)
+    assert re.search(
+        r"nominal flux uses \d+ % of the scale; daylight on the receiver reads as \d", text
+    )
     assert text.endswith(f"reference written to {out}\n")
     shown = receiver_scene.frame(12, seed=5)
     share = receiver_scene.true_share(receiver_scene.mirrors(12))

@@ -104,13 +104,13 @@ def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ((SUN, "--time=now"), "give --time or --sun, not both"),
+        ((SUN, "--time=now"), "use --time or --sun, not both"),
         (("--time=2026-09-02T22:00Z",), "above the horizon; choose a time by day"),
         ((SUN, "--dni=-1"), "--dni"),
         ((SUN, "--air=fog"), "air 'fog': known models"),
         ((SUN, "--sun-shape=disk"), "sun shape 'disk'; known"),
         ((SUN, "--focus=near"), "--focus 'near': give slant, flat, or a focal length"),
-        ((SUN, "--facets=5"), "--facets '5': give columns and rows such as 5x7"),
+        ((SUN, "--facets=5"), "--facets '5': write COLUMNSxROWS, such as 5x7"),
         ((SUN, "--facets=5x7", "--canting=noon"), "time 'noon' is not ISO 8601"),
         ((SUN, "--cells=0x4"), "--cells '0x4': give rows and columns such as 20x56"),
         ((SUN, "--tower=1,2,3"), "--tower '1,2,3': give four numbers in m"),

@@ -76,7 +76,7 @@ def test_track_takes_what_is_true(tmp_path: Path, run: Any) -> None:
     code, out, _ = run("track", plant, "--heliostat", "A1", *NOON)
     assert code == 0
     assert "the beam reaches its aim" in out
-    assert "* the one to take; shading and blocking by other mirrors are not considered" in out
+    assert "* recommended pose; shading and blocking by other mirrors are not considered" in out
     # In front of the target's back, and over it.
     for aim in ("0,0.5,13", "0,-5,20"):
         code, out, _ = run("track", plant, "--heliostat", "B1", *NOON, "--aim", aim)

@@ -333,7 +333,7 @@ def test_the_command_tells_json(tmp_path: Path) -> None:
     ("arguments", "text"),
     [
         (("rings",), "there is no layout 'rings'"),
-        (("rows", "--table", "xls"), "table 'xls': give csv or parquet"),
+        (("rows", "--table", "xls"), "table 'xls': use csv or parquet"),
         (("rows", "--picture", "p.bmp"), "give a file that ends in .png, .svg or .pdf"),
     ],
 )

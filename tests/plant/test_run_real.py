@@ -289,7 +289,9 @@ def test_a_real_plant_over_tcp_mqtt_and_its_own_bus(
     # Ctrl-C stows whom it can, and names the others.
     assert set(states(lines).values()) == {"STOWED"}
     assert re.search(
-        r"\nstowing \d heliostats \(\d tracking.*\), about \d+ s; Ctrl-C again ends at once\n", text
+        r"\nstowing \d heliostats \(\d tracking.*\), about \d+ s; press Ctrl-C again to stop "
+        r"immediately\n",
+        text,
     )
     assert "not in stow: H7 silent, H8 silent" in text
     assert "1 of 4 clusters silent: K4 (" in text
@@ -567,7 +569,10 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
             ("plant.toml", "--clusters", "links.toml", "--start", "2012-09-02"),
             "run: --start: only available in simulation, because real clusters track the actual",
         ),
-        (("--start", "1979-12-31"), "--start 1979-12-31: give a time in the years 1981 to 2099"),
+        (
+            ("--start", "1979-12-31"),
+            "--start 1979-12-31: the time must be in the years 1981 to 2099",
+        ),
         (("--start", "2012-09-02T10:00"), "has no time zone; append Z for UTC or an offset"),
         (("--check",), "need a real plant; give --clusters"),
         (("--configure",), "need a real plant; give --clusters"),
@@ -722,7 +727,7 @@ def test_a_group_without_a_machine_is_told_and_not_configured(folder: Path) -> N
     words = (folder / "plant.toml", "--clusters", folder / "links.toml", "--check")
     code, out, _ = call(*words)
     assert code == 0
-    assert out.endswith("no machine table, which --configure needs: group all\n")
+    assert out.endswith("--configure needs a machine table, which is missing in group all\n")
     code, _, err = call(*words, "--configure")
     assert (code, err.count("\n")) == (2, 1)
     assert "group all: the plant file has no table [groups.all.machine]; add it" in err
