@@ -59,7 +59,7 @@ def test_json_keeps_the_limit_of_a_file(aim: Any) -> None:
     ("words", "line"),
     [
         (("--limit=5", "--keep-all"), "no aims were found that hold the flux limit"),
-        (("--limit=much",), "--limit 'much': give kW/m²"),
+        (("--limit=much",), "--limit 'much': use 0.001 to 64000 kW/m²"),
         (("--limit=none.csv",), "none.csv"),
         (("--limit=100", "--time=now"), "--time or --sun"),
         (("--limit=100", "--receiver=other"), "other"),

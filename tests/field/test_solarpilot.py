@@ -164,7 +164,7 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
             "0,732.3,-735.8,0,NULL,NULL\n",
             "'732.3' is neither true nor false; give 0 or 1; 6 columns begin",
         ),
-        ("Template,Loc. X,Loc. Y,Loc. Z\n", "there is no heliostat in it"),
+        ("Template,Loc. X,Loc. Y,Loc. Z\n", "there are no heliostats"),
         (" \n,,,\n\n", "the file has no rows; it should be a table of heliostats"),
         ("Σ" * 40, "gives no positions; give id,x,y,z (m east, north, up), id,latitude"),
         ("NULL\n", "line 1: 1 columns; a layout has 14"),

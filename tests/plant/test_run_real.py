@@ -558,8 +558,11 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("--clusters", "links.toml"), "--clusters needs the plant file"),
-        (("plant.toml", "--clusters", "links.toml"), "a real plant keeps its records; give --data"),
+        (("--clusters", "links.toml"), "--clusters needs a plant file"),
+        (
+            ("plant.toml", "--clusters", "links.toml"),
+            "a real plant must keep its records; use --data",
+        ),
         (("plant.toml", "--clusters", "no.toml"), "no.toml: there is no such file"),
         (
             ("plant.toml", "--clusters", "links.toml", "--speed", 2),
@@ -577,7 +580,7 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
         (("--check",), "need a real plant; give --clusters"),
         (("--configure",), "need a real plant; give --clusters"),
         (("--prototype", "--heliostats", 5), "--prototype is a plant of its own; leave out"),
-        (("plant.toml", "--heliostats", 5), "--heliostats is for the default plant"),
+        (("plant.toml", "--heliostats", 5), "--heliostats applies only to the default plant"),
         (("--speed", 0), "--speed '0': give a number from 0.001 to 1,000"),
         (("--minutes", 0), "--minutes '0': give a number from 0.001 to"),
         (("--every", "nan"), "--every 'nan': give a number from 0.1 to 86,400"),

@@ -256,7 +256,7 @@ def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
     later = [str(each).replace("/data", "/later") for each in command]
     told = CliRunner().invoke(app, later).output
     assert (
-        "3 of 4 heads match; events are kept since 1970-01-01T00:06:40Z, those of earlier" in told
+        "3 of 4 heads match; events are kept since 1970-01-01T00:06:40Z, heads of earlier" in told
     )
     old = " ".join(str(head) for head in chain.read_heads(file)[:1])
     failed = CliRunner().invoke(app, [*later[:-1], old])

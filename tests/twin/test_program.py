@@ -354,7 +354,7 @@ def test_a_pseudo_terminal_needs_boards(tmp_path: Path) -> None:
     field = Program(MAIN, "twin", "--folder", str(tmp_path / "desk"), "--pty")
     try:
         assert field.ends() == 2
-        assert "--pty: only boards have a bus of bytes; give --boards too" in field.text
+        assert "--pty needs --boards, because only boards have a serial bus" in field.text
         assert not (tmp_path / "desk").exists()
     finally:
         field.close()

@@ -110,7 +110,8 @@ def surface_in(scene: Scene) -> Plate | Cylinder:
     surface = scene.surfaces[0]
     if not isinstance(surface, Plate | Cylinder):
         raise InputError(
-            f"receiver {surface.name}: aims are chosen on plates and cylinders; give one of these"
+            f"receiver {surface.name}: aims can be chosen only on flat and cylindrical receivers; "
+            "use one of these"
         )
     return surface
 
@@ -170,6 +171,6 @@ def candidates(engine: FieldFlux) -> Candidates:
     if not power.any():
         raise InputError(
             f"receiver {surface.name}: none of the {len(mirrors)} mirrors sends light to any of "
-            "its cells; turn it to the field, or choose another sun"
+            "its cells; turn the receiver towards the field, or choose another sun position"
         )
     return replace(built, power=power)

@@ -173,7 +173,7 @@ def next_round(now: Round, **light: Any) -> Answer:
         room = limit - fixed - _risk(engine, now.demand, limit).above
         if (room <= 0.0).any():
             raise InputError(
-                f"aims: {int(stays.sum())} beams that keep their aims, by an operator or for their "
+                f"aims: {int(stays.sum())} beams whose aims are kept, by an operator or for their "
                 "return from a visit, bring up to "
                 f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of "
                 "them, or raise the limit"

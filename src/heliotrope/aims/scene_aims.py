@@ -236,8 +236,8 @@ def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
     """Return earlier candidates rescaled to the present light."""
     if len(scene.mirrors) != len(start.aims):
         raise InputError(
-            f"aims: the start has {len(start.aims)} mirrors, the scene {len(scene.mirrors)}; begin "
-            "without it"
+            f"aims: the start has {len(start.aims)} mirrors, but the scene has "
+            f"{len(scene.mirrors)}; omit the start"
         )
     before, now = start.engine.leaving, base.leaving
     # A mirror that is defocused now or was then has no light of its own to compare; use the
@@ -282,7 +282,7 @@ def _refuse(scene: Scene, trial: SceneAims, demand: Demand) -> None:
     cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
     advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
     raise InputError(
-        f"receiver {surface_in(scene).name}: no aims were found that hold the flux limit; "
+        f"receiver {surface_in(scene).name}: no aims were found that respect the flux limit; "
         f"{_place(scene, cell)} gets {1e-3 * trial.quantile[cell]:.4g} kW/m², of which errors are "
         f"{1e-3 * trial.risk.above[cell]:.4g}, {100 * trial.excess:.2g} % above its "
         f"{1e-3 * trial.limit[cell]:.4g}; raise the limit by that, or {advice}"

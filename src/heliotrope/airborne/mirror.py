@@ -76,15 +76,15 @@ class MirrorShape:
             object.__setattr__(self, name, as_vectors(getattr(self, name), f"mirror: {name}"))
         shape = self.center.shape
         if self.center.ndim != 2 or {self.half_width.shape, self.half_height.shape} != {shape}:
-            raise InputError(f"mirror: facets of shape {shape}; give centres and edges (F, 3)")
+            raise InputError(f"mirror: facets of shape {shape}; expected centres and edges (F, 3)")
         focal = np.array(np.broadcast_to(as_float(self.focal), shape[:1]))
         if not (focal != 0.0).all():
-            raise InputError("mirror: a focal length is 0 m or not a number; give inf for flat")
+            raise InputError("mirror: a focal length is 0 m or not a number; use inf for flat")
         object.__setattr__(self, "focal", focal)
         area = np.linalg.norm(np.cross(self.half_width, self.half_height), axis=-1)
         if not (area > 0.0).all():
             k = int(np.argmin(area))
-            raise InputError(f"mirror: facet {k} has no area; give edges that are not parallel")
+            raise InputError(f"mirror: facet {k} has no area; its edges must not be parallel")
         if self.slope is None:
             return
         slope = as_float(self.slope)

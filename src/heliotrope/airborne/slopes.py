@@ -129,8 +129,8 @@ def smooth_slopes(
     """
     if not (rms >= 0.0 and length > 0.0 and cells > 1):
         raise InputError(
-            f"smooth_slopes: rms {rms} rad, length {length} m and {cells} cells; give an rms of "
-            "0 or more, a length above 0 and two cells or more"
+            f"smooth_slopes: rms {rms} rad, length {length} m and {cells} cells; use an rms of 0 "
+            "or more, a length above 0 and at least two cells"
         )
     from scipy.ndimage import gaussian_filter
 
@@ -170,12 +170,13 @@ def _read_csv(file: Path) -> FloatArray:
             rows.places[i],
         )
     if not len(index):
-        raise FormatError(file, "no rows; give one for each cell of the map")
+        raise FormatError(file, "no rows; write one row per cell of the map")
     whole = index.astype(np.intp)
     shape = np.asarray(whole.max(axis=0)) + 1
     if int(np.prod(shape)) > 10 * len(whole):
         raise FormatError(
-            file, f"{len(whole)} rows for {' × '.join(map(str, shape))} cells; give the whole map"
+            file,
+            f"{len(whole)} rows for {' × '.join(map(str, shape))} cells; include the whole map",
         )
     slope = np.full((*shape, 2), np.nan)
     slope[whole[:, 0], whole[:, 1], whole[:, 2]] = 1e-3 * values

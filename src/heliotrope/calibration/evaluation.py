@@ -139,7 +139,7 @@ def split(
     """
     check_fraction(fraction)
     if kind not in get_args(Split):
-        raise InputError(f"split {kind!r}: give one of {', '.join(get_args(Split))}")
+        raise InputError(f"split {kind!r}: use one of {', '.join(get_args(Split))}")
     if kind in KINDS:
         return paint_split(sightings, kind, seed)[0]
     chosen = np.zeros(len(sightings), dtype=np.bool_)

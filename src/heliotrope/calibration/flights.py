@@ -113,14 +113,17 @@ class FlightDocument(_Strict):
         """
         count = len(self.shared)
         if len(self.covariance) != count or any(len(r) != count for r in self.covariance):
-            raise ValueError(f"covariance: give {count} by {count} values, one for each of shared")
+            raise ValueError(
+                f"covariance: write {count} by {count} values, a row and a column for each of "
+                "shared"
+            )
         if count and not _positive(np.array(self.covariance)):
             raise ValueError("covariance: it is not symmetric and positive definite")
         for k, row in enumerate(self.rows):
             if any(len(line) != count for line in row.shift):
-                raise ValueError(f"rows.{k}.shift: give 3 lists of {count} values")
+                raise ValueError(f"rows.{k}.shift: write 3 lists of {count} values")
             if any(len(line) != 3 for line in row.covariance_m2):
-                raise ValueError(f"rows.{k}.covariance_m2: give 3 lists of 3 values")
+                raise ValueError(f"rows.{k}.covariance_m2: write 3 lists of 3 values")
         good = is_covariance(np.array([row.covariance_m2 for row in self.rows]))
         if not good.all():
             k = int(np.flatnonzero(~good)[0])

@@ -184,7 +184,7 @@ def find_images(
     place = Path(folder)
     try:
         if not stat.S_ISDIR(place.stat().st_mode):
-            raise InputError(f"{place}: not a folder; give one with images")
+            raise InputError(f"{place}: not a folder; use a folder with images")
         images = [
             item
             for item in check_entries(place, place.rglob("*") if recursive else place.iterdir())
@@ -194,7 +194,7 @@ def find_images(
         ]
     except OSError as error:
         raise InputError(
-            f"{place}: cannot be read ({error.strerror}); give a folder with images"
+            f"{place}: cannot be read ({error.strerror}); use a folder with images"
         ) from None
     return sorted(images, key=_natural)
 
@@ -210,9 +210,9 @@ def _content(file: Path, limit: int) -> tuple[bytes, float]:
     try:
         state = file.stat()
         if stat.S_ISDIR(state.st_mode):
-            raise FormatError(file, f"this is a folder; give an image file ({_KINDS})")
+            raise FormatError(file, f"this is a folder; specify an image file ({_KINDS})")
         if not stat.S_ISREG(state.st_mode):
-            raise FormatError(file, "this is a device or a pipe; give an image file")
+            raise FormatError(file, "this is a device or a pipe; specify an image file")
         if state.st_size > most:
             raise FormatError(
                 file,
@@ -222,13 +222,13 @@ def _content(file: Path, limit: int) -> tuple[bytes, float]:
         data = read_bytes(file, most)
     except FileNotFoundError:
         if file.is_symlink():
-            text = f"a link to {file.readlink()}, which does not exist; give an image file"
+            text = f"a link to {file.readlink()}, which does not exist; specify an image file"
             raise FormatError(file, text) from None
-        raise FormatError(file, "there is no such file; give an image file") from None
+        raise FormatError(file, "no such file; specify an image file") from None
     except OSError as error:
-        raise FormatError(file, f"cannot be read ({error.strerror}); give an image") from None
+        raise FormatError(file, f"cannot be read ({error.strerror}); use another image") from None
     if not data:
-        raise FormatError(file, f"the file is empty; give an image ({_KINDS})")
+        raise FormatError(file, f"the file is empty; use an image ({_KINDS})")
     return data, state.st_mtime
 
 
@@ -260,14 +260,14 @@ def _opener(file: Path, data: bytes) -> tuple[str, Callable[[io.BytesIO], ImageF
     for start, (kind, opener) in _OPENERS.items():
         if data.startswith(start):
             if kind == "WebP" and data[8:12] != b"WEBP":
-                raise FormatError(file, f"this is a RIFF file but not WebP; give a {_KINDS}")
+                raise FormatError(file, f"this is a RIFF file but not WebP; use a {_KINDS}")
             return kind, opener
     if data[4:8] == b"ftyp":
         what = "an AVIF, a HEIC or a video"
     else:
         what = next((w for start, w in _OTHERS.items() if data.startswith(start)), "")
     if not what:
-        raise FormatError(file, f"not an image of a known kind; give a {_KINDS}")
+        raise FormatError(file, f"not a supported image format; use a {_KINDS}")
     raise FormatError(file, f"this is {what} file; convert it to a {_KINDS}")
 
 
@@ -287,7 +287,9 @@ def _damaged(file: Path, kind: str, size: int, error: Exception) -> FormatError:
 
 def _check_size(file: Path, width: int, height: int, limit: int) -> None:
     if width < SMALLEST or height < SMALLEST:
-        text = f"{width} × {height} px; an image needs {SMALLEST} × {SMALLEST} px or more"
+        text = (
+            f"{width} × {height} px; an image must have at least {SMALLEST} × {SMALLEST} px or more"
+        )
         raise FormatError(file, text)
     if width * height > limit:
         text = f"{width} × {height} px are {width * height / 1e6:.3g} million, above the limit of "
@@ -341,7 +343,9 @@ def _check_tiff(file: Path, image: TiffImagePlugin.TiffImageFile, data: bytes) -
         raise FormatError(file, f"{channels} channels of kind {photometric}; convert it to RGB")
     starts, lengths = (tags.get(a, tags.get(b, ())) for a, b in ((273, 324), (279, 325)))
     if len(starts) != len(lengths):
-        raise FormatError(file, "its directory names no strips: damaged, copy it again")
+        raise FormatError(
+            file, "its TIFF directory lists no strips, so the file is damaged; copy it again"
+        )
     if any(not kind & 1 for kind in _further_pages(data)):
         raise FormatError(file, "this TIFF has several pages; save each as a file of its own")
 
@@ -365,7 +369,7 @@ def _decode(file: Path, container: _Container) -> Pixels:
     kind, image, data = container.kind, container.image, container.data
     size = image.size
     if _is_transparent(image):
-        text = "every pixel is transparent: it shows nothing; save it without alpha"
+        text = "every pixel is transparent, so the image is blank; save it without alpha"
         raise FormatError(file, text)
     orientation = image.tag_v2.get(274, 1) if kind == "TIFF" else 1  # type: ignore[attr-defined]
     try:
@@ -626,12 +630,12 @@ def encode_image(
 
     frame = image if isinstance(image, Frame) else Frame(image, name)
     if suffix not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
-        raise InputError(f"{name}: images are written as .png, .jpg or .tif, not as {suffix!r}")
+        raise InputError(f"{name}: images can be written as .png, .jpg or .tif, not as {suffix!r}")
     jpeg = suffix in (".jpg", ".jpeg")
     if jpeg and frame.pixels.dtype != np.uint8:
         raise InputError(f"{name}: a JPEG holds 8 bits, the frame has 16; write a PNG or a TIFF")
     if not 1 <= quality <= 100:
-        raise InputError(f"{name}: quality {quality}; give 1 to 100")
+        raise InputError(f"{name}: quality {quality}; must be 1 to 100")
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if jpeg else []
     done, encoded = cv2.imencode(suffix, frame.pixels, options)
     if not done:

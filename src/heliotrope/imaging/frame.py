@@ -63,7 +63,7 @@ class Frame:
             raise InputError(f"{self.name or 'frame'}: pixels {shape} must be (H, W) or (H, W, 3)")
         if self.pixels.dtype not in (np.uint8, np.uint16):
             raise InputError(
-                f"{self.name or 'frame'}: pixels of {self.pixels.dtype}; give uint8 or uint16"
+                f"{self.name or 'frame'}: pixels of {self.pixels.dtype}; use uint8 or uint16"
             )
         if self.time is not None and self.time.tzinfo is None:
             raise InputError(f"{self.name or 'frame'}: time {self.time} has no zone; add one")

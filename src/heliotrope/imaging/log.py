@@ -111,9 +111,11 @@ def read_log(path: str | Path) -> Log:
     for i, key in enumerate(file or number for file, number in zip(files, ids, strict=True)):
         first = places.setdefault(key, i)
         if not key:
-            rows.refuse(i, "file", "neither file nor id is given; give one")
+            rows.refuse(i, "file", "neither file nor id is filled in; enter one")
         elif first != i:
-            rows.refuse(i, "file", f"{key} has the row {rows.places[first]} too; keep the true one")
+            rows.refuse(
+                i, "file", f"{key} also appears in {rows.places[first]}; keep the correct row"
+            )
         counts = np.array([numbers[0][i], numbers[1][i]])
         entries[key] = Entry(
             heliostat=heliostats[i],
@@ -126,8 +128,11 @@ def read_log(path: str | Path) -> Log:
     for key, i in places.items():
         for other in {*_short(Path(key))} - {key}:
             if other in places:
-                text = f"{key} and {other} of {rows.places[places[other]]} name one photograph"
-                rows.refuse(i, "file", f"{text}; keep the true row")
+                text = (
+                    f"{key} and {other} of {rows.places[places[other]]} refer to the same "
+                    "photograph"
+                )
+                rows.refuse(i, "file", f"{text}; keep the correct row")
     rows.refuse_bad()
     return Log(entries)
 

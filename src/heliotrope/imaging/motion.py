@@ -194,7 +194,9 @@ def _view(picture: Frame | Pixels) -> _View:
     frame = picture if isinstance(picture, Frame) else Frame(picture)
     width, height = frame.size
     if min(width, height) < 16:
-        raise InputError(f"a frame of {width} × {height} px; motion needs 16 × 16 px or more")
+        raise InputError(
+            f"a frame of {width} × {height} px; motion detection needs 16 × 16 px or more"
+        )
     factor = max(1, math.ceil(width / _WIDTH), math.ceil(height / _HEIGHT))
     grey = frame.grey
     if factor > 1:
@@ -213,9 +215,11 @@ def _mask(mask: npt.ArrayLike | None, view: _View) -> _Image | None:
         return None
     counting = np.asarray(mask) != 0
     if counting.shape != (view.size[1], view.size[0]):
-        raise InputError(f"a mask of {counting.shape} does not fit frames of {view.size[::-1]} px")
+        raise InputError(
+            f"a mask of {counting.shape} does not match frames of {view.size[::-1]} px"
+        )
     if not counting.any():
-        raise InputError("the mask excludes the whole frame; clear a part of it")
+        raise InputError("the mask excludes the whole frame; unmask a part of it")
     size = view.image.shape[1::-1]
     share = cv2.resize(counting.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.asarray(share > 0.0, dtype=np.uint8)
@@ -241,7 +245,7 @@ def _expected(first: _View, second: _View) -> tuple[_Image, float]:
     if first.size != second.size:
         raise InputError(
             f"frames of {first.size[0]} × {first.size[1]} and {second.size[0]} × {second.size[1]} "
-            "px cannot be compared; give two of the same camera"
+            "px cannot be compared; use two frames from the same camera"
         )
     a, b = first.cells, second.cells
     y, x = np.mgrid[-1.0 : 1.0 : a.shape[0] * 1j, -1.0 : 1.0 : a.shape[1] * 1j]
@@ -411,7 +415,7 @@ def _compare(
     regions.sort(key=lambda pair: -pair[0].significance)
     area = sum(region.area_px for region, _ in regions)
     if area > 0.5 * places * first.factor**2:
-        problem = "more than half of the frame changed: another scene, or another light"
+        problem = "more than half of the frame changed: a different scene or different lighting"
     return FrameMotion(
         moved=bool(regions) and not problem,
         significance=float(max(high.max(), -low.min())),

@@ -255,8 +255,8 @@ def _empty_picture(
     known = next((f.view for f in again if f.view is not None), None)
     if known is None:
         raise InputError(
-            f"{without.name or 'the frame without the beam'}: {again[0].reason}; give an empty "
-            "frame of the same camera"
+            f"{without.name or 'the frame without the beam'}: {again[0].reason}; use an empty "
+            "frame from the same camera"
         )
     return rectify(without, known, rim=rim)
 

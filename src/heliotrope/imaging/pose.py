@@ -232,15 +232,15 @@ def _observed(
     where, observed, noise = as_vectors(points, "points"), as_float(pixels), as_float(sigma)
     if where.ndim != 2 or observed.shape != (len(where), 2):
         raise InputError(
-            f"points {where.shape} and pixels {observed.shape}; give (N, 3) and (N, 2)"
+            f"points {where.shape} and pixels {observed.shape}; expected (N, 3) and (N, 2)"
         )
     if not np.isfinite(observed).all():
         row = int(np.argwhere(~np.isfinite(observed))[0, 0])
-        raise InputError(f"pixels[{row}]: {observed[row]} is not finite; leave such points out")
+        raise InputError(f"pixels[{row}]: {observed[row]} is not finite; omit such points")
     if noise.shape in ((), (len(where),)):
         noise = np.eye(2) * np.broadcast_to(np.sign(noise) * noise**2, len(where))[:, None, None]
     if noise.shape != (len(where), 2, 2):
-        raise InputError(f"sigma {noise.shape}; give one number, (N,) or (N, 2, 2)")
+        raise InputError(f"sigma {noise.shape}; pass one number, (N,) or (N, 2, 2)")
     if not (np.isfinite(noise).all() and (np.linalg.eigvalsh(noise) > 0.0).all()):
         raise InputError("sigma of the pixels: a variance is not finite and above 0")
     return where, observed, np.linalg.inv(np.linalg.cholesky(noise))
@@ -254,7 +254,7 @@ def _problem(
     origin = where.mean(axis=0)
     spread = np.linalg.svd(where - origin, compute_uv=False)
     if spread[1] <= 1e-3 * spread[0]:
-        raise InputError(f"the {len(where)} points lie on one line; take some that span an area")
+        raise InputError(f"the {len(where)} points lie on one line; use points that span an area")
     return _Problem(origin, where - origin, observed, white, base, free)
 
 
@@ -307,7 +307,7 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
             solved.append((2.0 * float(solution.cost), solution.x))
     name = f"camera {problem.base.name}"
     if not solved:
-        raise InputError(f"{name}: no pose explains the points; are their names right?")
+        raise InputError(f"{name}: no pose explains the points; check their names")
     solved.sort(key=lambda pair: pair[0])
     chi2, x = solved[0]
     camera = problem.camera(x)
@@ -322,7 +322,7 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
     other = problem.camera(differ[0]) if differ else None
     size = np.linalg.norm(slopes, axis=0)
     if not (size.min() > 0.0 and np.linalg.cond(slopes / size) < 1e8):
-        raise InputError(f"{name}: the points do not determine its position; take more")
+        raise InputError(f"{name}: the points do not determine its position; use more points")
     raw = np.linalg.inv((slopes / size).T @ (slopes / size)) / size / size[:, None]
     residuals = problem.pixels - problem.predict(x, problem.local)[0]
     if problem.free:

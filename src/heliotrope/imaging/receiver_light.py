@@ -93,7 +93,7 @@ class ReceiverSight:
         who = f"camera {self.camera}: receiver {self.receiver}"
         outline = as_float(self.outline)
         if outline.ndim != 2 or outline.shape[1:] != (2,) or len(outline) < 3:
-            raise InputError(f"{who}: an outline of {outline.shape}; give 3 corners or more, px")
+            raise InputError(f"{who}: an outline of {outline.shape}; specify 3 corners or more, px")
         object.__setattr__(self, "outline", outline)
         top = np.array(self.size) - 0.5
         if not ((outline >= -0.5) & (outline <= top)).all():
@@ -104,14 +104,14 @@ class ReceiverSight:
         pixels = int(self.face.sum())
         if pixels < LEAST_FACE:
             raise InputError(
-                f"{who}: it has {pixels} px in the frame, the limit is {LEAST_FACE}; use a longer "
-                "lens"
+                f"{who}: it has {pixels} px in the frame, below the minimum of {LEAST_FACE}; use "
+                "a longer lens"
             )
         visible = sum(int(side.sum()) >= LEAST_SIDE for side in self.sides)
         if visible < LEAST_SIDES:
             raise InputError(
-                f"{who}: {visible} of its four sides have room about it in the frame, the limit is "
-                f"{LEAST_SIDES}; use a wider lens"
+                f"{who}: {visible} of its four sides have a margin in the frame, below the "
+                f"minimum of {LEAST_SIDES}; use a wider lens"
             )
 
     @cached_property
@@ -203,10 +203,12 @@ class ReceiverReference:
         if not (np.isfinite(numbers).all() and 0.0 <= self.black < 1.0 and self.rise > 0.0):
             raise InputError(
                 f"{who}: a reference with levels {self.black:g} and {self.face:g} and a rise of "
-                f"{self.rise:g} is none; take it again"
+                f"{self.rise:g} is invalid; take the reference again"
             )
         if sides.shape != (4,) or int((sides > 0.0).sum()) < LEAST_SIDES:
-            raise InputError(f"{who}: a reference of {sides} shows too few sides; take it again")
+            raise InputError(
+                f"{who}: a reference of {sides} shows too few sides; take the reference again"
+            )
         shape = reduced(np.zeros(self.sight.face.shape, np.float32)).shape
         if self.surroundings.shape != shape:
             raise InputError(
@@ -260,7 +262,7 @@ def receiver_light(
     if frame.size != sight.size or _bits(frame) != reference.bits:
         kind = f"{frame.size[0]} × {frame.size[1]} px of {_bits(frame)} bit"
         first = f"{sight.size[0]} × {sight.size[1]} px of {reference.bits} bit"
-        return ReceiverLight(math.nan, f"its frames have {kind}, those of the reference {first}")
+        return ReceiverLight(math.nan, f"its frames have {kind}, but the reference has {first}")
     levels = _Levels.of(frame, sight)
     brightness = np.asarray((levels.sides - reference.black) / reference.sides)
     counting = np.isfinite(brightness) & (levels.clipped_sides <= CLIPPED_SIDE)
@@ -304,19 +306,19 @@ def _doubt(
     if abs(exposure / reference.exposure - 1.0) > EXPOSED:
         return (
             f"exposure times gain is {exposure:.3g} s, that of the reference "
-            f"{reference.exposure:.3g} s; fix both"
+            f"{reference.exposure:.3g} s; fix exposure and gain"
         )
     if not counting:
         return "the surroundings of the receiver are overexposed; shorten the exposure"
     if daylight < DIMMEST:
         return (
             f"the surroundings of the receiver show {max(daylight, 0.0):.0%} of the reference's "
-            f"daylight, the limit is {DIMMEST:.0%}: night, or something covers the lens"
+            f"daylight, below the minimum of {DIMMEST:.0%}: night, or something covers the lens"
         )
     if daylight > BRIGHTEST:
         return (
             f"the surroundings of the receiver are {daylight:.1f} times as bright as in the "
-            f"reference, the limit is {BRIGHTEST:g}"
+            f"reference; the limit is {BRIGHTEST:g}"
         )
     if levels.clipped_face > CLIPPED_FACE:
         return f"{levels.clipped_face:.1%} of the receiver is overexposed; shorten the exposure"
@@ -347,7 +349,9 @@ def _check_photographs(
                 f"{who}: {frame.name} at a share of {share:g}; give above 0 to 2, 1 is nominal"
             )
     if not with_beams:
-        raise InputError(f"{who}: no photograph with beams; give one with its share of the flux")
+        raise InputError(
+            f"{who}: no photograph with beams; pass one with its fraction of the nominal flux"
+        )
 
 
 def take_reference(
@@ -387,8 +391,9 @@ def take_reference(
     if good.sum() < LEAST_SIDES:
         raise InputError(
             f"{who}: {dark.name} shows {int(good.sum())} sides of the receiver's surroundings "
-            f"brighter than a capped lens and not overexposed, the limit is {LEAST_SIDES}; change "
-            "the exposure, or have more of what stands about the receiver in the picture"
+            "brighter than a capped lens and not overexposed, below the minimum of "
+            f"{LEAST_SIDES}; change the exposure, or include more of the receiver's surroundings "
+            "in the picture"
         )
     usual = np.where(good, sides, math.nan)
     rises, shares = [], []
@@ -413,9 +418,9 @@ def take_reference(
     for (frame, share), rise in zip(lit, rises, strict=True):
         if not (slope > 0.0 and abs(rise / (slope * share) - 1.0) <= _LINEAR):
             raise InputError(
-                f"{who}: {frame.name} rises by {rise:.4f} of full scale at a share of {share:g}, "
-                f"the others say {slope * share:.4f}; is a share wrong, or the response not linear "
-                "(gamma)?"
+                f"{who}: {frame.name} rises by {rise:.4f} of full scale at a fraction of "
+                f"{share:g}, the other photographs predict {slope * share:.4f}; check the "
+                "fractions and the linearity of the response (gamma)"
             )
     exposures = {frame.exposure * frame.gain for frame in (capped, dark, *(f for f, _ in lit))}
     stated = [value for value in exposures if math.isfinite(value)]
@@ -514,14 +519,14 @@ def _view_change(sight: ReceiverSight, usual: Image, now: Image) -> str:
     theirs = theirs / (np.linalg.norm(theirs, axis=0) + 1e-9)
     whole = float(np.linalg.norm(mine, axis=0).sum())
     if not whole > 0.0:
-        return "nothing about the receiver shows where the camera looks"
+        return "nothing around the receiver shows where the camera points"
     shifts = [(y, x) for y in range(-_REACH, _REACH + 1) for x in range(-_REACH, _REACH + 1)]
     like = [float((mine * theirs[:, row + y, column + x]).sum()) / whole for y, x in shifts]
     best = int(np.argmax(like))
     if like[best] < LIKENESS:
         return (
-            "the surroundings of the receiver are not those of the reference; the camera was "
-            "moved, or something is in front of it"
+            "the surroundings of the receiver do not match the reference; the camera was moved, "
+            "or something is in front of it"
         )
     pixel = _factor(sight.face.shape)
     away = math.hypot(*shifts[best]) * pixel

@@ -54,7 +54,7 @@ def canted(
     """
     columns, rows = facets
     if not (1 <= columns <= 50 and 1 <= rows <= 50):
-        raise InputError(f"canting: {columns} × {rows} facets; give 1 to 50 each way")
+        raise InputError(f"canting: {columns} × {rows} facets; must be 1 to 50 each way")
     x = (np.arange(columns) + 0.5) / columns - 0.5
     y = (np.arange(rows) + 0.5) / rows - 0.5
     grid = np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=-1)
@@ -83,16 +83,19 @@ def _off_axis(
 ) -> FloatArray:
     """Return tilts for which the facets send the sun to the aim, (H, F, 2)."""
     if plant is None:
-        raise InputError("canting: off axis it needs the plant, whose mirrors turn to that sun")
+        raise InputError(
+            "canting: off-axis canting needs the plant, because its heliostats must face that sun"
+        )
     light = normalize(as_vectors(sun, "canting: sun"))
     if light.shape != (3,) or light[2] <= 0.0:
-        raise InputError("canting: give one sun above the horizon, (3,)")
+        raise InputError("canting: pass one sun vector above the horizon, (3,)")
     scene = scene_of(plant, light, aim)
     then = scene.mirrors
     if scene.dark is not None and scene.dark.any():
         name = plant.names[int(np.flatnonzero(scene.dark)[0])]
         raise InputError(
-            f"canting: heliostat {name} cannot reach its aim at the sun of canting; choose another"
+            f"canting: heliostat {name} cannot reach its aim at the sun position chosen for "
+            "canting; choose another"
         )
     x, y = center[..., :1], center[..., 1:]
     place = then.center[:, None] + x * then.right[:, None] + y * then.up[:, None]

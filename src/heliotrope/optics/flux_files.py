@@ -172,7 +172,7 @@ def write_solartherm(path: str | Path, table: FluxTable) -> None:
         If the table is one over times.
     """
     if not np.isfinite(table.declination).all():
-        raise InputError(f"{path}: SolarTherm takes a table over a year; use flux_year")
+        raise InputError(f"{path}: SolarTherm needs a table over a year; use flux_year")
     hours = np.unique(np.round(np.degrees(table.hour), 9))
     step = float(np.diff(hours).min()) if len(hours) > 1 else 15.0
     across = np.round(step * np.arange(-round(180.0 / step), round(180.0 / step) + 1), 9)

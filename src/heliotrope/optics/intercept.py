@@ -189,5 +189,5 @@ def _chords(
 def _offset(name: str, value: npt.ArrayLike) -> FloatArray:
     offset = as_float(value)
     if np.isinf(offset).any():
-        raise InputError(f"{name}: an offset is infinite; give metres, or NaN for no beam")
+        raise InputError(f"{name}: an offset is infinite; pass metres, or NaN for no beam")
     return offset

@@ -59,7 +59,7 @@ class Campaign:
             f"{axis} {1e3 * o:+.1f} ± {1e3 * s:.1f}"
             for axis, o, s in zip("ENU", self.offset, self.offset_sigma, strict=True)
         ]
-        return f"common offset of RTK, recorded less true: {', '.join(parts)} mm"
+        return f"common RTK offset, recorded minus true: {', '.join(parts)} mm"
 
     def warnings(self, prior: float) -> list[str]:
         """Return a warning if the offset is far larger than its prior standard deviation, m."""
@@ -67,9 +67,9 @@ class Campaign:
         if size <= 3.0 * prior:
             return []
         line = (
-            f"RTK's common offset is {1e3 * size:.0f} mm, its standard deviation was given as "
-            f"{1e3 * prior:.0f} mm; check the position of the base station, or give a larger "
-            "standard deviation (--rtk-mm)"
+            f"the common RTK offset is {1e3 * size:.0f} mm, but its specified standard deviation "
+            f"is {1e3 * prior:.0f} mm; check the position of the base station, or specify a "
+            "larger standard deviation (--rtk-mm)"
         )
         return [line]
 
@@ -113,7 +113,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
         if not flights:
             raise InputError("there is no flight to evaluate")
         first = f"{flights[0].name}: {_cause(problems[0])}".removeprefix(": ")
-        raise InputError(f"no flight of {len(flights)} gives a reflection; the first: {first}")
+        raise InputError(f"none of {len(flights)} flights shows a reflection; the first: {first}")
     offset, covariance = common_offset(done, (priors or Priors()).offset)
     return Campaign(tuple(evaluations), tuple(problems), offset, covariance, len(done))
 

@@ -86,8 +86,8 @@ def _read(photo: Photo, camera: LedCamera) -> SeenTargets:
     height, width = picture.shape[:2]
     if (width, height) != camera.size:
         return _none(
-            f"{width} × {height} px, but the camera file says {camera.size[0]} × "
-            f"{camera.size[1]} px; give the file of this camera"
+            f"{width} × {height} px, but the camera file says {camera.size[0]} × {camera.size[1]} "
+            "px; use the file of this camera"
         )
     return find_targets(picture)
 

@@ -157,15 +157,17 @@ def decode(path: str | Path) -> Picture:
     try:
         data = read_bytes(file)
     except OSError as error:
-        raise FormatError(file, f"cannot be read ({error.strerror}); give a photograph") from None
+        raise FormatError(
+            file, f"cannot be read ({error.strerror}); specify another photograph"
+        ) from None
     if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]:
-        raise FormatError(file, f"it breaks off after {len(data)} bytes; copy it again")
+        raise FormatError(file, f"the file ends after {len(data)} bytes; copy it again")
     # Its header says how much memory decoding takes.
     read_metadata(file)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if picture is None:
-        raise FormatError(file, "this is no readable image; copy it again")
+        raise FormatError(file, "not a readable image; copy it again")
     return np.asarray(picture, np.uint8)
 
 

@@ -108,7 +108,7 @@ def evaluate(
             lines = tuple(s.why_unused() for s in seen if s.problem)
             return _evaluate_dark(*own, camera, stand, shape, known, lines)
         first = f"; the first: {problems[0]}" if problems else ""
-        raise InputError(f"no photograph of {len(seen)} can be used{first}")
+        raise InputError(f"none of {len(seen)} photographs can be used{first}")
     recorded, used = [photos[k] for k in good], [seen[k] for k in good]
     corners = corners_of(used)
     adjusted = adjust_photos(recorded, used, camera, stand, known, owner)

@@ -261,7 +261,7 @@ def _missing_photographs(named: Matches, flights: Sequence[FlightData]) -> list[
     present = {name for f in flights for p in f.photos for name in (p.name, f"{f.name}/{p.name}")}
     missing = dict.fromkeys(name for name in named.photo if name not in present)
     return [
-        f"{named.path.name}: there is no photograph {name!r}; its places are not used"
+        f"{named.path.name}: there is no photograph {name!r}; its rows are ignored"
         for name in missing
     ]
 

@@ -257,7 +257,7 @@ class _Surfaces:
                 f"{self._folder}: there is no slope map in it; name the files after heliostats, "
                 f"{self._without[0]}.npz"
             )
-        return [f"{self._folder}: no slope map of {n}; taken as ideal" for n in self._without]
+        return [f"{self._folder}: no slope map of {n}; assumed ideal" for n in self._without]
 
 
 def _has_photos(folder: Path) -> bool:

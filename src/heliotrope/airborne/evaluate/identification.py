@@ -139,10 +139,13 @@ def identify(
     _, visible = expected_size(camera, photo, stand)
     rows = np.flatnonzero(visible)
     if len(rows) < FEWEST:
-        text = f"wrong_field: {len(rows)} mirrors of the field can be in it; is this the right one?"
+        text = (
+            f"wrong_field: {len(rows)} mirrors of the field can be in view; check that this is "
+            "the right field"
+        )
         return Identified(photo.rotation, none, none, text)
     if len(patches) < FEWEST:
-        text = f"nothing: {len(patches)} patches look like mirrors, {FEWEST} are needed"
+        text = f"nothing: only {len(patches)} patches look like mirrors; {FEWEST} are needed"
         return Identified(photo.rotation, none, none, text)
     tried = _search(camera, photo, stand, rows, patches, (photo.rotation,))
     near, fit = _choose(tried, photo, camera, stand, rows, len(patches))
@@ -209,7 +212,7 @@ def _farther(
         text = (
             f"ambiguous: {len(fit.solution.mirror)} mirrors match badly, {100 * fit.apart:.0f} % "
             f"of a side apart and {100 * fit.matched:.0f} % of all; the gimbal may be more than "
-            f"{np.degrees(GIMBAL):.0f}° off: check its angles"
+            f"{np.degrees(GIMBAL):.0f}° off; check the gimbal angles"
         )
         return Identified(photo.rotation, none, none, text, shifted=True)
     return near
@@ -384,8 +387,8 @@ def _choose(
     if best.score < LEAST_SHARE * ranked[0].inside:
         text = (
             f"wrong_field: {len(best.mirror)} patches match the {ranked[0].inside} mirrors of the "
-            "field that should be in it; check the field, the commands that were given, and the "
-            f"angles of the gimbal ({np.degrees(GIMBAL):.0f}° off are found)"
+            "field that should be in it; check the field, the commands, and the gimbal angles "
+            f"({np.degrees(GIMBAL):.0f}° off are found)"
         )
         return Identified(photo.rotation, none, none, text), None
     for other in ranked[1:]:
@@ -438,7 +441,10 @@ def find_lights(
     none = np.empty(0, dtype=np.intp)
     identified = Identified(photo.rotation, none, none)
     if len(spots) < FEWEST:
-        text = f"nothing: it is dark and shows {len(spots)} lights, {FEWEST} are needed"
+        text = (
+            f"nothing: the photograph is dark and shows only {len(spots)} lights; {FEWEST} are "
+            "needed"
+        )
         return replace(identified, reason=text), spots
     if not photo.by_hand:
         identified = identify(
@@ -446,8 +452,8 @@ def find_lights(
         )
     if identified.reason:
         text = (
-            f"ambiguous: it is dark, and its {len(spots)} lights cannot be assigned to mirrors; "
-            "check the field and the commands that were given"
+            f"ambiguous: the photograph is dark, and its {len(spots)} lights cannot be assigned "
+            "to mirrors; check the field and the commands"
         )
         return replace(identified, reason=text), spots
     mirror = _mirrors_of(undistort(camera, spots.pixel), photo, identified.rotation, stand)

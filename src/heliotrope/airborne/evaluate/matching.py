@@ -111,7 +111,7 @@ def _corners(rows: Rows) -> list[str]:
     for k, text in enumerate(rows.texts("corner")):
         name = " ".join(text.replace("_", " ").split()).casefold() or MIDDLE
         if name not in known:
-            rows.refuse(k, "corner", f"{text!r} is none of {', '.join(known)}")
+            rows.refuse(k, "corner", f"{text!r} is not one of {', '.join(known)}")
         names.append(name)
     return names
 
@@ -165,7 +165,10 @@ def _turned(
     if unknown:
         return f"heliostat {unknown[0]} was not commanded in this flight; correct the name"
     if len(rows) < FEWEST:
-        return f"{len(rows)} place is named, {FEWEST} are needed and 3 show a wrong name; name more"
+        return (
+            f"{len(rows)} place is named; {FEWEST} are needed, and 3 to detect a wrong name; name "
+            "more"
+        )
     plane = undistort(camera, matches.pixel[rows])
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -182,7 +185,7 @@ def _turned(
         directions = points - photo.position
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         if float(np.linalg.svd(directions - directions.mean(axis=0))[1][0]) < 1e-3:
-            return "its places are all at one point; name mirrors farther from each other"
+            return "all its places coincide; name mirrors that are farther apart"
         current = photo.moved(photo.position, nearest_rotation(directions, rays))
     gap = np.linalg.norm(current.pixels(camera, points) - matches.pixel[rows], axis=-1)
     side = np.sqrt(quad_area(current.pixels(camera, stand.corners[mirrors])))
@@ -191,8 +194,8 @@ def _turned(
     if not off[worst] < _OFF:
         name, corner = matches.heliostat[rows[worst]], matches.corner[rows[worst]]
         return (
-            f"{name}, {corner}, is {gap[worst]:.0f} px from where the other places put it; "
-            "correct its name or its place"
+            f"{name}, {corner}, is {gap[worst]:.0f} px from the position that the other places "
+            "imply; correct its name or its place"
         )
     return replace(current, by_hand=True)
 

@@ -60,7 +60,7 @@ def write_sheets(flights: "Sequence[FlightData]", names: Sequence[str], out: Pat
     table = out / "matches.csv"
     if table.exists():
         raise InputError(
-            f"{table}: there is one already, perhaps with names in it; move it, or give --out"
+            f"{table}: this file already exists and may contain names; move it, or use --out"
         )
     chosen = _chosen(flights, names)
     pictures, counts, rows = [], [], []
@@ -97,15 +97,15 @@ def _chosen(
         unnamed = [(f, p) for f, p, reading in every if reading.nameable]
         if not unnamed:
             raise InputError(
-                "the mirrors of all photographs are identified, or cannot be seen; nothing is to "
-                "be named. --photo NAME writes the picture of a certain photograph"
+                "the mirrors in all photographs are identified or not visible, so there is "
+                "nothing to name. --photo NAME writes the picture of a specific photograph"
             )
         return unnamed
     chosen = []
     for name in names:
         mine = [(f, p) for f, p, _ in every if name in (p.name, f"{f.name}/{p.name}")]
         if not mine:
-            raise InputError(f"--photo: there is no photograph {name}; give the name of a file")
+            raise InputError(f"--photo: there is no photograph {name}; use the name of a file")
         chosen += mine
     return chosen
 

@@ -108,8 +108,8 @@ def usable(targets: Sequence[SeenTargets]) -> tuple[list[int], dict[int, str]]:
             good.append(k)
         else:
             unusable[k] = shown.problem or (
-                f"it shows {count} targets that other photographs show too, {FEWEST_OF_PHOTO} are "
-                "needed"
+                f"it shows only {count} targets that other photographs also show; "
+                f"{FEWEST_OF_PHOTO} are needed"
             )
     return good, unusable
 
@@ -133,14 +133,14 @@ def locate(
     """
     if len(photos) < FEWEST_PHOTOS:
         raise InputError(
-            f"{len(photos)} photographs show coded targets, {FEWEST_PHOTOS} are needed; fly a dome "
-            "over them (heliotrope drone dome)"
+            f"{len(photos)} photographs show coded targets; {FEWEST_PHOTOS} are needed: fly a "
+            "dome over them (heliotrope drone dome)"
         )
     sights, numbers = _sights(targets)
     if len(numbers) < FEWEST_TARGETS:
         raise InputError(
-            f"{len(numbers)} coded targets are seen in two photographs or more, {FEWEST_TARGETS} "
-            "are needed; lay out more of them"
+            f"{len(numbers)} coded targets are seen in two photographs or more; {FEWEST_TARGETS} "
+            "are needed: lay out more"
         )
     state = _start(photos, sights, camera, 4 * len(numbers))
     return _result(*_adjusted(state, photos, camera, sights))
@@ -244,7 +244,7 @@ def _adjusted(
     else:
         raise InputError(
             f"the photogrammetry of {len(photos)} photographs does not converge; check that "
-            "camera.toml is the file of this camera, and that no target lies there twice"
+            "camera.toml is the file of this camera, and that no target number occurs twice"
         )
     kept = scaled < 4.0
     freedom = max(2 * int(kept.sum()) - size + 7, 1)

@@ -74,7 +74,7 @@ def field_map(orientations: Orientations, position: FloatArray, title: str = "")
         ax.set_ylabel("north, m")
         ax.grid(alpha=0.3)
     axes[0, 0].set_title("deviation of the orientation", fontsize=10)
-    axes[0, 1].set_title("how well it is known", fontsize=10)
+    axes[0, 1].set_title("uncertainty of the orientation", fontsize=10)
     if 0 < len(rows) <= MOST_ARROWS:
         _leans(axes[0, 0], orientations, places[rows])
     if 0 < len(rows) <= MOST_NAMES:
@@ -143,7 +143,7 @@ def _points(o: Orientation, shape: MirrorShape) -> Panel:
         390.0,
         x,
         y,
-        "sampling points, and the lean of the normals",
+        "sampling points and tilt of the normals",
         "x, m (right, seen from the front)",
         "y, m",
     ).equal()

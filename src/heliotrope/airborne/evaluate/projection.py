@@ -83,7 +83,7 @@ def overlay(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPose
         fit = f"{100 * best[0].fit:.0f} %" if best else "nothing"
         text = (
             f"wrong_field: the {len(rows)} mirrors that should be in it correlate to {fit} with "
-            "it; check the field and the commands that were given"
+            "it; check the field and the commands"
         )
         return Identified(photo.rotation, none, none, text)
     first = best[0]

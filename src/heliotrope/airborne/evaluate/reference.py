@@ -64,13 +64,13 @@ def read_reference(path: str | Path) -> Reference:
     rows.check("elevation_deg", np.abs(angles[1]) > 90.0, angles[1], "° is beyond ±90°")
     rows.refuse_bad()
     if not len(rows):
-        raise FormatError(file, "no rows; give one for each heliostat")
+        raise FormatError(file, "no rows; write one row per heliostat")
     known: dict[tuple[str, str], FloatArray] = {}
     flights = rows.texts("flight") if "flight" in rows.columns else [""] * len(angles[0])
     normals = direction(*np.radians(angles))
     for flight, name, normal in zip(flights, rows.texts("heliostat"), normals, strict=True):
         if (flight, name) in known:
-            raise FormatError(file, f"heliostat {name} is there twice; give one row for each pose")
+            raise FormatError(file, f"heliostat {name} is listed twice; write one row per pose")
         known[flight, name] = normal
     return Reference(known)
 
@@ -136,8 +136,8 @@ def compare(flights: Sequence[FlightResult], reference: Reference) -> tuple[Comp
             compared.append(Compared(flight.label(name), normal, shape, results[0], measured_one))
     if not compared:
         raise InputError(
-            "reference: none of its heliostats was measured; its names are those of the plant, and "
-            "its flights those of the campaign's folders"
+            "reference: none of its heliostats was measured; use heliostat names from the plant "
+            "and flight names from the campaign's folders"
         )
     return tuple(compared)
 

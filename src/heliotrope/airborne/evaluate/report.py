@@ -152,7 +152,9 @@ def write_campaign_report(
     """
     names = [f.name.replace("/", "-") for f in flights]
     if not names or len(set(names)) < len(names):
-        raise InputError(f"flight report: flights {names}; give one or more with different names")
+        raise InputError(
+            f"flight report: flights {names}; pass one or more flights with different names"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     _write_tables(flights, folder)
     every = [(f, o) for f in flights for o in f.found.found]

@@ -85,7 +85,7 @@ def check_rtk(
     problems = tuple(s.why_unused() for s in seen if s.problem)
     if len(good) < 3:
         first = f"; the first: {problems[0]}" if problems else ""
-        raise InputError(f"{len(good)} photographs can be used, three are needed{first}")
+        raise InputError(f"{len(good)} photographs can be used; three are needed{first}")
     recorded, used = [photos[k] for k in good], [seen[k] for k in good]
     usual = adjust_photos(recorded, used, camera, stand, priors or Priors())
     places, corners = as_float([p.position for p in recorded]), corners_of(used)

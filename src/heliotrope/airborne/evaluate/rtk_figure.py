@@ -31,7 +31,7 @@ def rtk_drawing(check: RtkCheck) -> str:
             (low, high),
             (0.0, most),
             title=f"{axis}: RTK's σ {1e3 * check.rtk[k]:.1f} mm",
-            across="RTK less photogrammetry, mm",
+            across="RTK minus photogrammetry, mm",
             up="photographs" if k == 0 else "",
         )
         panel.bars(edges, counts[k], _BAR)

@@ -75,7 +75,7 @@ class PointSelection:
 
     def __post_init__(self) -> None:
         if self.points < 1:
-            raise InputError(f"{self.points} calibration points: give 1 or more")
+            raise InputError(f"{self.points} calibration points: must be 1 or more")
         if not (np.isfinite(self.sigma) and self.sigma > 0.0):
             raise InputError(f"sigma {self.sigma} rad of a normal must be above 0")
         if not (np.isfinite(self.scatter) and self.scatter >= 0.0):
@@ -83,17 +83,17 @@ class PointSelection:
         if not 0.0 <= self.min_elevation < self.max_elevation <= 0.5 * np.pi:
             raise InputError(
                 f"elevations {np.degrees(self.min_elevation):g}° to "
-                f"{np.degrees(self.max_elevation):g}°: give 0° to 90°, the lower first"
+                f"{np.degrees(self.max_elevation):g}°: must be 0° to 90°, the lower first"
             )
         if not 0.0 < self.share <= 1.0:
-            raise InputError(f"share {self.share}: give a number above 0, up to 1")
+            raise InputError(f"share {self.share}: must be above 0, up to 1")
 
     def check(self, names: tuple[str, ...], model: str) -> None:
         """Raise an error unless the points outnumber the unknowns of a model."""
         if self.points <= len(names):
             raise InputError(
                 f"{self.points} calibration points: the model {model} has {len(names)} unknowns; "
-                f"give {len(names) + 1} or more"
+                f"use {len(names) + 1} points or more"
             )
 
 

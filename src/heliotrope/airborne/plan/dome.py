@@ -97,7 +97,7 @@ def plan_dome(
     rings = np.sort(as_float(elevations))
     if len(rings) < 2 or rings[0] < np.radians(15.0) or rings[-1] > np.radians(88.0):
         raise InputError(
-            f"dome: elevations {np.degrees(rings).tolist()}°; give two or more from 15 to 88"
+            f"dome: elevations {np.degrees(rings).tolist()}°; use two or more from 15 to 88"
         )
     middle = as_vectors(center, "center")
     share = np.cos(rings) / np.cos(rings).sum()

@@ -71,16 +71,16 @@ class Sampling:
         for name, unit in units.items():
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} {value:g}{unit}: give a number above 0")
+                raise InputError(f"{name} {value:g}{unit}: must be above 0")
         if not 0.0 <= self.pointing <= 0.1:
             raise InputError(
-                f"pointing error {1e3 * self.pointing:g} mrad: give 0 to 100 mrad; roughly align "
-                "mirrors with larger errors first"
+                f"pointing error {1e3 * self.pointing:g} mrad: must be 0 to 100 mrad; roughly "
+                "align mirrors with larger errors first"
             )
         if not abs(self.focal) > 0.0:
-            raise InputError("focal length 0 m: give another, or infinity for flat facets")
+            raise InputError("focal length 0 m: use another value, or infinity for flat facets")
         if np.shape(self.led_offset) != (3,) or not np.isfinite(self.led_offset).all():
-            raise InputError("led_offset: give three numbers, right, down and forward, in metres")
+            raise InputError("led_offset: use three numbers (right, down, forward) in metres")
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def mirrors(plant: Plant) -> HoverMirrors:
         if len(group.mechanism.driven) != 2:
             raise InputError(
                 f"group {name}: its mechanism has {len(group.mechanism.driven)} drive; a flight "
-                "needs heliostats that turn about two axes"
+                "needs heliostats with two axes"
             )
     parts = []
     for group in plant.groups.values():
@@ -315,8 +315,8 @@ def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tu
     if scale.min() < _BLURRED:
         raise InputError(
             f"facets of {sampling.focal:g} m focal length, seen from "
-            f"{float(slant[scale.argmin()]):.0f} m: close to twice the focal length a facet lights "
-            "up as a whole; change the distance"
+            f"{float(slant[scale.argmin()]):.0f} m: close to twice the focal length the whole "
+            "facet lights up; change the distance"
         )
     # Drone spacing that gives the number of samples asked for.
     required = float((np.sqrt(facet_area / sampling.samples) * scale).min())

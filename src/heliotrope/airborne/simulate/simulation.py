@@ -158,7 +158,7 @@ def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
     if (status != TrackingStatus.OK).any():
         i = int(np.flatnonzero(status != TrackingStatus.OK)[0])
         raise InputError(
-            f"heliostat {heliostats.names[i]}: cannot face {to.tolist()} m; choose another point"
+            f"heliostat {heliostats.names[i]}: cannot turn to {to.tolist()} m; choose another point"
         )
     return result.best_counts
 

@@ -362,14 +362,14 @@ def _scatter(white: FloatArray, sigma: FloatArray) -> str:
     beam = 1e3 * float(np.median(white * sigma))
     return (
         f"half of its beams are more than {beam:.2f} mrad, {np.median(white):.0f} times their "
-        "sigma, from where the others put them; give the true sigma, or check model and counts"
+        "sigma, from where the others put them; specify the true sigma, or check model and counts"
     )
 
 
 def _reason(beyond: int, unexplained: int, count: int) -> str:
     if beyond > unexplained:
         return (
-            f"{beyond} of {count} sightings have counts beyond the reach of its drives. Probably "
+            f"{beyond} of {count} sightings have counts outside the range of its drives. Probably "
             "the counts were recorded wrongly, or the properties of its drives are wrong."
         )
     if unexplained > NOTHING * count:

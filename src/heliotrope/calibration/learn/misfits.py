@@ -251,8 +251,8 @@ def _unmoved(mechanism: Mechanism, sightings: Sightings) -> Iterator[Misfit]:
             yield Misfit(
                 int(row),
                 FitOutcome.UNMOVED,
-                f"the mirror did not move: {amount(len(mine), 'sighting')} of different suns have "
-                "the same counts; check its motors and the log of the counts",
+                f"the mirror did not move: {amount(len(mine), 'sighting')} under different sun "
+                "directions have the same counts; check its motors and the log of the counts",
             )
 
 

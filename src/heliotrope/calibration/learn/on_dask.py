@@ -42,7 +42,7 @@ def connect(scheduler: str) -> "Client":
         return Client(scheduler, timeout="5s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"scheduler {scheduler!r}: no answer ({str(error).splitlines()[0]}); give "
+            f"scheduler {scheduler!r}: no reply ({str(error).splitlines()[0]}); use "
             "tcp://HOST:PORT of a running dask scheduler, or local:N"
         ) from None
 

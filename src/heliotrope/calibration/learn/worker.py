@@ -40,14 +40,16 @@ def answered(text: bytes) -> LearntGroup:
     try:
         answer: dict[str, Any] = dict(json.loads(text))
     except (TypeError, ValueError) as error:
-        raise InputError(f"the process that learns gave no result ({error})") from error
+        raise InputError(f"the learning process returned no result ({error})") from error
     if problem := answer.get("error"):
         raise InputError(str(problem))
     try:
         counts = int(answer["heliostats"]), int(answer["sightings"])
         return LearntGroup(read_hyperparameters(answer["hyper"]), *counts, float(answer["gain"]))
     except (KeyError, TypeError) as error:
-        raise InputError(f"the process that learns gave half a result ({error!r})") from error
+        raise InputError(
+            f"the learning process returned an incomplete result ({error!r})"
+        ) from error
 
 
 def _answer(data: bytes) -> dict[str, Any]:

@@ -98,11 +98,15 @@ class CommissionTerms:
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise InputError(f"commission: {name} {getattr(self, name)} must be 0 or more")
         if not 0.0 < self.clear <= 1.0:
-            raise InputError(f"commission: clear {self.clear}: give 0 to 1, not 0")
+            raise InputError(f"commission: clear {self.clear} must be above 0 and at most 1")
         if not 0.0 <= self.worth < 1.0:
-            raise InputError(f"commission: worth {self.worth}: give a share from 0 to below 1")
+            raise InputError(
+                f"commission: worth {self.worth}: must be a fraction from 0 to below 1"
+            )
         if self.shots < 1:
-            raise InputError(f"commission: {self.shots} photographs of a mirror; give 1 or more")
+            raise InputError(
+                f"commission: {self.shots} photographs per heliostat; must be 1 or more"
+            )
 
     @property
     def alone(self) -> float:
@@ -215,8 +219,8 @@ class CommissionPlan:
         share = {name: value / total for name, value in self.seconds.items()} if total else {}
         if self.terms.floor > self.terms.goal:
             return (
-                f"what a visit does not repeat: {1e3 * self.terms.floor:.2f} mrad stay "
-                "however often a mirror is measured"
+                f"error that visits do not repeat: {1e3 * self.terms.floor:.2f} mrad stay however "
+                "often a mirror is measured"
             )
         if share.get("idle", 0.0) > 1.0 - _BUSY:
             return (
@@ -283,7 +287,7 @@ def plan_commission(
     because the running schedule avoids them and visits an obstructed heliostat an hour later.
     """
     if not fleets or not sum(len(f) for f in fleets) or not targets:
-        raise InputError("commission: give heliostats and at least one target")
+        raise InputError("commission: specify heliostats and at least one target")
     chosen = terms or CommissionTerms()
     days, cells = _cells(site, start, stop, chosen)
     work = _Commissioning(fleets, targets, chosen, np.asarray(size, dtype=np.float64), measured)
@@ -317,13 +321,13 @@ def _cells(
 ) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
     """Days of sun, and their intervals, each (begin, end)."""
     if not (np.isfinite([start, stop]).all() and 0.0 < stop - start <= 366.0 * 86400.0):
-        raise InputError(f"commission: {start} to {stop} s; give a span of up to a year")
+        raise InputError(f"commission: {start} to {stop} s; the period must be at most a year")
     edges = np.append(np.arange(start, stop, 60.0), stop)
     up = solar.position(edges, site).elevation >= terms.limits.min_elevation
     if not (up[:-1] & up[1:]).any():
         raise InputError(
-            f"commission: the sun never reaches {np.degrees(terms.limits.min_elevation):g}° in the "
-            "span; choose other days or lower the least elevation"
+            f"commission: the sun never reaches {np.degrees(terms.limits.min_elevation):g}° in "
+            "this period; choose other days or lower the minimum elevation"
         )
     runs = np.split(np.arange(len(edges)), np.flatnonzero(np.diff(up.astype(np.int8))) + 1)
     days = [(float(edges[r[0]]), float(edges[r[-1]])) for r in runs if up[r[0]] and len(r) > 1]

@@ -32,7 +32,7 @@ def build_aims(table: AimsTable | None, folder: Path) -> AimSettings:
     if table is None:
         return AimSettings()
     if table.limit_kw_m2 is not None and table.limit_map:
-        raise InputError("aims: limit_kw_m2 and limit_map; give one of them")
+        raise InputError("aims: both limit_kw_m2 and limit_map are set; keep one")
     limit = None
     if table.limit_kw_m2 is not None:
         limit = FluxLimit(1e3 * table.limit_kw_m2, table.margin)

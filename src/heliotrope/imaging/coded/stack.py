@@ -47,7 +47,9 @@ class Stack:
     def __post_init__(self) -> None:
         shape = self.values.shape
         if len(shape) != 3 or min(shape) < 2:
-            raise InputError(f"stack: values of shape {shape}; give (photographs, rows, columns)")
+            raise InputError(
+                f"stack: values of shape {shape}; expected (photographs, rows, columns)"
+            )
         for name, array, expected in (
             ("seen", self.seen, shape[1:]),
             ("empty", self.empty, shape[1:]),
@@ -55,7 +57,7 @@ class Stack:
             ("first", self.first, (2,)),
         ):
             if array is not None and np.shape(array) != expected:
-                raise InputError(f"stack: {name} has shape {np.shape(array)}; give {expected}")
+                raise InputError(f"stack: {name} has shape {np.shape(array)}; expected {expected}")
         if not (np.isfinite(self.step) and self.step > 0.0):
             raise InputError(f"stack: step {self.step} m must be above 0")
         if not np.isfinite(self.values[:, self.seen]).all():

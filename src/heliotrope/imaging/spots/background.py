@@ -121,8 +121,8 @@ def from_difference(picture: Rectified, without: Rectified) -> Background:
     """
     if without.shape != picture.shape or not np.allclose(without.first, picture.first):
         raise InputError(
-            f"the empty frame shows another face ({without.shape} px) than the frame with the "
-            f"beam ({picture.shape} px); give two frames of the same target"
+            f"the empty frame shows a target area of {without.shape} px, the frame with the beam "
+            f"one of {picture.shape} px; use two frames of the same target"
         )
     return _fit(picture, without.values, (1, 1), "difference")
 
@@ -247,7 +247,7 @@ class EmptyTarget:
         if self.targets and set(self.targets) != set(names):
             raise InputError(
                 f"the model is of {', '.join(self.targets)}, the frame shows {', '.join(names)}; "
-                "give the model of this target"
+                "use the model of this target"
             )
         if picture.shape != self.reflectance.shape:
             raise InputError(
@@ -304,7 +304,7 @@ def of_face(
         method = "difference" if empty is not None else "model" if ready else "frame"
     if method == "difference":
         if empty is None:
-            raise InputError("background by difference needs a frame without the beam; give one")
+            raise InputError("background by difference needs a frame without the beam; pass one")
         return from_difference(picture, empty)
     if method == "model":
         if model is None:

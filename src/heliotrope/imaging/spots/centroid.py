@@ -107,7 +107,8 @@ def with_centroid(
     if moved.target is None or moved.target.name != target.name:
         raise InputError(
             f"own centroid: place {plane.tolist()} m is not on target {target.name}, "
-            f"{target.width:.4g} × {target.height:.4g} m; give metres right of and above its centre"
+            f"{target.width:.4g} × {target.height:.4g} m; return metres right of and above its "
+            "centre"
         )
     return replace(moved, flux=placed.flux)
 
@@ -116,15 +117,15 @@ def _checked(result: object, target: Target) -> tuple[FloatArray, FloatArray]:
     """Return place and covariance as arrays."""
     if not (isinstance(result, tuple | list) and len(result) == 2):
         raise InputError(
-            f"own centroid: it gave {kind_of(result)} for target {target.name}; return a place "
-            "(2,) in metres and its covariance (2, 2) in m²"
+            f"own centroid: it returned {kind_of(result)} for target {target.name}; return a "
+            "place (2,) in metres and its covariance (2, 2) in m²"
         )
     try:
         plane, covariance = as_float(result[0]), as_float(result[1])
     except (TypeError, ValueError):
         raise InputError(
-            f"own centroid: place or covariance on target {target.name} is no array of numbers; "
-            "return a place (2,) in metres and its covariance (2, 2) in m²"
+            f"own centroid: place or covariance on target {target.name} is not an array of "
+            "numbers; return a place (2,) in metres and its covariance (2, 2) in m²"
         ) from None
     if plane.shape != (2,) or not np.isfinite(plane).all():
         raise InputError(

@@ -123,8 +123,8 @@ def _check_seen(camera: Camera, target: Target) -> None:
     front = (camera.position - target.center) @ target.normal
     if front <= 0.0 or not np.isfinite(pixels).all():
         raise InputError(
-            f"camera {camera.name}: it does not see the front of target {target.name}; place it "
-            "in front of the target, facing it"
+            f"camera {camera.name}: it cannot see the front of target {target.name}; place it in "
+            "front of the target, facing it"
         )
 
 

@@ -385,11 +385,9 @@ class Search:
         per_metre = np.sqrt(np.abs(np.linalg.det(scale)))
         limit = MISFIT * self.extent * float(per_metre.mean()) + MISFIT_PIXELS
         if not view.residual <= limit:
-            return (
-                f"its marks do not fit together: {view.residual:.1f} px RMS, limit {limit:.1f} px"
-            )
+            return f"its marks are inconsistent: {view.residual:.1f} px RMS, limit {limit:.1f} px"
         if self._impossible(view):
-            return "no camera can see a plane with its marks in these places"
+            return "no camera position explains these mark positions"
         return self._misshapen(used, observed, known) or self._dark(view, used, observed)
 
     def _points_of(self, used: list[int]) -> int:
@@ -430,14 +428,14 @@ class Search:
         size = 0.5 * float(np.trace(middle))
         if abs(size) > WRONG_SIZE:
             return (
-                f"its marks appear {1.0 + size:.2f} times as large as they should be: another "
-                "target, or wrong sizes of the marks"
+                f"its marks appear {1.0 + size:.2f} times as large as they should be: a different "
+                "target, or wrong mark sizes"
             )
         common = float(np.abs(middle - size * np.eye(2)).max())
         if len(drawn) >= FEWEST and common > ASKEW:
             return (
-                f"its marks are all stretched or skewed by {common:.0%}: another target, or wrong "
-                "places of the marks"
+                f"its marks are all stretched or skewed by {common:.0%}: a different target, or "
+                "wrong mark positions"
             )
         unlike = np.abs(shapes - size * np.eye(2)).max(axis=(1, 2))
         explained = min(
@@ -445,9 +443,12 @@ class Search:
         )
         few = len(used) <= ALONE and not known
         if float(np.median(unlike)) > ALIKE or (few and float(unlike.max()) > ALIKE_EACH):
-            return f"shapes that lie like its marks differ from them by up to {unlike.max():.0%}"
+            return f"shapes arranged like its marks differ from them by up to {unlike.max():.0%}"
         if few and explained < EXPLAINED_EACH:
-            return f"other shapes lie where its marks should: one is explained to {explained:.0%}"
+            return (
+                "there are other shapes where its marks should be: one is explained only to "
+                f"{explained:.0%}"
+            )
         return ""
 
     def _dark(self, view: FaceView, used: list[int], observed: _Observed) -> str:
@@ -521,7 +522,7 @@ class Search:
                 reasons[target.name] = f"all marks seen lie on one side of it: {names}"
             elif not deviation <= limit:
                 reasons[target.name] = (
-                    f"the marks seen determine its place only to {deviation:.3f} m; "
+                    f"the visible marks determine its position only to {deviation:.3f} m; "
                     f"{limit:.3f} m is needed"
                 )
         return reasons

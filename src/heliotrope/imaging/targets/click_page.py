@@ -125,14 +125,14 @@ class _Handler(BaseHTTPRequestHandler):
     def _read(self) -> dict[str, Pixel]:
         length = self.headers.get("Content-Length", "")
         if not length.isascii() or not length.isdigit() or int(length) > _LONGEST:
-            raise InputError(f"the answer's length {length!r} is not a number up to {_LONGEST}")
+            raise InputError(f"the reply's length {length!r} is not a number up to {_LONGEST}")
         try:
             document = json.loads(self.rfile.read(int(length)))
         except ValueError:
-            raise InputError("the answer is not JSON") from None
+            raise InputError("the reply is not JSON") from None
         points = document.get("points") if isinstance(document, dict) else None
         if not isinstance(points, dict):
-            raise InputError('the answer has no "points"')
+            raise InputError('the reply has no "points"')
         return {name: self._point(name, value) for name, value in points.items()}
 
     def _point(self, name: str, value: object) -> Pixel:
@@ -144,7 +144,7 @@ class _Handler(BaseHTTPRequestHandler):
             and len(value) == 2
             and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
         ):
-            raise InputError(f"point {name}: give two numbers, pixels right and down")
+            raise InputError(f"point {name}: enter two numbers, pixels right and down")
         x, y = (float(v) for v in value)
         # NaN fails too.
         if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
@@ -208,7 +208,7 @@ def ask(
             server.shutdown()
             thread.join()
     if state.answer is None:
-        raise InputError(f"{title}: cancelled in the browser; nothing is written")
+        raise InputError(f"{title}: cancelled in the browser; nothing was written")
     return state.answer
 
 
@@ -306,7 +306,7 @@ _HTML = r"""<!doctype html>
     <button id="cancel">Cancel</button><button id="done">Done</button>
   </div>
   <div id="said" role="status"></div>
-  <small>Wheel: closer. Drag: move. Space: put the point in the middle. Arrows: nudge the last point
+  <small>Wheel: zoom. Drag: move. Space: put the point in the centre. Arrows: nudge the last point
   by a quarter of a pixel, with Shift by 4, with Ctrl by 40. S: skip, Backspace: undo,
   Enter: done.</small>
 </aside>
@@ -336,10 +336,10 @@ const send = async (place, body) => {
     if (!reply.ok) { byId("said").textContent = text; return; }
     close();
     document.querySelector("aside").textContent =
-      place === "cancel" ? "Cancelled; nothing is written. This page can be closed."
-        : "Thank you. The command goes on; this page can be closed.";
+      place === "cancel" ? "Cancelled; nothing was written. This page can be closed."
+        : "Thank you. The command continues; this page can be closed.";
   } catch (error) {
-    byId("said").textContent = "The command no longer listens; start it again.";
+    byId("said").textContent = "The command is no longer running; start it again.";
   }
 };
 const done = () => {

@@ -291,7 +291,7 @@ class _Face:
                 missing = len(search.within(view.to_pixels(plane - shift))) - len(attempt.used)
                 if missing <= unseen + 1:
                     names = f"{targets[a].name} or {targets[b].name}"
-                    return f"this may be {names}; name the targets that the camera sees"
+                    return f"this may be {names}; specify which targets the camera sees"
         return ""
 
     def _settled(self, attempt: Attempt, view: FaceView) -> Attempt:
@@ -368,9 +368,10 @@ class _Face:
         )
         if turn:
             text = (
-                f"the frame is {turn} against the pose of camera {camera.name}; undo that in the "
-                "camera or in what stores its frames (if the camera itself was turned: delete its "
-                "position_m and rotation from the plant file and calibrate it again)"
+                f"the frame is {turn} against the pose of camera {camera.name}; correct this in "
+                "the camera or in the program that stores its frames (if the camera itself was "
+                "rotated: delete its position_m and rotation from the plant file and calibrate "
+                "it again)"
             )
             self.best = replace(self.best, view=None, text=text)
 
@@ -536,7 +537,7 @@ def _one_place_each(searches: Sequence[_Face]) -> None:
             lost = [f"the frame shows {name} there" for name in reversed(names)]
             if abs(clear) < _CLEARER:
                 lost = [
-                    f"the frame may show {name} there; name the targets that the camera sees"
+                    f"the frame may show {name} there; specify which targets the camera sees"
                     for name in reversed(names)
                 ]
             if clear < _CLEARER:

@@ -261,7 +261,9 @@ def posed_view(camera: Camera, target: Target) -> FaceView:
     plane = low + plane * (high - low)
     pixels = project(camera, face.point(plane))
     if not np.isfinite(pixels).all():
-        raise InputError(f"camera {camera.name}: {target.name} is not in front of it; turn it")
+        raise InputError(
+            f"camera {camera.name}: {target.name} is not in front of it; turn the camera"
+        )
     turned = max(camera.deviation, _TURNED) ** 2 * np.tile(np.eye(2), (len(plane), len(plane)))
     return fit_view(
         face, plane, pixels, turned + _FITTED**2 * np.eye(2 * len(plane)), camera, lens_known=True
