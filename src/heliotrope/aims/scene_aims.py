@@ -30,7 +30,7 @@ ROUNDS, BELOW = 16, 5e-4
 FREE = 3
 #: From then on the remaining excess times this factor is subtracted from the limit.
 BEYOND = 1.5
-#: Least share of the limit left to the next choice after errors; excess that counts as zero.
+#: Minimum share of the limit left to the next choice after errors; excess that counts as zero.
 LEAST, HOLDS = 0.02, 1e-3
 #: Sweeps of every choice after the first.
 AGAIN = 2

@@ -128,7 +128,7 @@ def _xmp(file: Path, packet: bytes | str) -> dict[str, str]:
 
 
 def _time(values: dict[str, str], tags: dict[int, object]) -> datetime | None:
-    """Return the time of exposure in UTC, from the most exact statement."""
+    """Return the time of exposure in UTC, from the most precise entry."""
     taken = str(tags.get(_TAKEN, "")).replace(":", "-", 2)
     part = str(tags.get(_SUBSECOND, "")).strip()
     taken += f".{part}" if taken and part.isdigit() else ""

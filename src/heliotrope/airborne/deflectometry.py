@@ -63,8 +63,8 @@ def read_deflectometry(path: str | Path, shape: MirrorShape) -> FloatArray:
     Raises
     ------
     FormatError
-        If it cannot be read, is for another number of facets, has points beside its facets or
-        normals that look backwards, or as `heliotrope.airborne.slopes.read_slopes`.
+        If the file cannot be read, has a different number of facets, points beside its facets or
+        normals that point backwards, or fails a check of `heliotrope.airborne.slopes.read_slopes`.
     """
     import h5py
 
@@ -125,7 +125,7 @@ def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, Float
 def _gridded(
     file: Path, shape: MirrorShape, k: int, points: FloatArray, normals: FloatArray, cells: int
 ) -> FloatArray:
-    """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2); NaN without any."""
+    """Return the mean deviation per cell of facet ``k``, (cells, cells, 2); NaN if empty."""
     own, half = normals @ shape.axes[k].T, shape.half_size[k]
     uv = ((points - shape.center[k]) @ shape.axes[k].T)[:, :2]
     inside = (np.abs(uv) <= half).all(axis=-1)

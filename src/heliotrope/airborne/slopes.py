@@ -53,7 +53,7 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
 
 
 def checked_slopes(file: Path, slope: FloatArray, facets: int) -> FloatArray:
-    """Return a slope map whose holes are filled; errors as `read_slopes`."""
+    """Fill the holes of a slope map; raises the errors of `read_slopes`."""
     if slope.ndim != 4 or slope.shape[3] != 2 or not slope.size:
         raise FormatError(file, f"slopes of shape {slope.shape}; they must be (F, H, W, 2)")
     if len(slope) != facets:
@@ -120,7 +120,7 @@ def smooth_slopes(
     length
         Correlation length of the slopes, m: that of a Gaussian filter of the heights.
     cells
-        Along each edge of a facet.
+        Number of cells along each edge of a facet.
 
     Raises
     ------

@@ -44,7 +44,7 @@ Origin = tuple[float, float, float]
 
 #: With fewer photographs, a further process costs more than it gains.
 FEWEST_FOR_PROCESSES = 8
-#: Greatest angular speed of the sun, rad/s.
+#: Maximum angular speed of the sun, rad/s.
 _SUN_RATE = 7.292e-5
 #: Standard deviation of a beam caused by atmosphere and heliostat, rad. A single photograph cannot
 #: show it, but repeated sightings do.
@@ -86,7 +86,7 @@ class Job:
 
     @property
     def trust(self) -> str:
-        """What no frame can reveal, in one line: whether it is rotated or mirrored; else empty."""
+        """Warn, in one line, if frames cannot show whether they are mirrored; else empty."""
         if self.crop:
             cause = "a crop shows one target without its surroundings"
         elif self.camera is not None and self.camera.position is not None:

@@ -91,7 +91,7 @@ _ROUNDING = 1.0 / math.sqrt(12.0)  # standard deviation of a value rounded to wh
 
 @dataclass(frozen=True)
 class _Container:
-    """A file that Pillow opened; ``texts`` and ``changed`` are those of a PNG."""
+    """A file opened by Pillow; ``texts`` and ``changed`` are text and time chunks of a PNG."""
 
     kind: str
     image: ImageFile.ImageFile
@@ -205,7 +205,7 @@ def _natural(path: Path) -> tuple[list[tuple[int, str, int]], str]:
 
 
 def _content(file: Path, limit: int) -> tuple[bytes, float]:
-    """Return the bytes of a file of plausible size, and its modification time."""
+    """Return the bytes of a file, if its size is plausible, and its modification time."""
     most = 8 * limit + 2**24  # four channels of 16 bit, and room for metadata
     try:
         state = file.stat()
@@ -272,7 +272,7 @@ def _opener(file: Path, data: bytes) -> tuple[str, Callable[[io.BytesIO], ImageF
 
 
 def _damaged(file: Path, kind: str, size: int, error: Exception) -> FormatError:
-    """Return the refusal of a file that Pillow cannot read."""
+    """Return the error for a file that Pillow cannot read."""
     if isinstance(error, FormatError):
         return error
     reason = " ".join(str(error).split()) or type(error).__name__
@@ -297,7 +297,7 @@ def _check_size(file: Path, width: int, height: int, limit: int) -> None:
 
 
 def _png(image: ImageFile.ImageFile, data: bytes) -> _Container:
-    """Check all checksums; keep the chunks that say when and how the image was taken."""
+    """Verify all checksums, and keep the chunks that say when and how the image was taken."""
     image.verify()
     exif: Mapping[int, Any] = {}
     texts: dict[str, str] = {}
@@ -318,7 +318,7 @@ def _png(image: ImageFile.ImageFile, data: bytes) -> _Container:
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
-    """Yield type, content and whole of each chunk of a PNG."""
+    """Yield each chunk of a PNG: its type, its content, and all of its bytes."""
     position = 8
     while position + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)
@@ -412,7 +412,7 @@ def _is_deep_colour(container: _Container) -> bool:
 
 
 def _eight_bit(image: ImageFile.ImageFile) -> Pixels:
-    """Return the pixels that Pillow decodes: 8 bits, or grey of 16."""
+    """Return the pixels decoded by Pillow: 8 bits, or 16-bit grey."""
     import cv2
 
     image.load()
@@ -428,7 +428,7 @@ def _eight_bit(image: ImageFile.ImageFile) -> Pixels:
 
 
 def _deep_colour(file: Path, container: _Container) -> Pixels:
-    """Return colour of 16 bits, blue-green-red, by OpenCV."""
+    """Decode 16-bit colour with OpenCV, as blue-green-red."""
     import cv2
 
     data = container.data
@@ -444,7 +444,7 @@ def _deep_colour(file: Path, container: _Container) -> Pixels:
 
 
 def _turned_back(pixels: Pixels, orientation: int) -> Pixels:
-    """Return the rows and columns of the sensor, of pixels turned by an EXIF orientation."""
+    """Undo an EXIF orientation: return pixels in the rows and columns of the sensor."""
     back: dict[int, Callable[[Any], Any]] = {
         2: lambda p: p[:, ::-1],
         3: lambda p: p[::-1, ::-1],
@@ -460,10 +460,10 @@ def _turned_back(pixels: Pixels, orientation: int) -> Pixels:
 def _is_torn(pixels: Pixels, data: bytes) -> bool:
     """Return whether the scan of a JPEG ends before its picture does.
 
-    libjpeg then fills the rest with one value, and its warning does not reach Pillow's callers.
-    If a scene truly has only one value, as at night, every block is coded in the same bits, so the
-    scan ends in repeating bits. This does not hold with restart markers (DRI) or progressive scans
-    (SOF2), which are not judged.
+    libjpeg then fills the rest with one value, and its warning does not reach Pillow's callers. A
+    scene that really has one value throughout, as at night, codes every block with the same bits,
+    so its scan ends in repeating bits. With restart markers (DRI) or progressive scans (SOF2) this
+    does not hold, so they are not checked.
     """
     last = pixels[-8:, -128:]
     header = data[: data.find(b"\xff\xda")]
@@ -495,7 +495,7 @@ def _time(file: Path, container: _Container, zone: tzinfo | None) -> tuple[datet
 
 
 def _exif(get: Callable[[], Image.Exif]) -> Mapping[int, Any]:
-    """Return EXIF's tags together with those of the image; none if they are damaged."""
+    """Return the EXIF tags together with those of the image; none if they are damaged."""
     try:
         exif = get()
         return dict(exif) | exif.get_ifd(0x8769)
@@ -533,7 +533,7 @@ def _name_time(name: str, zone: tzinfo | None) -> tuple[datetime | None, float]:
 def _stated(
     numbers: tuple[str, ...], fraction: str, offset: str, zone: tzinfo | None
 ) -> tuple[datetime | None, float]:
-    """Return a time and the unit of its last digit, s; None without a zone."""
+    """Return a time and the unit of its last digit, s; None if there is no time zone."""
     match = re.fullmatch(r"([+-])(\d\d)[:-]?(\d\d)", offset)
     if match:
         minutes = 60 * int(match[2]) + int(match[3])
@@ -553,7 +553,7 @@ def _stated(
 
 
 def _text_time(text: str) -> tuple[datetime | None, float]:
-    """Read PNG's recommended form (RFC 1123), or ISO 8601."""
+    """Read a time in the form that PNG recommends (RFC 1123), or in ISO 8601."""
     time = None
     with suppress(ValueError, TypeError):
         time = datetime.fromisoformat(text)
@@ -645,7 +645,7 @@ def encode_image(
 
 
 def _with_texts(data: bytes, frame: Frame) -> bytes:
-    """Return a PNG with the facts about a frame in text chunks after its header."""
+    """Return a PNG with the frame's metadata in text chunks after the header."""
     texts = {}
     if frame.time is not None:
         texts["Creation Time"] = frame.time.isoformat()

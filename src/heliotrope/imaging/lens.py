@@ -23,7 +23,7 @@ MODELS: dict[str, tuple[int, ...]] = {
 }  # fmt: skip
 #: Boards whose normals differ by less than this count as one tilt, rad.
 SAME_TILT = np.radians(3.0)
-#: Greatest relative uncertainty of a focal length.
+#: Maximum relative uncertainty of a focal length.
 FOCAL_LIMIT = 0.1
 
 
@@ -277,7 +277,7 @@ def _without_outliers(
 
 
 def _check_lens(lens: Lens, normals: FloatArray) -> None:
-    """Reject a lens that the boards do not determine."""
+    """Raise an error if the boards do not determine the lens."""
     f, sigma = lens.matrix[0, 0], lens.sigma[0]
     if sigma > FOCAL_LIMIT * f or sigma == 0.0:
         raise InputError(_FRONTAL.format(f"the focal length of {f:.0f} px ± {sigma:.0f} px"))
@@ -292,7 +292,7 @@ def _check_lens(lens: Lens, normals: FloatArray) -> None:
 
 
 def _coverage(size: tuple[int, int], outlines: Sequence[FloatArray]) -> float:
-    """Return the share of the frame that quadrilaterals (4, 2) cover."""
+    """Return the fraction of the frame covered by quadrilaterals (4, 2)."""
     scale = 256.0 / max(size)
     rows, columns = (int(np.ceil(n * scale)) for n in reversed(size))
     return float(coverage([outline * scale for outline in outlines], (rows, columns)).mean())

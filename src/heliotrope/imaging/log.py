@@ -1,4 +1,4 @@
-"""Facts about a photograph other than its pixels: heliostat, motors, target, time or sun vector."""
+"""Metadata of photographs: heliostat, motor counts, target, time or sun vector."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _MOTORS, _ANGLES = COLUMNS[5:7], COLUMNS[7:9]
 
 @dataclass(frozen=True)
 class Entry:
-    """Facts about one photograph.
+    """Metadata of one photograph.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Log:
 
 
 def _short(path: Path) -> tuple[str, str]:
-    """Return the shorter names under which a log may list a photograph."""
+    """Return the shortened names under which a log may list a photograph."""
     return path.stem, _number(path)
 
 

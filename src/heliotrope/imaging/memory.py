@@ -87,7 +87,7 @@ class Memory:
             model.save(place / f"{name}.npz")
 
 
-#: Least beam-free share of a face's paint for learning.
+#: Minimum beam-free share of a face's paint for learning.
 _LEAST_FREE = 0.3
 
 

@@ -137,7 +137,7 @@ DEFAULT = MotionSettings()
 
 @dataclass(frozen=True)
 class _View:
-    """A frame prepared for comparison: grey, of full scale 1, reduced by ``factor``."""
+    """A frame prepared for comparison: grey, with full scale 1, reduced by ``factor``."""
 
     image: _Image
     cells: _Image  # float64, means of cells of it
@@ -268,7 +268,7 @@ def _expected(first: _View, second: _View) -> tuple[_Image, float]:
 
 
 def _fitted(design: _Image, b: _Image, start: float, step: float) -> tuple[_Image, float]:
-    """Return the parameters of a robust fit, and the deviation of its residuals."""
+    """Return the parameters of a robust fit, and the standard deviation of its residuals."""
     p = np.zeros(design.shape[1])
     p[0] = start
     scale = step
@@ -323,7 +323,7 @@ def _refine(a: _Image, b: _Image, start: _Pair) -> tuple[int, _Pair] | None:
 
 
 def _moved(image: _Image, x: float, y: float) -> _Image:
-    """Return the image x pixels further right and y further down."""
+    """Return the image shifted by x pixels to the right and y pixels down."""
     import cv2
 
     if x == 0.0 and y == 0.0:
@@ -346,7 +346,7 @@ def _moved(image: _Image, x: float, y: float) -> _Image:
 
 
 def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
-    """Return how many tiles agree on a small shift, and the shift, pixels."""
+    """Return the number of tiles that agree on a small shift, and the shift, pixels."""
     import cv2
 
     # The noise of the gradient of the mean is independent of that of the difference.
@@ -442,7 +442,7 @@ def _exposed(view: _View, which: str) -> str:
 def _difference(
     first: _View, second: _View, expected: _Image, shift: _Pair, ratio: float
 ) -> list[_Image]:
-    """Return the difference, the lesser brightness and gradient, and 1 where they are valid."""
+    """Return the difference, the smaller brightness and gradient, and the valid pixels."""
     import cv2
 
     bright = np.maximum(first.image, expected)
@@ -500,7 +500,7 @@ def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
 
 
 def _median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the medians of rows; np.median spends more time on checks."""
+    """Return the median of each row; np.median is slower because of its checks."""
     half = values.shape[-1] // 2
     return np.asarray(np.partition(values, half, axis=-1)[..., half])
 
@@ -508,7 +508,7 @@ def _median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def _significance(
     parts: list[_Image], counts: _Image, step: float, edge: float
 ) -> tuple[_Image, _Image, _Image]:
-    """Return greatest and least significance over all scales, and the difference, halved."""
+    """Return the largest and smallest significance over all scales, and half the difference."""
     import cv2
 
     area = cv2.INTER_AREA
@@ -535,7 +535,7 @@ def _significance(
 
 
 def _threshold(places: float, settings: MotionSettings) -> float:
-    """Return the significance, of either sign, that noise exceeds at the accepted rate."""
+    """Return the two-sided significance that noise exceeds at the accepted false-alarm rate."""
     from scipy.special import ndtri
 
     # Smoothing leaves about one independent position per four pixels of a scale.

@@ -160,7 +160,7 @@ class _Problem:
     free: bool
 
     def camera(self, x: FloatArray) -> Camera:
-        """Return the camera of unknowns."""
+        """Return the camera for a vector of unknowns."""
         matrix, distortion = self.lens(x)
         position = self.origin - self.turn(x).T @ self.shift(x)
         return replace(
@@ -178,7 +178,7 @@ class _Problem:
         return as_float(cv2.Rodrigues(x[:3])[0])
 
     def lens(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return matrix and distortion of unknowns."""
+        """Return lens matrix and distortion for a vector of unknowns."""
         if not self.free:
             return self.base.matrix, self.base.distortion
         f = float(np.exp(np.clip(x[6], -20.0, 20.0)))
@@ -219,7 +219,7 @@ class _Problem:
         return np.concatenate([white, (x[6:] - mean) / sigma]) if self.free else white
 
     def slopes(self, x: FloatArray) -> FloatArray:
-        """Return the derivatives of `residuals`."""
+        """Return the derivatives of `residuals` with respect to the unknowns."""
         white = np.einsum("nij,njp->nip", self.whitener, self.predict(x, self.local)[1])
         prior = np.eye(10)[6:] / self.prior[1][:, None]
         return np.concatenate([white.reshape(-1, len(x))] + [prior] * self.free)
@@ -287,7 +287,7 @@ def _starts(problem: _Problem, lens: Camera) -> list[tuple[FloatArray, FloatArra
 
 
 def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
-    """Refine all starts; return the best, with the next if it is hardly worse."""
+    """Refine all starts; return the best result, and the second if it is hardly worse."""
     from scipy.optimize import least_squares
     from scipy.special import chdtri
 
@@ -340,7 +340,7 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
 
 
 def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
-    """Return the derivative of the camera's turns and position by the unknowns."""
+    """Return the derivative of the camera's rotation and position with respect to the unknowns."""
     k, shift = cross_matrix(x[:3]), problem.shift(x)
     angle = max(float(np.linalg.norm(x[:3])), 1e-4)
     # Left Jacobian of SO(3).
@@ -358,7 +358,7 @@ def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
 
 
 def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
-    """Return the standard deviation from pixel to plane, at the points and half-way between."""
+    """Return the standard deviation of pixels' positions on the plane, at and between points."""
     axes = np.linalg.svd(problem.local)[2][:2]
     few = problem.local[:: len(problem.local) // 40 + 1]
     points = (0.5 * (few + few[:, None])).reshape(-1, 3)
@@ -370,7 +370,7 @@ def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
         ],
         axis=-1,
     ) / (2.0 * step)
-    # With the pixel fixed, the place on the plane moves against the prediction.
+    # For a fixed pixel, the position on the plane moves opposite to the prediction.
     moved = np.linalg.solve(across, problem.predict(x, points)[1])
     return float(np.sqrt(0.5 * np.einsum("nip,pq,niq->n", moved, raw, moved).mean()))
 

@@ -16,7 +16,7 @@ from heliotrope.imaging.receiver_light import ReceiverReference, ReceiverSight
 
 
 class ReceiverLightDocument(BaseModel):
-    """The whole file; levels are linear, as shares of the full scale."""
+    """The contents of the file; levels are linear, as fractions of full scale."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -43,12 +43,12 @@ class ReceiverLightDocument(BaseModel):
 
 
 def read_reference(path: str | Path) -> ReceiverReference:
-    """Return the reference of a file.
+    """Read the reference from a file.
 
     Raises
     ------
     FormatError
-        If it, or its PNG, cannot be used.
+        If the file or its PNG cannot be used.
     """
     path = Path(path)
     document = read_document(path, "receiver-light", ReceiverLightDocument, [ReceiverLightDocument])

@@ -36,7 +36,7 @@ Mask = npt.NDArray[np.bool_]
 #: Outline of the measured face, and inner and outer edge of the surroundings, as multiples of the
 #: receiver's outline about its middle.
 FACE, INNER, OUTER = 0.97, 1.15, 1.7
-#: Least pixels of the face, and of a side of the surroundings that counts; least number of sides.
+#: Minimum pixels of the face, and of a side of the surroundings that counts; least number of sides.
 LEAST_FACE, LEAST_SIDE, LEAST_SIDES = 100, 40, 2
 #: Largest share of clipped pixels in the face, and in a side that counts.
 CLIPPED_FACE, CLIPPED_SIDE = 0.0005, 0.01
@@ -45,7 +45,7 @@ CLIPPED_FACE, CLIPPED_SIDE = 0.0005, 0.01
 DIMMEST, BRIGHTEST = 0.1, 4.0
 #: Share below which the receiver is darker than daylight alone would leave it.
 DARKER = -0.05
-#: Least likeness of the surroundings to those of the reference (1: the same), and the largest
+#: Minimum likeness of the surroundings to those of the reference (1: the same), and the largest
 #: movement of the picture, as a share of the outline's diagonal.
 LIKENESS, MOVED = 0.4, 0.02
 #: Largest relative change of exposure times gain, where frames state them.
@@ -58,7 +58,7 @@ _LONGEST, _REACH = 320, 6
 _STEEP, _SMOOTH = 0.08, 1.5
 #: Largest departure of a lit photograph from the common rise, as a share of its own.
 _LINEAR = 0.1
-#: Least and largest daylight of a lit photograph, as a multiple of that of the dark one.
+#: Minimum and largest daylight of a lit photograph, as a multiple of that of the dark one.
 _ALIKE = (0.7, 1.4)
 
 
@@ -71,7 +71,7 @@ class ReceiverSight:
     camera, receiver
         Names.
     size
-        Of a frame, px.
+        Size of a frame, px.
     outline
         Corners of the receiver in the frame, in order around it, px, (N, 2).
     gamma
@@ -80,7 +80,7 @@ class ReceiverSight:
     Raises
     ------
     InputError
-        An outline that leaves the frame, is too small, or leaves no room for the surroundings.
+        If the outline leaves the frame, is too small, or leaves no room for the surroundings.
     """
 
     camera: str
@@ -164,26 +164,27 @@ class ReceiverSight:
 class ReceiverReference:
     """A camera's view of a receiver at known flux.
 
-    Levels are linear, as shares of the full scale.
+    Levels are linear, as fractions of full scale.
 
     Attributes
     ----------
     sight
         Where the camera sees it.
     bits
-        Of a value in the camera's frames, 8 or 16.
+        Bits per value in the camera's frames, 8 or 16.
     black
         Level with the lens capped.
     face
         Level of the receiver in daylight without beams, above black.
     sides
-        Levels of its surroundings then, above black, (4,); NaN where the frame does not show them.
+        Levels of its four sides of surroundings in daylight without beams, above black, (4,); NaN
+        where the frame does not show them.
     rise
         Rise of the receiver's level at nominal flux.
     surroundings
-        Receiver and surroundings then, reduced (`reduced`), uint16.
+        Receiver and surroundings in daylight without beams, reduced in size (`reduced`), uint16.
     exposure
-        Exposure times gain of the frames, s; NaN if they do not state it.
+        Exposure times gain of the frames, s; NaN if the frames do not record it.
     """
 
     sight: ReceiverSight
@@ -229,13 +230,13 @@ class ReceiverLight:
     Attributes
     ----------
     share
-        Share of the nominal flux, 0 or more; a lower bound if there is a ``doubt``. NaN if the
+        Fraction of the nominal flux, 0 or more; a lower bound if there is a ``doubt``; NaN if the
         frame cannot be measured at all.
     doubt
-        Why the flux may be higher; empty if it is not.
+        Why the flux may be higher; empty if there is no doubt.
     cells
-        Share of the nominal mean flux in each cell that was asked for, (...); NaN outside the
-        frame; None if none was.
+        Fraction of the nominal mean flux in each requested cell, (...); NaN outside the frame; None
+        if no cells were requested.
     """
 
     share: float
@@ -246,17 +247,17 @@ class ReceiverLight:
 def receiver_light(
     frame: Frame, reference: ReceiverReference, places: FloatArray | None = None
 ) -> ReceiverLight:
-    """Return the flux on a receiver in a frame; see the module's text.
+    """Measure the flux on a receiver in a frame; see the module docstring.
 
     Parameters
     ----------
     frame
-        Of the reference's camera, with the exposure of the reference.
+        Frame from the reference's camera, with the exposure of the reference.
     reference
         See `take_reference`.
     places
-        Middles of cells of which the flux is wanted too, px, (rows, columns, 2). Daylight counts as
-        even over the receiver.
+        Centres of cells whose flux is also requested, px, (rows, columns, 2). Daylight is assumed
+        uniform over the receiver.
     """
     sight = reference.sight
     if frame.size != sight.size or _bits(frame) != reference.bits:
@@ -281,7 +282,7 @@ def receiver_light(
 
 
 def _at(frame: Frame, sight: ReceiverSight, places: FloatArray) -> FloatArray:
-    """Return mean levels in cells about some places, (rows, columns, 2); NaN outside the frame."""
+    """Return mean levels in cells around centres, (rows, columns, 2); NaN outside the frame."""
     import cv2
 
     grey = _linear(frame, sight)
@@ -335,7 +336,7 @@ def _doubt(
 def _check_photographs(
     sight: ReceiverSight, capped: Frame, dark: Frame, with_beams: Sequence[tuple[Frame, float]]
 ) -> None:
-    """Refuse photographs of another size, shares that cannot be, and none with beams."""
+    """Raise InputError for a wrong size, an impossible fraction, or no photograph with beams."""
     who = f"camera {sight.camera}"
     for frame in (capped, dark, *(frame for frame, _ in with_beams)):
         if frame.size != sight.size:
@@ -368,19 +369,20 @@ def take_reference(
     sight
         Where the camera sees the receiver.
     capped
-        With the lens capped.
+        Frame with the lens capped.
     dark
-        In daylight, no beam on the receiver.
+        Frame in daylight, with no beam on the receiver.
     lit
-        Photographs with beams, soon after ``dark``, each with the share of the nominal flux; the
-        receiver must not be overexposed.
+        Photographs with beams, taken soon after ``dark``, each with its fraction of the nominal
+        flux; the receiver must not be overexposed.
     bits
-        Of a value in the camera's frames, where these are averages; None: as in ``dark``.
+        Bits per value in the camera's frames, if the frames passed are averages; None: as in
+        ``dark``.
 
     Raises
     ------
     InputError
-        Photographs that contradict each other, or of which one cannot be used.
+        If photographs contradict each other, or one of them cannot be used.
     """
     who = f"camera {sight.camera}"
     _check_photographs(sight, capped, dark, lit)
@@ -443,7 +445,7 @@ def take_reference(
 
 @dataclass(frozen=True)
 class _Levels:
-    """Mean levels in a frame, linear, as shares of the full scale."""
+    """Mean levels in a frame, linear, as fractions of full scale."""
 
     face: float
     sides: FloatArray
@@ -473,7 +475,7 @@ class _Levels:
 
 
 def _linear(frame: Frame, sight: ReceiverSight) -> Image:
-    """Return the levels of the box, linear, as shares of the full scale."""
+    """Return the levels of the box, linear, as fractions of full scale."""
     linear = Frame(frame.pixels[sight.box], frame.name).linear(sight.gamma)
     return np.asarray(linear.grey, dtype=np.float32) / np.float32(linear.full_scale)
 
@@ -504,16 +506,17 @@ def _factor(shape: tuple[int, ...]) -> int:
 def _view_change(sight: ReceiverSight, usual: Image, now: Image) -> str:
     """Return the reason why the surroundings differ from the reference; empty if they agree.
 
-    The directions of slopes are compared, weighted by the reference's slopes, so that neither the
-    strength of the light nor a veil over the picture counts.
+    Gradient directions are compared, weighted by the gradients of the reference, so that neither
+    the brightness nor a veil over the picture matters.
     """
-    # Slopes at the edge of the ring belong to the receiver, and to nothing at the box's edge.
+    # Gradients at the inner edge of the ring belong to the receiver; those at the edge of the box
+    # are artefacts.
     ring = reduced(sight.ring.astype(np.float32)) > 0.999
     inside = np.zeros_like(ring)
     inside[_REACH + 2 : -_REACH - 2, _REACH + 2 : -_REACH - 2] = True
     mine, theirs = _slopes(usual), _slopes(now)
     steep = np.where(ring & inside, np.linalg.norm(mine, axis=0), 0.0)
-    # Elsewhere noise has slopes too.
+    # Elsewhere, noise has gradients too.
     row, column = np.nonzero(steep > np.quantile(steep[ring & inside], 1.0 - _STEEP))
     mine = mine[:, row, column]
     theirs = theirs / (np.linalg.norm(theirs, axis=0) + 1e-9)
@@ -537,7 +540,7 @@ def _view_change(sight: ReceiverSight, usual: Image, now: Image) -> str:
 
 
 def _slopes(values: Image) -> FloatArray:
-    """Return the slopes of a picture to the right and down, (2, H, W)."""
+    """Return the gradients of a picture to the right and down, (2, H, W)."""
     import cv2
 
     smooth = cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH)

@@ -27,7 +27,7 @@ from heliotrope.optics.sun_shape import AUREOLE_RADIUS, PROFILES, sun_profile
 
 #: A Gaussian is drawn to this many σ; 4e-6 of a two-dimensional Gaussian lies beyond.
 _REACH = 5.0
-#: Greatest number of samples along a side of a grid.
+#: Maximum number of samples along a side of a grid.
 _LARGEST = 4096
 #: Samples of several beams must coincide on one grid to within this share of a step.
 _ALIGNED = 1e-6

@@ -119,7 +119,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
 
 
 def _cause(lines: Sequence[str]) -> str:
-    """Return the cause of a failed flight: the reason of most of its lines, with an example."""
+    """Return why a flight failed: the most frequent reason among its messages, with an example."""
     reasons = [line for line in lines if line.strip(" :")]
     if not reasons:
         return "its photographs show no reflection of the lamp"
@@ -152,7 +152,7 @@ def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[
             group += near
         group.sort()
         parts = -(-sum(flights[k].corners for k in group) // MOST_CORNERS)
-        # Deal the flights out in turn, so that each part looks from several sides.
+        # Distribute the flights in turn, so that each group has views from several sides.
         groups += [group[i::parts] for i in range(min(parts, len(group)))]
     return groups
 
@@ -190,7 +190,7 @@ def _together(flights: Sequence[FlightData], priors: Priors | None) -> FlightEva
 
 
 def _parts(flights: Sequence[FlightData], joint: FlightEvaluation) -> list[FlightEvaluation]:
-    """Return the flights of a joint evaluation, each with its own rows and photographs."""
+    """Split a joint evaluation into its flights, each with its own mirrors and photographs."""
     if len(flights) == 1:
         return [joint]
     parts, row, photo = [], 0, 0

@@ -77,9 +77,9 @@ class Identified:
 def expected_size(
     camera: LedCamera, photo: Photo, stand: MirrorPoses, gimbal: float = GIMBAL
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return the sides of mirrors as a photograph shows them, px, and which may be in it, (M,).
+    """Return the apparent sides of mirrors, px, and which of them may be in the frame, (M,).
 
-    The side is the root of the area. A mirror may be in the frame if an error of the gimbal can
+    The side is the square root of the area. A mirror may be in the frame if a gimbal error can
     bring it there.
     """
     local = (stand.corners - photo.position) @ photo.rotation
@@ -132,8 +132,8 @@ def identify(
     patches
         Centres of patches, px, (K, 2).
     far
-        Whether to search attitudes up to `FAR_GIMBAL` away where the mirrors fit badly. One that
-        fits clearly better counts.
+        Whether to search attitudes up to `FAR_GIMBAL` away if the mirrors fit badly; a clearly
+        better fit is accepted.
     """
     none = np.empty(0, dtype=np.intp)
     _, visible = expected_size(camera, photo, stand)
@@ -162,7 +162,7 @@ def _search(
     patches: FloatArray,
     about: Sequence[FloatArray],
 ) -> "list[_Tried]":
-    """Return the solutions within `GIMBAL` of some attitudes; their mirrors count in ``rows``."""
+    """Return solutions within `GIMBAL` of some attitudes, with mirrors as indices into ``rows``."""
     side, _ = expected_size(camera, photo, stand)
     directions = stand.corners[rows].mean(axis=1) - photo.position
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -185,7 +185,7 @@ def _farther(
     near: Identified,
     fit: "_Fit | None",
 ) -> Identified:
-    """Return an attitude far from the gimbal's if it fits clearly better than the near one."""
+    """Return an attitude far from the gimbal's if it fits clearly better than a near one."""
     none = np.empty(0, dtype=np.intp)
     _, visible = expected_size(camera, photo, stand, FAR_GIMBAL)
     rows = np.flatnonzero(visible)
@@ -220,7 +220,7 @@ def _farther(
 
 @dataclass(frozen=True)
 class _Tried:
-    """A solution: how closely it fits, its attitude, and pairs of a mirror and a patch.
+    """A solution: its attitude, its pairs of a mirror and a patch, and how well it fits.
 
     ``apart``: their RMS distance, in mirrors' sides.
     """
@@ -259,7 +259,7 @@ def _starts(
             ranked.append((float(votes[i, j]), total))
             votes[max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3] = 0.0
     ranked.sort(key=lambda f: -f[0])
-    # Neighbouring turns vote for the same solution: keep different ones.
+    # Neighbouring rotations vote for the same solution, so keep only distinct ones.
     apart = max(0.7 * size, 2.2 * GIMBAL / (_TURNS - 1))
     kept: list[FloatArray] = []
     for _, start in ranked:
@@ -298,21 +298,21 @@ def _refine(
 
 @dataclass(frozen=True)
 class _Fit:
-    """A solution with how well it fits.
+    """A solution and its quality of fit.
 
     Attributes
     ----------
     one
         The solution.
     merit, evidence
-        Mirrors that match closely, less those and patches left over; with and without the
-        penalty of an unusual gimbal.
+        Number of closely matching mirrors minus unmatched mirrors and patches, with and without the
+        penalty for an unusual gimbal angle.
     inside
         Mirrors that should be in the frame.
     matched
-        Share of those, and of the patches, that match: the smaller one.
+        Fraction of these mirrors, or of the patches, that match, whichever is smaller.
     left
-        Mirrors without a patch, or patches without a mirror, over the pairs: the fewer ones.
+        Unmatched mirrors or unmatched patches, whichever are fewer, divided by the number of pairs.
     apart
         RMS distance of patches from their mirrors, in mirrors' sides.
     """
@@ -331,7 +331,7 @@ class _Fit:
         return self.apart < _BAD_FIT and self.matched > _GOOD_SHARE
 
     def differs(self, other: "_Fit") -> bool:
-        """Return whether another solution gives most mirrors other names."""
+        """Return whether another solution assigns different names to most mirrors."""
         pairs = [
             set(zip(f.solution.patch.tolist(), f.solution.mirror.tolist(), strict=True))
             for f in (self, other)
@@ -412,12 +412,12 @@ def rotation_angle(a: FloatArray, b: FloatArray) -> float:
 
 
 def is_dark(picture: Picture) -> bool:
-    """Return whether nothing but lights can be seen in a picture."""
+    """Return whether only lights are visible in a picture."""
     return bool(np.median(picture[::8, ::8]) < DARK_READING)
 
 
 def expected_feet(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[FloatArray, Rows]:
-    """Return where mirrors in expected poses show the lamp, (K, 3), and their rows, (K,)."""
+    """Return where mirrors in expected poses show the lamp, (K, 3), and their indices, (K,)."""
     between = photo.position + 0.5 * (photo.led_position(camera) - photo.position)
     local = np.einsum("nji,nj->ni", stand.rotation, between - stand.vertex)
     half = 0.5 * np.ptp(stand.outline[..., :2], axis=1)

@@ -33,7 +33,7 @@ _TICK, _NUMBER = 100, 500
 
 @dataclass(frozen=True)
 class Sheets:
-    """What was written: the pictures, the table, and the number of outlines of each picture."""
+    """The files written: pictures, table, and the number of outlines in each picture."""
 
     pictures: tuple[Path, ...]
     table: Path
@@ -48,14 +48,15 @@ def write_sheets(flights: "Sequence[FlightData]", names: Sequence[str], out: Pat
     flights
         Flights whose photographs have been read.
     names
-        Names of photographs, NAME or FLIGHT/NAME; none: all in which no mirror was identified.
+        Names of photographs, NAME or FLIGHT/NAME; if empty, all in which no mirror was identified.
     out
         Folder.
 
     Raises
     ------
     InputError
-        If there is nothing to name, a photograph is unknown, or the folder has a table already.
+        If there is nothing to name, a photograph is unknown, or the folder already contains a
+        table.
     """
     table = out / "matches.csv"
     if table.exists():
@@ -111,7 +112,7 @@ def _chosen(
 
 
 def _patches(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPoses) -> Patches:
-    """Return the patches that may be mirrors: the most, if not far more than there are mirrors."""
+    """Return the largest set of patches that is not far larger than the number of mirrors."""
     side, near = expected_size(camera, photo, stand)
     if not near.any():
         return Patches(np.empty((0, 2)), np.empty(0))

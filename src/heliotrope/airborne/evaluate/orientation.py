@@ -62,12 +62,12 @@ class FacetMean:
     Attributes
     ----------
     facet, count
-        Its number, and how many points it has: without outliers, unless most of them are.
+        Facet index, and its number of points without outliers, unless most points are outliers.
     mean
         Mean of the differences, rotX and rotY, rad, (2,): its canting error relative to the mean of
         all; NaN without points.
     sigma
-        Plain standard error of the mean, rad, (2,).
+        Standard error of the mean, σ/√n, rad, (2,).
     """
 
     facet: int
@@ -383,7 +383,7 @@ def measure_field(
 
 
 def _common_scatter(orientations: Sequence[Orientation]) -> float | None:
-    """Return the typical scatter of a flight's mirrors, rad; None if too few show it."""
+    """Return the typical scatter of a flight's mirrors, rad; None if too few are well measured."""
     known = [float(np.mean(o.sigma**2)) for o in orientations if o.count >= FEWEST]
     return float(np.sqrt(np.median(known))) if len(known) >= _ENOUGH_MIRRORS else None
 
@@ -534,11 +534,11 @@ def _tilt_by_gradient(o: Orientation, xy: FloatArray, offset: FloatArray) -> Flo
 
 
 def _off_the_others(o: Orientation, f: FacetMean) -> FloatArray | None:
-    """Return a facet's mean less the median of the others' if it is beyond chance."""
+    """Return a facet's mean minus the median of the others' means, if significant."""
     others = [g for g in o.facets if g.facet != f.facet and g.count >= 3]
     if f.count < 3 or not others:
         return None
-    # The median, so that the odd facet is reported and not all the others.
+    # Use the median, so that the one deviating facet is reported and not all the others.
     away = f.mean - np.median([g.mean for g in others], axis=0)
     error = np.sqrt(f.sigma**2 + np.mean([g.sigma**2 for g in others], axis=0))
     if ((np.abs(away) > _CANTED_SIGMA * error) & (np.abs(away) > _CANTED)).any():

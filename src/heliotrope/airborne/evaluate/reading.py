@@ -271,7 +271,7 @@ def _look_along(
     stand: MirrorPoses,
     reaches: Sequence[float],
 ) -> PhotoReading:
-    """Return the reading of a picture with an attitude right to the first of ``reaches``, px."""
+    """Read a picture whose attitude is accurate to the first of ``reaches``, px."""
     turned = photo
     # Edges against the ground correct the attitude; then they are measured where they belong.
     for reach in reaches:
@@ -300,7 +300,7 @@ def _nothing_in_frame(photo: Photo) -> PhotoReading:
 
 
 def _consistent(lines: Outlines, expected: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return the corners (M, 4) that were found and are not another edge's."""
+    """Return the mask of corners (M, 4) that were found and do not belong to another edge."""
     size = np.sqrt(quad_area(expected))
     shift = np.where(lines.known[..., None], lines.corners - expected, np.nan)
     if not lines.known.any():

@@ -55,7 +55,7 @@ def read_reference(path: str | Path) -> Reference:
     Raises
     ------
     FormatError
-        If it cannot be read, a row cannot be used, or a heliostat stands there twice.
+        If the file cannot be read, a row cannot be used, or a heliostat is listed twice.
     """
     file = check_file(path, "a table of reference orientations (.csv)")
     rows = read_rows(file, "a table of reference orientations")
@@ -82,14 +82,14 @@ class Compared:
     Attributes
     ----------
     label
-        Name, with the flight's before it if there are several.
+        Name, preceded by that of the flight if there are several.
     reference
         Unit normal, ENU, (3,).
     shape
         Its surface, with the slope map if there is one.
     ideal, measured
-        By the ideal surface and by the measured one; None without a slope map, or if it could not
-        be evaluated.
+        Orientations with the ideal and with the measured surface; None without a slope map, or if
+        the evaluation failed.
     """
 
     label: str
@@ -99,7 +99,7 @@ class Compared:
     measured: Orientation | None
 
     def offset(self, surface: str) -> FloatArray:
-        """Return rotX and rotY from the reference to the result, rad, (2,); NaN without one."""
+        """Return rotX and rotY from the reference to the result, rad (2,); NaN without a result."""
         orientation: Orientation | None = getattr(self, surface)
         if orientation is None:
             return np.full(2, np.nan)

@@ -10,7 +10,7 @@ _WIDTH, _HEIGHT, _STEP = 250.0, 210.0, 320.0
 
 
 def rtk_drawing(check: RtkCheck) -> str:
-    """Return RTK less photogrammetry as SVG: a histogram of each axis, about its mean.
+    """Return RTK minus photogrammetry as SVG: a histogram for each axis, about its mean.
 
     The curve is the normal distribution of the differences' standard deviation; the title gives the
     standard deviation of RTK alone.

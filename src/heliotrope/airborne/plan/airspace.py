@@ -343,7 +343,7 @@ def path_length(points: FloatArray) -> float:
 
 
 def _polygon(corners: FloatArray, what: str) -> None:
-    """Refuse a polygon that encloses no area or whose edges cross."""
+    """Raise an error for a polygon that encloses no area or whose edges cross."""
     polygon = Polygon(corners)
     if not polygon.is_valid or polygon.area <= 0.0:
         raise InputError(

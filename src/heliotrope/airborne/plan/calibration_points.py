@@ -110,7 +110,7 @@ class CalibrationPoints:
     facing
         Poses, batch shape (K, n).
     plan
-        The choice for the mirror in the middle, with the expected errors.
+        The selection made for the central heliostat, with the expected errors.
     prospect
         What the photographs will show, (K, n).
     """
@@ -172,7 +172,7 @@ def calibration_points(
     Raises
     ------
     InputError
-        If fewer directions are possible than points are wanted.
+        If fewer directions are possible than points requested.
     """
     armature, drives = Armature(mirrors.armature.table[rows]), Drive(mirrors.drives.table[rows])
     centre = armature.origin_1.mean(axis=0)
@@ -244,7 +244,7 @@ def _free(
     rows: npt.NDArray[np.intp],
     sampling: Sampling,
 ) -> npt.NDArray[np.bool_]:
-    """Return the points that have room for a pattern around them."""
+    """Return the points with enough room for a pattern around them."""
     corners, distance = mirrors.corners[rows], sampling.distance
     middle = corners.mean(axis=2, keepdims=True)
     slope = mirrors.slopes[rows][:, :, None] - (corners - middle) / (2.0 * sampling.focal)
@@ -265,7 +265,7 @@ def _candidates(
     names: tuple[str, ...],
     sigma: FloatArray,
 ) -> CandidateSightings:
-    """Return sightings of the drone by one mirror; their "time" is the row of the direction."""
+    """Return one mirror's sightings of the drone; their "time" is the index of the direction."""
     facing = face(middle.armature, middle.drives, points[:, None])
     rows = np.flatnonzero(facing.able[:, 0])
     counts = facing.counts[rows, 0]

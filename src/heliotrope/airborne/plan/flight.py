@@ -463,7 +463,7 @@ def timeline(
 
 
 def separation(sorties: Sequence[Sortie], stations: Sequence[HoverStation], craft: Craft) -> float:
-    """Return the least distance of two drones, m, checked every second; infinite for one drone."""
+    """Return the smallest distance between drones, m, checked every second; inf for one drone."""
     drones = sorted({s.drone for s in sorties})
     if len(drones) < 2:
         return float(np.inf)

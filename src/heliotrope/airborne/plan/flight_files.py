@@ -223,7 +223,7 @@ def commands(plan: FlightPlan) -> str:
 
 
 def document(plan: FlightPlan) -> dict[str, Any]:
-    """Return the plan as plan.json holds it; names carry the units."""
+    """Return the plan as stored in plan.json; names include the units."""
     settings, air = plan.settings, plan.settings.airspace
     timing = {v.station: [np.inf, 0.0] for s in plan.sorties for v in s.visits}
     for sortie in plan.sorties:

@@ -199,10 +199,10 @@ def face(
 
     Notes
     -----
-    Lamp and camera are at the same point, so the law asks for the normal n ∥ p − m.
-    The vertex m moves with the pose. The direction to p is taken from the previous vertex, and its
-    error shrinks by (offset / distance) in each of four rounds: at 100 m and an offset of 0.5 m,
-    to less than a nanometre.
+    Lamp and camera are treated as one point, so the normal must satisfy n ∥ p − m. The vertex m
+    moves with the pose. The direction to p is taken from the previous vertex, and its error shrinks
+    by (offset / distance) in each of four rounds: at 100 m and an offset of 0.5 m, to less than a
+    nanometre.
     """
     goal = as_float(point)
     start = armature.origin_1
@@ -234,7 +234,8 @@ class Pattern:
     spacing
         Spacing between neighbours, m.
     samples
-        Expected on each facet; fewer than asked for if the least spacing does not allow more.
+        Expected number of samples per facet; fewer than requested if the minimum spacing does not
+        allow more.
     camera
         Positions of the camera, row by row back and forth, ENU metres, (H, 3).
     """
@@ -297,14 +298,14 @@ def reach(
 
 
 def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tuple[float, float]:
-    """Return the spacing of a pattern, m, and the samples that it gives on the worst facet.
+    """Return the spacing of a pattern, m, and the number of samples on the worst facet.
 
     Parameters
     ----------
     facet_area, slant
         Smallest facet, m², and distance to the drone, m, of n mirrors, (n,).
     sampling
-        Sampling asked for.
+        Requested sampling.
 
     Raises
     ------
@@ -344,7 +345,7 @@ def pattern(
     point, direction
         Point that the mirrors face, and the normal of the plane, (3,).
     sampling
-        Sampling asked for.
+        Requested sampling.
     """
     p, d = as_float(point), as_float(direction)
     low, high = reach(corners, slopes, facing_vertex, p, d, sampling)

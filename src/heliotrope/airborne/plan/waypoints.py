@@ -318,7 +318,7 @@ def _placemark(mission: Mission, k: int, template: bool) -> str:
 
 
 def _actions(mission: Mission, k: int) -> str:
-    """Return gimbal, rest and photograph; nothing where the drone only passes."""
+    """Return gimbal, hover and photograph actions; none where the drone only passes."""
     if not mission.photo[k]:
         return ""
     position = "<wpml:payloadPositionIndex>0</wpml:payloadPositionIndex>"
@@ -375,7 +375,7 @@ def qgc(mission: Mission, fence: Fence | None = None) -> str:
     mission
         The flight.
     fence
-        Airspace that the autopilot gets with the plan.
+        Airspace uploaded to the autopilot with the plan.
     """
     items: list[dict[str, Any]] = []
 

@@ -247,7 +247,8 @@ def fly(
         _photograph(f"DJI_{k + 1:04d}.JPG", time, place, as_float(focus), applied, rng)
         for k, (time, place) in enumerate(zip(times, places, strict=True))
     ]
-    # Drawn last, so that a flight without these errors is the same as before they were thought of.
+    # Drawn last, so that flights without these errors stay the same as before these errors were
+    # added.
     stand = standing(really, counts)
     if applied.kinematics > 0.0:
         off = applied.kinematics * rng.normal(0.0, 1.0, stand.vertex.shape)

@@ -1,4 +1,4 @@
-"""Beams of a stack: those expected, and those found."""
+"""Expected and found beams of a stack."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -7,7 +7,7 @@ from heliotrope.geometry import FloatArray
 
 
 class Verdict(Enum):
-    """The verdict of a stack on one heliostat."""
+    """The result of a stack for one heliostat."""
 
     PROVEN = "follows its own code at its expected place"
     STUCK = "its light does not move"

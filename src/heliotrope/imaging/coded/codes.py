@@ -1,4 +1,4 @@
-"""Codes: small movements of many heliostats that no sum of other movements can reproduce."""
+"""Codes: small, linearly independent movements of many heliostats."""
 
 import numpy as np
 import numpy.typing as npt

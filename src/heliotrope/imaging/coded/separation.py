@@ -116,11 +116,11 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
 def _tops(
     stack: Stack, pictures: FloatArray, moves: FloatArray, expected: Sequence[ExpectedBeam]
 ) -> list[Top]:
-    """Return the strongest beam that moves by each mirror's code.
+    """Return the strongest beam that follows each heliostat's code.
 
-    Of n mirrors that share a code the n strongest beams are found one after the other, each without
-    the light of those before it. Each mirror gets the one that is nearest to its place, such that
-    the sum of all distances is least.
+    For n heliostats that share a code, the n strongest beams are found one after another, each
+    after subtracting the previous ones. Beams are assigned to heliostats so that the sum of their
+    distances from the expected positions is smallest.
     """
     from scipy.optimize import linear_sum_assignment
 

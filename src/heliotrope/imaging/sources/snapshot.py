@@ -1,4 +1,4 @@
-"""A network camera that answers each HTTP request with one photograph."""
+"""A network camera that replies to each HTTP request with one photograph."""
 
 import tempfile
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from heliotrope.imaging.sources.source import Source, hide_password
 if TYPE_CHECKING:
     import httpx
 
-#: Larger answers are not photographs, bytes.
+#: Maximum size of a reply, bytes; larger replies are not photographs.
 _LARGEST = 64 * 2**20
 
 
@@ -67,7 +67,7 @@ class SnapshotSource(Source):
         Raises
         ------
         FetchError
-            If the camera does not answer, or not with an image.
+            If the camera does not reply, or does not reply with an image.
         FormatError
             If the image is broken.
         """

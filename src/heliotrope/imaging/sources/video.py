@@ -148,7 +148,7 @@ class CameraSource(Source):
 
     @abstractmethod
     def _open(self) -> Any:
-        """Return an open capture; raise FetchError or InputError if there is none to open."""
+        """Return an open capture; raise FetchError or InputError if it cannot be opened."""
 
     def _begin(self) -> None:
         capture = self._open()

@@ -221,7 +221,7 @@ def judge(
 
 
 def _of_power(spot: Spot, flux: float, limits: Limits, expectation: Expectation) -> list[Reason]:
-    """Judge the power of a spot: less than expected is a cloud, more is another beam."""
+    """Judge the power of a spot: too little suggests a cloud, too much a second beam."""
     share = flux / expectation.flux
     if not np.isfinite(share):
         share = spot.power / expectation.power

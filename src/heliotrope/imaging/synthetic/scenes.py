@@ -180,7 +180,7 @@ class Sensor:
     Attributes
     ----------
     electrons
-        At full scale and gain 1.
+        Electrons at full scale and gain 1.
     sensitivity
         Electrons per second and W/m² on white; 6000 and 1 ms fill the scale at 1667 W/m².
     exposure

@@ -22,14 +22,14 @@ from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.targets.teaching import places_of, shown_pixels
 
-#: Longest answer, bytes; a point takes a few hundred.
+#: Maximum size of a reply, bytes; a point takes a few hundred bytes.
 _LONGEST = 1 << 20
 Pixel = tuple[float, float]
 
 
 @dataclass
 class _State:
-    """The question, and the answer."""
+    """The points requested from the user, and the reply."""
 
     token: str
     nonce: str
@@ -63,7 +63,7 @@ class _Handler(BaseHTTPRequestHandler):
         return cast("_Server", self.server).port
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the base's name
-        """Keep quiet: the terminal belongs to the command."""
+        """Log nothing: the terminal belongs to the command."""
 
     def _allowed(self) -> str | None:
         """Return the path after the random word; None if the request is not for this page."""
@@ -161,7 +161,7 @@ def ask(
     fewest: int = 4,
     aspect: float = 1.0,
 ) -> dict[str, Pixel]:
-    """Return the pixels that a person clicked, by name.
+    """Return the pixels that the user clicked, by point name.
 
     Parameters
     ----------
@@ -175,17 +175,16 @@ def ask(
     title
         Title of the page.
     announce
-        Called with the page's address once it can be opened; this function waits for the
-        answer.
+        Called with the page's address once it can be opened; this function waits for the reply.
     fewest
-        Least number of points in an answer, those given included.
+        Minimum number of points in a reply, including those already known.
     aspect
         Width of the target over its height, for the page's sketch of it.
 
     Raises
     ------
     InputError
-        If the person cancels.
+        If the user cancels.
     """
     import cv2
 
@@ -219,14 +218,14 @@ def click_points(
     title: str,
     announce: Callable[[str], None],
 ) -> dict[str, Pixel]:
-    """Ask a person in a browser for the points of a target that are not given.
+    """Ask the user in a browser for the points of a target that were not specified.
 
-    ``announce`` is called with the page's address, on this machine alone.
+    ``announce`` is called with the page's address, which is reachable only from this computer.
 
     Raises
     ------
     InputError
-        If the person cancels.
+        If the user cancels.
     """
     places, aspect = places_of(target)
     asked = {name: place for name, place in places.items() if name not in known}

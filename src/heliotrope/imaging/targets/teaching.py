@@ -31,9 +31,9 @@ KINDS = ("corner", "tee", "square", "disc", "picture")
 SHARE = 0.12
 #: Sides of a taught picture, px.
 SMALLEST, LARGEST = 12, 512
-#: Greatest error of a point given by hand, px.
+#: Maximum error of a point given by hand, px.
 REACH = 12.0
-#: Least share of the variance that a drawing explains; greatest brightness over its surroundings.
+#: Minimum share of the variance that a drawing explains; greatest brightness over its surroundings.
 EXPLAINED, CONTRAST = 0.5, 0.93
 #: A picture that can be located no better than this, px, shows only an edge or nothing.
 VAGUE = 0.5
@@ -128,7 +128,7 @@ def known_points(target: Target) -> dict[str, FloatArray]:
     for name, point in target.markers.items():
         points.setdefault(name, as_float(point))
     for name, point in zip(CORNERS, target.corners, strict=True):
-        # A surveyed corner may stand under a name of its own.
+        # A surveyed corner may be listed under its own name.
         if not any(np.linalg.norm(point - other) < 1e-3 for other in points.values()):
             points.setdefault(name, point)
     return points
@@ -146,7 +146,7 @@ def places_of(target: Target) -> tuple[dict[str, Pixel], float]:
 
 
 def shown_pixels(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Return a frame as bright as possible: in a faint one points are hard to click."""
+    """Return the frame brightened: in a dark frame, points are hard to click."""
     pixels = frame.pixels.astype(np.float32)
     top = max(float(np.percentile(pixels, 99.9)), 1.0)
     return np.asarray(np.clip(pixels * (255.0 / top), 0.0, 255.0), dtype=np.uint8)
@@ -441,7 +441,7 @@ def _picture(
     offset = (np.arange(count) - count // 2) * (size / count)
     right, up = np.meshgrid(offset, -offset)
     grid = place + np.stack([right, up], axis=-1).reshape(-1, 2)
-    # The point is where the hand put it; the view gives the plane around it.
+    # The point stays where the user put it; the view defines the plane around it.
     spots = _mapped(H, grid) + taught.pixel - _mapped(H, place[None])[0]
     width, height = frame.size
     if (spots.min(axis=0) < -0.5).any() or (spots.max(axis=0) > [width - 0.5, height - 0.5]).any():
@@ -540,7 +540,7 @@ def _with_marks(plant: Plant, target: Target, marks: Sequence[Mark], camera: Cam
 
 
 def with_camera(plant: Plant, camera: Camera) -> Plant:
-    """Return the plant with a camera added, or replaced if one has its name."""
+    """Return the plant with a camera added, replacing any camera of the same name."""
     names = [c.name for c in plant.cameras]
     if camera.name not in names:
         return replace(plant, cameras=(*plant.cameras, camera))
@@ -629,7 +629,7 @@ def see_marks(
 def fit_marks(
     size: tuple[int, int], marks: SeenMarks, known: Camera | None, name: str, anew: bool
 ) -> CameraFit:
-    """Return the camera that saw marks; a known lens is kept unless ``anew``."""
+    """Return the camera fitted to its marks; a known lens is kept unless ``anew`` is set."""
     if known is None or anew:
         return calibrate_marks(size, marks.points, marks.pixels, marks.covariances, name)
     parts = marks.points, marks.pixels, marks.covariances
