@@ -135,7 +135,7 @@ def check_clock(
 
 @dataclass(frozen=True)
 class _Step:
-    """The shift of the suns that the sightings at another one ask for, and its sigma, s."""
+    """The further shift of the sun positions that shifted sightings require, and its sigma, s."""
 
     shift: float
     sigma: float
@@ -233,7 +233,7 @@ def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
 
 
 def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings:
-    """Return at most a given number of sightings per heliostat, spread over all its sightings."""
+    """Return at most a given number of sightings per heliostat, spread evenly over all of them."""
     rows, place = [], []
     for k, row in enumerate(chosen):
         mine = np.flatnonzero(suns.heliostat == row)

@@ -132,7 +132,7 @@ def judge(
 def judge_in(
     plant: Plant, sightings: Sightings, kinds: Sequence[str] = (), now: float | None = None
 ) -> Judgement:
-    """Return the judgement with everything that a plant knows; rows are those of its heliostats."""
+    """Judge sightings with all of a plant's data; heliostat indices refer to the plant."""
     return judge(
         sightings,
         mechanism=plant.nominal if len(plant.groups) == 1 else None,

@@ -169,12 +169,12 @@ class FieldFit(Value, Framed):
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def __getitem__(self, heliostat: int | str) -> "FieldFit":
-        """Return the fit of one heliostat, by name or by row, without the axis N.
+        """Return the fit of one heliostat, by name or index, without the axis N.
 
         Raises
         ------
         InputError
-            If there is no such row.
+            If there is no such index.
         UnknownNameError
             If there is no such name.
         """
@@ -363,7 +363,7 @@ def _fit(
 
 
 def _reject(result: FieldFit, mechanism: Mechanism) -> None:
-    """Reject parameters that no mechanism can have; the heliostat keeps its nominal ones."""
+    """Reject impossible parameters; the heliostat keeps its nominal parameters."""
     most = np.array([mechanism.most(name) for name in result.names])
     beyond = ~(np.abs(result.values) <= most).all(axis=1)
     result.outcome[beyond & (result.outcome != FitOutcome.FAILED)] = FitOutcome.MISFIT
@@ -379,12 +379,12 @@ def _check_options(loss: str, max_iterations: int) -> None:
 
 
 def names_of(model: str | Sequence[str], mechanism: Mechanism) -> tuple[str, ...]:
-    """Return the parameters of a model by name, or of a list of names.
+    """Return the parameter names of a model or of an explicit list.
 
     Raises
     ------
     InputError
-        If it is neither.
+        If the argument is neither a name nor a list of names.
     UnknownNameError
         If there is no such model or parameter.
     """
@@ -449,7 +449,7 @@ def _priors(
 
 
 def canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
-    """Return the rows sorted by heliostat, then in an order that does not depend on their order."""
+    """Return sighting indices by heliostat, then in an order independent of the input."""
     first = (s.counts[:, -1], s.time, s.heliostat)
     order = np.lexsort(first)
     alike = np.ones(max(len(order) - 1, 0), dtype=np.bool_)

@@ -262,7 +262,7 @@ def _places(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> list[int]:
 
 
 def _shapes(terms: Sequence[DriveTerm], nominal: Mechanism, counts: FloatArray) -> FloatArray:
-    """Return the error by each term for a coefficient of 1, (M, K)."""
+    """Return the error from each term for a coefficient of 1, (M, K)."""
     angles = nominal.drives.angles(counts)
     columns = []
     for term in terms:
@@ -286,7 +286,7 @@ def _moved(
     terms: Sequence[DriveTerm],
     values: FloatArray,
 ) -> FloatArray:
-    """Return the counts (M, D) at which mechanisms (M,) without terms stand as with them."""
+    """Return the counts (M, D) at which mechanisms (M,) have the same pose without their terms."""
     angles = mechanism.drives.angles(counts)
     for k, drive in enumerate(_places(mechanism, terms)):
         angles[:, drive] += values[:, k] * shapes[:, k]

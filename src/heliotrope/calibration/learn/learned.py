@@ -132,7 +132,7 @@ class Learned(Value, Framed):
     around
         Site of the heliostats, if known.
     misfits
-        Heliostats that their sightings do not describe, with the reason; these are not learnt.
+        Heliostats that do not fit their sightings, with the reason; these are not learnt.
     """
 
     mechanism: Mechanism
@@ -169,7 +169,7 @@ class Learned(Value, Framed):
         return heliostat
 
     def __getitem__(self, heliostat: int | str) -> "Learned":
-        """Return one heliostat of the field, by name or by row."""
+        """Return one heliostat of the field, by name or index."""
         i = self.row(heliostat)
         mine = np.flatnonzero(self.sightings.heliostat == i)
         place = np.full(len(self.sightings), -1)
@@ -190,7 +190,7 @@ class Learned(Value, Framed):
         )
 
     def doubted(self) -> "Learned":
-        """Return the same result marked as doubtful clock: no heliostat counts as learnt."""
+        """Return the result marked for a doubtful clock: no heliostat counts as learnt."""
         outcome = self.static.outcome.copy()
         outcome[np.isin(outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))] = (
             FitOutcome.CLOCK

@@ -21,7 +21,7 @@ def connect(scheduler: str) -> "Client":
     Raises
     ------
     InputError
-        If dask.distributed is not installed, or no scheduler answers there.
+        If dask.distributed is not installed, or no scheduler replies at this address.
     """
     try:
         from distributed import Client, LocalCluster
@@ -66,7 +66,7 @@ def runner(client: "Client") -> Runner:
 
 
 def disconnect(client: "Client") -> None:
-    """Leave the scheduler; stop it if `connect` started it on this machine."""
+    """Disconnect from the scheduler, and stop it if `connect` started it on this computer."""
     machines = client.cluster
     client.close()  # type: ignore[no-untyped-call]
     if machines is not None:

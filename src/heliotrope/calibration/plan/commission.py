@@ -420,7 +420,7 @@ class _Commissioning:
         self.curve.append((float(middle), float(high), float(rms)))
 
     def fill(self, begin: float, end: float, sun: FloatArray) -> None:
-        """Give the time of all targets, and of the receiver, in an interval to visits."""
+        """Fill the time of all targets, and of the receiver, in an interval with visits."""
         # Time left over from the previous interval, too short for a visit, is used now.
         unused = self._unused if begin == self._until else np.zeros_like(self._unused)
         carried = begin - unused
@@ -452,7 +452,7 @@ class _Commissioning:
         self._until = end
 
     def _use(self, j: int, span: dict[str, float]) -> None:
-        """Account for the time of a target, without that of the receiver."""
+        """Account for the time of a target; the receiver's time is excluded."""
         if j < len(self.targets):
             for name, value in span.items():
                 self.seconds[name] += value
@@ -490,14 +490,14 @@ class _Commissioning:
         return view, spread
 
     def _gains(self, view: TargetView, accuracy: float) -> FloatArray:
-        """Return the fall of each expected squared error, 0 where a visit is not worth it, rad²."""
+        """Return the decrease of each expected squared error, rad²; 0 if not worth a visit."""
         slope = view.slope * (self.sigma / accuracy)[:, None, None]
         falls = _gain.variance_gain(self.field.covariance, slope, self.field.form)
         worthy = view.able & self.counted & (falls > self.terms.worth * self.field.squares())
         return np.where(worthy, falls, 0.0)
 
     def _in_production(self, sun: FloatArray, terms: ReceiverTerms, now: float) -> _Choices:
-        """Return the visits on the receiver: those of mirrors that are known well enough."""
+        """Return the receiver visits, open to heliostats that are known well enough."""
         view, spread = self._seen_on(terms.face, sun)
         ready = self._shines & self.measured & (spread <= terms.known**2)
         ready &= now - self._shone >= terms.settings.every
@@ -528,16 +528,17 @@ class _Commissioning:
             light = terms.fitting(self.targets[j], self.size[many], slant, spread)
             if light >= terms.least:
                 return many[:light], True
-        # Those that have to go alone at first get every second visit.
+        # Heliostats whose first visit must be a single visit get every second visit.
         if self._last_joint[j] and (lost := choices.lost.first(free, 1)).size:
             return lost, False
         many = choices.known.first(free, terms.most)
         return (many, True) if len(many) >= terms.least else (alone, False)
 
     def _span(self, j: int, choices: _Choices, rows: Rows, joint: bool) -> dict[str, float]:
-        """Return the time of a visit by use, s; joint mirrors drive at once, and do not search.
+        """Return the time of a visit by use, s.
 
-        On the receiver they do not drive either.
+        In a joint visit heliostats drive simultaneously and do not search; on the receiver they do
+        not drive either.
         """
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
             return {"photographs": shining.span(len(rows), self._shining)}
@@ -550,7 +551,7 @@ class _Commissioning:
         return {"photographs": took, "travel": travel * (2.0 if own else 1.0)}
 
     def _own(self, choices: _Choices, rows: Rows) -> bool:
-        """Return whether each mirror of a joint visit has a code of its own."""
+        """Return whether each heliostat in a joint visit has its own code."""
         joint = self.terms.joint
         vague = joint is not None and (choices.spread[rows] > joint.known**2).any()
         return bool(vague or not self.measured[rows].all())
@@ -579,14 +580,14 @@ class _Commissioning:
         self.visits.append(Visit(begin, end, j, rows, joint, own, first, missed, after))
 
     def _misses(self, chance: FloatArray) -> Mask:
-        """Return the mask of beams that miss, (n,): as many as their chances say, spread evenly."""
+        """Return the mask of beams that miss, (n,): the expected number, spread evenly."""
         due = self._owed + np.cumsum(1.0 - chance)
         self._owed = float(due[-1]) % 1.0
         return np.asarray(np.diff(np.floor(due), prepend=0.0) > 0.0)
 
 
 def _descending(value: FloatArray) -> Rows:
-    """Return the rows of positive values, the largest first."""
+    """Return the indices of positive values, largest first."""
     return np.asarray(np.argsort(-value, kind="stable")[: int(np.sum(value > 0.0))])
 
 

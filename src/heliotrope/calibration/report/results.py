@@ -482,7 +482,7 @@ def _moved(
     location: FloatArray,
     source: str | Path,
 ) -> tuple[FloatArray, dict[str, tuple[str, ...]]]:
-    """Return the learned locations (N, 3), and the parameters lost in that form, by name."""
+    """Return the learnt locations (N, 3), and the parameters lost in this format, by name."""
     rows, moved = {name: i for i, name in enumerate(names)}, location.copy()
     lost: dict[str, tuple[str, ...]] = {}
     for name in heliostats:
@@ -504,7 +504,7 @@ def _moved(
 
 
 def _calibrated(plant: Plant, learned: Learned, time: float | None, what: str) -> Plant:
-    """Return the plant with what was learnt, for ``what`` to write."""
+    """Return the plant with the learnt parameters, for ``what`` to write."""
     if not learned.heliostats:
         raise InputError(
             f"{what}: learnt without heliostat names; learn from the plant, or plant[name]"
