@@ -47,7 +47,7 @@ PathImages = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """What is known of H mirrors when aims are computed.
+    """The state of H mirrors when aims are computed.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Move:
     rows
         Indices of the mirrors, (K,).
     aims
-        ENU m, (K, 3); NaN: they rest.
+        New aims, ENU m, (K, 3); NaN if the mirror is to rest.
     """
 
     rows: Rows
@@ -108,7 +108,7 @@ class Answer:
     moves
         One after the other.
     safe
-        The safe spread: aims of the plant file for as many mirrors as hold the limit, (H, 3).
+        The safe spread: aims from the plant file for as many mirrors as the limit allows, (H, 3).
     flux, above, limit
         Flux of the beams that shine now, what errors may add, and the limit less the margin, W/m²,
         (rows, columns).
@@ -134,7 +134,7 @@ class Answer:
 
     @property
     def excess(self) -> float:
-        """Greatest ratio of the flux, with its errors, to the limit, less 1."""
+        """Largest ratio of the flux, including errors, to the limit, minus 1."""
         return float(((self.flux + self.above) / self.limit).max()) - 1.0
 
     @property
@@ -338,7 +338,7 @@ class _Walk:
         return batch
 
     def _resting(self, paths: dict[int, PathImages]) -> list[int]:
-        """Return mirrors that rest, so that others may move, and come back later."""
+        """Select mirrors to rest, so that others can move; they return later."""
         if self._moved >= self._now.most:
             return []
         stuck = [row for row in paths if self._path.aimed[row] and self._path.goes[row]]
@@ -393,7 +393,7 @@ def _alike(scene: Scene, other: Scene) -> bool:
 
 
 def _safe(now: Round, room: FloatArray, light: dict[str, Any]) -> FloatArray:
-    """Return the plant file's aims of as many free mirrors as hold the limit, (H, 3)."""
+    """Return the plant file's aims for as many free mirrors as the limit allows, (H, 3)."""
     turn = (np.arange(len(now.free)) * 0.6180339887498949) % 1.0
     share = 1.0
     while share > 0.5 / len(now.free):

@@ -87,7 +87,7 @@ class SceneAims:
     defocused
         (H,).
     limit
-        Allowable flux in each cell, less the margin, W/m², (rows, columns).
+        Allowable flux in each cell minus the margin, W/m², (rows, columns).
     risk
         Uncertainty of the flux.
     light
@@ -110,7 +110,7 @@ class SceneAims:
 
     @property
     def excess(self) -> float:
-        """Greatest ratio of the quantile to the limit, less 1; 0 or less: the limit holds."""
+        """Largest ratio of the quantile to the limit, minus 1; at most 0 if the limit holds."""
         return float((self.quantile / self.limit).max()) - 1.0
 
     @cached_property

@@ -59,7 +59,7 @@ def air_loss(distance: npt.ArrayLike, model: str | float = "clear") -> FloatArra
 
 
 def air_model(model: str | float) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from distances (m) to the shares that the air takes.
+    """Return a function that maps distances (m) to the fraction lost in the atmosphere.
 
     Raises
     ------

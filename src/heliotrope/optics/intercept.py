@@ -155,7 +155,7 @@ def intercept_rectangle(
 
 
 def _within(half: FloatArray, sigma: FloatArray, center: FloatArray) -> FloatArray:
-    """Return the share of a normal distribution between −half and half."""
+    """Return the fraction of a normal distribution between −half and half."""
     from scipy import special
 
     # Mirrored to the lower tail, where the two values are small and their difference exact.

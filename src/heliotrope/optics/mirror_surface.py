@@ -44,7 +44,7 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
 
 
 def elements_of(facets: Facets, focal: float, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return places and normals (E, 3) and areas (E,) of the elements, in the mirror's frame.
+    """Return positions and normals (E, 3) and areas (E,) of the elements, in the mirror's frame.
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ def gram(
 def _decaying_gram(
     jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
 ):
-    """Like `gram` for one set of sightings, by symmetry; fills the lower half of ``decay`` (n, n, G).
+    """As `gram` for one set of sightings; fills the lower half of ``decay`` (n, n, G).
 
     Processes of one group have one time constant, so that one exponential serves them all. With
     unknown times the decay is 0.
