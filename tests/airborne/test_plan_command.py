@@ -82,7 +82,7 @@ def test_table_and_airspace_file(
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--points", "8"], "has 8 unknowns; give 9 or more"),
+        (["--points", "8"], "has 8 unknowns; use 9 points or more"),
         (["--formats", "kml"], "--formats 'kml': give some of dji,qgc,litchi, or none"),
         (["--aircraft", "M4"], "there is no aircraft 'M4'"),
         (["--elevations", "20"], "--elevations '20': use two angles from 0 to 90 degrees"),

@@ -268,7 +268,7 @@ def test_jacobian_of_candidates_against_finite_differences() -> None:
 
 def test_more_points_than_unknowns() -> None:
     PointSelection(points=9).check(NAMES, "malan8")
-    with pytest.raises(InputError, match="has 8 unknowns; give 9 or more"):
+    with pytest.raises(InputError, match="has 8 unknowns; use 9 points or more"):
         PointSelection(points=8).check(NAMES, "malan8")
 
 

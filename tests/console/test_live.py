@@ -184,7 +184,7 @@ def test_ctl_says_what_a_proof_has_measured_and_what_it_believes(
     [
         ("viewer", ("stow", "--all"), "needs operator"),
         ("wrong", ("status",), "sign in"),
-        ("operator", ("stow",), "give --all"),
+        ("operator", ("stow",), "use --all"),
         ("operator", ("aim", "receiver", "nobody"), "nobody"),
         ("operator", ("show", "nobody"), "nobody"),
     ],

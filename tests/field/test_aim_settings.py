@@ -46,7 +46,7 @@ def test_a_map_stands_beside_the_plant_file(tmp_path: Path) -> None:
         ("limit_kw_m2 = 600.0", "", "needs limit_kw_m2 or limit_map"),
         ("limit_kw_m2 = 600.0", "limit_kw_m2 = -3.0", "limit_kw_m2"),
         ("limit_kw_m2 = 600.0", 'limit_map = "none.csv"', "none.csv"),
-        ("limit_kw_m2 = 600.0", 'limit_kw_m2 = 1.0\nlimit_map = "a.csv"', "give one of them"),
+        ("limit_kw_m2 = 600.0", 'limit_kw_m2 = 1.0\nlimit_map = "a.csv"', "keep one"),
         ('strategy = "limit"', 'strategy = "spread"', 'needs strategy = "limit"'),
         ('strategy = "limit"', 'strategy = "best"', "aims.strategy"),
         ("margin = 0.1", "margin = 0.7", "a margin of 0.7"),

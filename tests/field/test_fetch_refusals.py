@@ -89,8 +89,12 @@ ITEM = "AA39/Properties/AA39-item-stac.json"
 @pytest.mark.parametrize(
     ("path", "content", "problem"),
     [
-        (CATALOGUE, b"<html>busy</html>", "the reply is not JSON; it begins '<html>busy</html>'"),
-        (CATALOGUE, b"", "the reply is not JSON; it begins ''"),
+        (
+            CATALOGUE,
+            b"<html>busy</html>",
+            "the reply is not JSON; it begins with '<html>busy</html>'",
+        ),
+        (CATALOGUE, b"", "the reply is not JSON; it begins with ''"),
         (CATALOGUE, b'{"links": [', "the reply is not JSON"),
         (CATALOGUE, b"\xff\xfe\x00", "the reply is not JSON"),
         (CATALOGUE, b"[1, 2]", "not a STAC document but a list or value"),
@@ -103,7 +107,7 @@ ITEM = "AA39/Properties/AA39-item-stac.json"
         ),
         (ITEM, b'{"links": []}', "not a STAC item: it names no files with addresses"),
         (ITEM, b'{"assets": {"a": {"href": 7}}}', "not a STAC item: it names no files"),
-        (BIG, b"<html>moved</html>", "the reply is not JSON; it begins '<html>moved</html>'"),
+        (BIG, b"<html>moved</html>", "the reply is not JSON; it begins with '<html>moved</html>'"),
     ],
 )
 def test_garbage_is_refused(
@@ -211,7 +215,7 @@ def test_places_that_cannot_be_written_to(database: Database, tmp_path: Path) ->
     (tmp_path / "file").write_text("x")
     assert "cannot be used (File exists)" in refused(database, tmp_path / "file")
     (tmp_path / "AA39").write_text("x")
-    assert "cannot be made (" in refused(database, tmp_path)
+    assert "cannot be created (" in refused(database, tmp_path)
     (tmp_path / "AA39").unlink()
     (tmp_path / (BIG + ".part")).mkdir(parents=True)
     assert "cannot be written (Is a directory)" in refused(database, tmp_path)
@@ -261,7 +265,7 @@ def test_a_bad_address_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", "../AA39", "AA 39", "AA39/x", "x" * 65])
 def test_names_of_heliostats_are_checked(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="give a name of letters and digits, such as AA39"):
+    with pytest.raises(InputError, match="use a name of letters and digits, such as AA39"):
         fetch_heliostats(name, tmp_path)
 
 

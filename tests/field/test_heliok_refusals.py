@@ -10,11 +10,11 @@ from heliotrope.field.formats import heliok
 from support.heliok_files import SCENE, SITE, edited
 
 WRONG = [
-    ('unitLength="m" ', "", "line 3: <HelioK> has no unitLength; give one"),
+    ('unitLength="m" ', "", "line 3: <HelioK> has no unitLength; add the attribute"),
     ('unitLength="m"', 'unitLength="inch"', "unitLength 'inch' is not one of m, cm, mm, km"),
     ('unitAngle="deg"', 'unitAngle="gon"', "unitAngle 'gon' is not one of rad, mrad, deg"),
     ("<HelioK ", "<HelioQ ", "not well-formed XML"),
-    ('translation="0, 0, 1.5"', "", "<Primary> has no translation; give one"),
+    ('translation="0, 0, 1.5"', "", "<Primary> has no translation; add the attribute"),
     ('translation="0, 0, 1.5"', 'translation=" "', "<Primary> has no translation"),
     ('"0, 0, 1.5"', '"0, 0"', "translation has 2 numbers; it needs 3"),
     ('"0, 0, 1.5"', '"0, 0, nan"', "<Primary> translation: 'nan' is not a finite number"),
@@ -46,7 +46,7 @@ WRONG = [
         "<Facet>",
         "<Facet> rotation: its normal stands 90° from that",
     ),
-    ('xWidth="2.4"', "", "<ApertureRectangular> has no x; give one"),
+    ('xWidth="2.4"', "", "<ApertureRectangular> has no x; add the attribute"),
     (
         '<ApertureRectangular xWidth="2.4"',
         '<ApertureDisk xWidth="2.4"',
@@ -57,7 +57,11 @@ WRONG = [
         '<HeliostatKit ref="AzIl"/>',
         "there is no HeliostatKit 'AzIl'; did you mean AzEl?",
     ),
-    ('<HeliostatKit ref="AzEl"/>', "<HeliostatKit/>", "<HeliostatKit> has no ref; give one"),
+    (
+        '<HeliostatKit ref="AzEl"/>',
+        "<HeliostatKit/>",
+        "<HeliostatKit> has no ref; add the attribute",
+    ),
     ('name="HeliostatB"', 'name="HeliostatA"', "heliostat HeliostatA: the name occurs twice"),
     ('name="HeliostatB"', "", "a heliostat node has no name; name it"),
     ('name="AzEl"', "", "<HeliostatKit> has no name; add the attribute"),

@@ -639,7 +639,7 @@ def test_receiver_visits_are_read_and_survive(tmp_path: Path) -> None:
             "receiver_visits: receiver visits: power 0.02 (largest fraction of the power",
         ),
         ("movement = 1", "receiver_visits.movement: "),
-        ("worth_mrad = 1\nworth_rad = 0.001", "worth is given twice"),
+        ("worth_mrad = 1\nworth_rad = 0.001", "worth is set twice"),
     ],
 )
 def test_receiver_visits_that_cannot_be_are_one_line(more: str, text: str, tmp_path: Path) -> None:

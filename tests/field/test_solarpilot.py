@@ -158,15 +158,15 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
         ("1.5" + ROW[1:], "'1.5' is not a template's number"),
         (
             ROW.replace("0,1,1", "0,2,1"),
-            "column 2 (Enabled): '2' is neither true nor false; give 0 or 1",
+            "column 2 (Enabled): '2' is neither true nor false; write 0 or 1",
         ),
         (
             "0,732.3,-735.8,0,NULL,NULL\n",
-            "'732.3' is neither true nor false; give 0 or 1; 6 columns begin",
+            "'732.3' is neither true nor false; write 0 or 1; with 6 columns a row begins",
         ),
         ("Template,Loc. X,Loc. Y,Loc. Z\n", "there are no heliostats"),
         (" \n,,,\n\n", "the file has no rows; it should be a table of heliostats"),
-        ("Σ" * 40, "gives no positions; give id,x,y,z (m east, north, up), id,latitude"),
+        ("Σ" * 40, "names no position columns; give id,x,y,z (m east, north, up), id,latitude"),
         ("NULL\n", "line 1: 1 columns; a layout has 14"),
         ("", "the file is empty; it should be a table of heliostats (SolarPILOT or OpenCSP)"),
     ],

@@ -353,12 +353,12 @@ def test_degrees_of_a_header_become_metres(tmp_path: Path) -> None:
             "id,x,y\n1,2,3\n",
             "line 1: the header (id, x, y) names no position columns; give id,x,y,z",
         ),
-        ("Vorlage,Länge,Höhe,z\n0,1,2,3\n", "the header (Vorlage, Länge, Höhe, z) gives no"),
-        ("id,lat,lon\n1,37.5,-5.25\n", "the header (id, lat, lon) gives no positions"),
-        ("id,x [mm],y,z\n1,2000,3,0\n", "column x [mm] is in mm; give m"),
-        ("id,x,y,z\n,[ft],[ft],[ft]\n1,2,3,0\n", "column x is in ft; give m"),
-        ("id,x_km,y_km,z\n1,2,3,0\n", "column x_km is in km; give m"),
-        ("id,lat_rad,lon,alt\n1,0.65,-5.25,100\n", "column lat_rad is in rad; give deg"),
+        ("Vorlage,Länge,Höhe,z\n0,1,2,3\n", "the header (Vorlage, Länge, Höhe, z) names no"),
+        ("id,lat,lon\n1,37.5,-5.25\n", "the header (id, lat, lon) names no position columns"),
+        ("id,x [mm],y,z\n1,2000,3,0\n", "column x [mm] is in mm; use m"),
+        ("id,x,y,z\n,[ft],[ft],[ft]\n1,2,3,0\n", "column x is in ft; use m"),
+        ("id,x_km,y_km,z\n1,2,3,0\n", "column x_km is in km; use m"),
+        ("id,lat_rad,lon,alt\n1,0.65,-5.25,100\n", "column lat_rad is in rad; use deg"),
         ("id,x,east,y,z\n1,2,3,4,0\n", "two columns hold x; keep one"),
         ("id,x,y,z,z\n1,2,3,4,0\n", "two columns hold z; keep one"),
         ("id,x,y,z\nunits,east,north,up\n1,2,3,4\n", "no number below the header"),
@@ -616,8 +616,8 @@ def test_a_layout_with_two_heliostats_at_one_place_is_refused_with_its_file(tmp_
     [
         ("id,x,y,z,units\nA,10,20,0,ft\n", "unit columns are not read; use metres"),
         ("1,10,20,0\n2,30,20,0\n", "column 1 has a different number in each row, like ids"),
-        ("id,x_mm,y_mm,z_mm\nA,10,20,0\n", "column x_mm is in mm; give m"),
-        ("id,x/m,y/km,z/m\nA,10,20,0\n", "column y/km is in km; give m"),
+        ("id,x_mm,y_mm,z_mm\nA,10,20,0\n", "column x_mm is in mm; use m"),
+        ("id,x/m,y/km,z/m\nA,10,20,0\n", "column y/km is in km; use m"),
         ("id,x,y,z\nA,10m,20m,0m\n", "'10m' is not a plain number: write metres without"),
     ],
 )
@@ -641,5 +641,5 @@ def test_an_argument_that_a_format_has_no_use_for_is_refused(tmp_path: Path) -> 
         open_plant(plant, site=SITE)
     layout = tmp_path / "layout.csv"
     layout.write_text("id,x,y,z\nA,10,20,0\n")
-    with pytest.raises(FormatError, match="centroids is given"):
+    with pytest.raises(FormatError, match="centroids is specified"):
         open_plant(layout, site=SITE, centroids=layout)

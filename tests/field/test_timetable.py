@@ -125,7 +125,7 @@ def test_a_timetable_is_written_and_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "text"),
     [
-        ('"12:00Z"', '"12:00"', "timetable[0]: timetable entry 'noon': '12:00' has no zone"),
+        ('"12:00Z"', '"12:00"', "timetable[0]: timetable entry 'noon': '12:00' has no time zone"),
         ("P0001C", "P0009C", "there is no heliostat 'P0009C'"),
         ("every_s = 3600.0", "every = 3600.0", "timetable.1.every"),
         ("every_s = 3600.0", "every_s = 1", "interval is 1 s; must be 60 to 86400 s"),
