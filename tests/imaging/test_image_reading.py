@@ -301,7 +301,7 @@ BAD: dict[str, tuple[bytes, str]] = {
     "png animated": (
         _png(0, 8, (32, 20), ROWS, _chunk(b"acTL", bytes(8))), "this PNG is animated"
     ),
-    "png transparent": (_encode(".png", CLEAR), "every pixel is transparent, so the image is blank"),
+    "png transparent": (_encode(".png", CLEAR), "every pixel is transparent, so the image"),
     "jpeg half": (JPEG[: len(JPEG) // 2], "this JPEG is truncated: it ends after 1031 bytes"),
     "jpeg start": (JPEG[:30], "this JPEG is truncated: it ends after 30 bytes"),
     "jpeg no end": (JPEG[:-2], "this JPEG is truncated"),

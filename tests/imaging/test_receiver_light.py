@@ -209,7 +209,7 @@ def auto(on: int) -> Frame:
         (frame, lambda: [(frame(4), 0.0)], "at a share of 0; give above 0 to 2"),
         (frame, lambda: [(auto(4), 0.2)], "with one fixed exposure, within a minute"),
         (frame, lambda: [(frame(4, sensor=LONG), 0.2)], "of the receiver is overexposed; use few"),
-        (frame, lambda: [(frame(4), 0.2), (frame(8), 0.7)], "check the fractions and the linearity of the response"),
+        (frame, lambda: [(frame(4), 0.2), (frame(8), 0.7)], "check the fractions and the line"),
         (frame, lambda: [(frame(0), 0.2), (frame(4), 0.2)], "check the fractions"),
         (frame, lambda: [(moved(frame(4), 30), 0.2)], "4 mirrors: the surroundings of the"),
         (frame, lambda: [(Frame(np.zeros((9, 9), np.uint16), "b.png"), 0.2)], "b.png has 9 × 9 px"),
