@@ -223,7 +223,7 @@ SIGHTINGS = [
     Wrong(lambda: row(destination_covariance=np.eye(2)), "destination_covariance", "(2, 2)", "(3, 3)"),
     Wrong(lambda: row(source_at_infinity=[True, False]), "source_at_infinity", "(2,)", "(3,)"),
     Wrong(lambda: sun_sensor(0, np.zeros((1, 2)), UP, normal_sigma=0.25), "sigma", "0.5 rad", "0.2 rad"),
-    Wrong(lambda: join([]), "join", "0 parts", "at least 1"),
+    Wrong(lambda: join([]), "join", "the list is empty", "at least 1"),
     Wrong(lambda: join([seen(), 5]), "part 1", "int", "list of Sightings"),  # type: ignore[list-item]
     Wrong(lambda: join([seen(), row(counts=np.zeros((3, 1)))]), "join", "[1, 2] drives", "one kind"),
     Wrong(lambda: ht.split(seen(), "random", 1.5), "fraction", "1.5", "between 0 and 1"),

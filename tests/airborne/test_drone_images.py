@@ -262,7 +262,7 @@ def test_without_lamp_the_campaign_says_so(case: Case) -> None:
     with pytest.raises(InputError, match="no reflection on the mirrors in 16 photographs"):
         evaluation.evaluate(case.photos, dark, case.flown.camera, case.stand, shape)
     broken = [PhotoReading(s.name, "nothing: at all") for s in case.seen]
-    with pytest.raises(InputError, match="no photograph of 16 can be used; the first: DJI_0001"):
+    with pytest.raises(InputError, match="none of 16 photographs can be used; the first: DJI_0001"):
         evaluation.evaluate(case.photos, broken, case.flown.camera, case.stand, shape)
     with pytest.raises(InputError, match="three are needed"):
         rtk.check_rtk(case.photos, broken, case.flown.camera, case.stand)

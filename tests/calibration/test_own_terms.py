@@ -124,7 +124,7 @@ def test_one_heliostat_of_a_plant_goes_by_its_name() -> None:
 @pytest.mark.parametrize(
     ("terms", "text"),
     [
-        ([], "0 given"),
+        ([], "the list is empty"),
         ([ECCENTRIC, ECCENTRIC], "term eccentric: the name occurs twice"),
         ([DriveTerm("x", "azimuth", lambda a: a[..., 0], 0.0)], "term x: prior 0.0"),
         ([DriveTerm("x", "azimuth", lambda a: a, 1e-3)], r"term x: its function returned shape \("),

@@ -440,7 +440,7 @@ SEEN = project(camera(SIDE), FACE)
         (FACE, SEEN, 0.0, "a variance is not finite and above 0"),
         (FACE, SEEN, -0.3, "a variance is not finite and above 0"),
         (FACE, SEEN, float("nan"), "a variance is not finite and above 0"),
-        (FACE, SEEN, [0.3, 0.3], r"sigma \(2,\); give one number"),
+        (FACE, SEEN, [0.3, 0.3], r"sigma \(2,\); pass one number"),
         (FACE, SEEN, np.zeros((9, 2, 2)), "a variance is not finite and above 0"),
     ],
 )

@@ -247,7 +247,7 @@ def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
     again = Keeper(tmp_path / "data", inline=True)
     again.forget_events(104.0)
     again.close()
-    assert "4 of 4 heads fit" in CliRunner().invoke(app, command).output
+    assert "4 of 4 heads match" in CliRunner().invoke(app, command).output
     shutil.copytree(tmp_path / "data", tmp_path / "later")
     again = Keeper(tmp_path / "later", inline=True)
     again.record_event(Event(400.0, "test", "later still"))
