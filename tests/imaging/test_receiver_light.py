@@ -224,7 +224,7 @@ def test_an_outline_that_cannot_be_measured() -> None:
     corners = sight().outline
     for outline, text in (
         (corners + [200.0, 0.0], "its outline leaves the frame of 320 × 240 px"),
-        (corners.mean(axis=0) + 0.05 * (corners - corners.mean(axis=0)), "px in the frame, the"),
+        (corners.mean(axis=0) + 0.05 * (corners - corners.mean(axis=0)), "px in the frame, below"),
         (corners[:2], "specify 3 corners or more"),
         ([[0, 0], [319, 0], [319, 239], [0, 239]], "0 of its four sides have a margin"),
     ):
