@@ -498,7 +498,10 @@ def test_receiver_writes_nothing_where_it_refuses(call: Any, lit: Path, tmp_path
         (("far.toml", *given, "--out", out), "position is unknown; specify --outline X,Y"),
         (("plant.toml", *given, "--out", tmp_path / "a.json"), "a reference is written as TOML"),
         (("plant.toml", *given, "--lit", "four.png", "--out", out), "write FILE=SHARE"),
-        (("plant.toml", *given, "--lit", f"{lit / 'four.png'}=0.9", "--out", out), "check the fractions"),
+        (
+            ("plant.toml", *given, "--lit", f"{lit / 'four.png'}=0.9", "--out", out),
+            "check the fractions",
+        ),
     ):
         assert text in call("receiver", lit / words[0], *words[1:], code=2)
     assert not list(tmp_path.iterdir())
