@@ -147,7 +147,9 @@ async def live_through(count: int, minutes: float, case: str) -> tuple[Seen, flo
     """Return what was seen, the limit, and the greatest flux of a cell, W/m²."""
     clock = VirtualClock(asyncio.get_running_loop().time, BEGIN)
     design, limit = design_of(count)
-    world = World(design, clock, WorldOptions(rendered=False, installed=lambda mechanism: mechanism))
+    world = World(
+        design, clock, WorldOptions(rendered=False, installed=lambda mechanism: mechanism)
+    )
     sky, seen = Sky(clock), Seen()
     # A lost cluster must not make automatic control wait for a person.
     work = AutomaticSettings(
@@ -243,4 +245,3 @@ def run(quick: bool, heliostats: int = 300, minutes: float = 50.0) -> Result:
         for row in rows
     )
     return Result(rows, headline, within_budget=None if quick else good)
-

@@ -35,7 +35,7 @@ def test_one_door_opens_every_format(name: str, first: str | None, kind: str) ->
 
 def test_a_format_without_a_place_asks_for_one() -> None:
     for name in ("solarpilot-export.csv", "opencsp-field.csv"):
-        with pytest.raises(FormatError, match="give the site"):
+        with pytest.raises(FormatError, match="specify the site"):
             ht.open(FILES / name)
 
 
@@ -131,7 +131,7 @@ def test_names_find_their_heliostats_whatever_the_order() -> None:
     assert np.median(after) < 0.2 * np.median(before)
     with pytest.raises(UnknownNameError, match="P6A"):
         ht.fit(plant["P2B"], some, "tilts")
-    with pytest.raises(InputError, match="no names; give the plant"):
+    with pytest.raises(InputError, match="no names; pass the plant"):
         ht.fit(plant.nominal, some, "tilts")
 
 

@@ -206,7 +206,7 @@ TRACKING = [
 ]  # fmt: skip
 
 SIGHTINGS = [
-    Wrong(lambda: row(heliostat=-1), "heliostat", "-1", "from 0 on"),
+    Wrong(lambda: row(heliostat=-1), "heliostat", "-1", "use integers from 0"),
     Wrong(lambda: row(heliostat=0.5), "heliostat", "0.5", "whole numbers"),
     Wrong(lambda: row(heliostat=[0, 0]), "heliostat", "(2,)", "(3,)"),
     Wrong(lambda: row(counts=np.zeros((2, 3, 2)), source=np.ones((4, 3))), "source", "(4, 3)", "(2, 3, 3)"),
@@ -223,7 +223,7 @@ SIGHTINGS = [
     Wrong(lambda: row(destination_covariance=np.eye(2)), "destination_covariance", "(2, 2)", "(3, 3)"),
     Wrong(lambda: row(source_at_infinity=[True, False]), "source_at_infinity", "(2,)", "(3,)"),
     Wrong(lambda: sun_sensor(0, np.zeros((1, 2)), UP, normal_sigma=0.25), "sigma", "0.5 rad", "0.2 rad"),
-    Wrong(lambda: join([]), "join", "0 parts", "at least 1"),
+    Wrong(lambda: join([]), "join", "the list is empty", "at least 1"),
     Wrong(lambda: join([seen(), 5]), "part 1", "int", "list of Sightings"),  # type: ignore[list-item]
     Wrong(lambda: join([seen(), row(counts=np.zeros((3, 1)))]), "join", "[1, 2] drives", "one kind"),
     Wrong(lambda: ht.split(seen(), "random", 1.5), "fraction", "1.5", "between 0 and 1"),
@@ -243,7 +243,7 @@ CALIBRATION = [
     Wrong(lambda: ht.fit(mechs(), seen(), "guo6", priors={"cant": 0.1}), "parameter", "'cant'", "canting", UnknownNameError),
     Wrong(lambda: ht.fit(mechs(), seen(), "guo6", keep=[True]), "keep", "(1,)", "(12,)"),
     Wrong(lambda: ht.fit(mechs(), seen(), "guo6", max_iterations=0), "max_iterations", "0", "at least 1"),
-    Wrong(lambda: ht.fit(mechs(), seen(), "azimuth_worm_ratio"), "fit", "azimuth_worm_ratio", "searched, not fitted"),
+    Wrong(lambda: ht.fit(mechs(), seen(), "azimuth_worm_ratio"), "fit", "azimuth_worm_ratio", "found by a search, not by a fit"),
     Wrong(lambda: ht.learn(mechs(), seen(), ("tilt_north", SINE)), "model", "a heliotrope DriveTerm", "fit_terms"),  # type: ignore[arg-type]
     Wrong(lambda: ht.learn(mechs(), seen(), "guo6", used=np.ones(3, bool)), "used", "(3,)", "(12,)"),
     Wrong(lambda: learned().parameters_at([1], 0.0), "heliostat", "row 1", "0 to 0"),
@@ -273,7 +273,7 @@ FIELD = [
     Wrong(lambda: Sphere("tower", ORIGIN, 0.0), "radius", "0.0 m", "above 0"),
     Wrong(lambda: Box("hall", ORIGIN, (1.0, 1.0)), "size", "(2,)", "3 numbers"),
     Wrong(lambda: Cylinder("mast", ORIGIN, ORIGIN, 1.0), "mast", "coincide", "two points"),
-    Wrong(lambda: flux(aim=[AIM, AIM]), "aim", "(2, 3)", "give (3,) or"),
+    Wrong(lambda: flux(aim=[AIM, AIM]), "aim", "(2, 3)", "expected (3,) or"),
     Wrong(lambda: flux(reflectivity=1.2), "reflectivity", "1.2", "from 0 to 1"),
     Wrong(lambda: flux(sun=(1.0, 0.0)), "sun", "(2,)", "3 numbers"),
     Wrong(lambda: flux(cells=(0, 24)), "cells", "0", "at least 1"),

@@ -212,12 +212,12 @@ def test_what_is_wrong_with_a_flight_does_not_stop_the_others(flown: Path, tmp_p
     assert {r["flight"] for r in told["orientations"]} == {"C1-1"}
     for words in (
         ("C1-2", "DJI_0001.JPG", "its XMP lacks GpsLatitude"),
-        ("C1-2", "DJI_0002.JPG", "unreadable: ", "it breaks off after 9000 bytes"),
+        ("C1-2", "DJI_0002.JPG", "unreadable: ", "the file ends after 9000 bytes"),
         ("C1-2", "DJI_0003.JPG", "nothing: "),
-        ("C1-2", "DJI_0004.JPG", "overexposed: 100 % of it is clipped"),
+        ("C1-2", "DJI_0004.JPG", "overexposed: 100 % of the photograph is clipped"),
         ("C1-1", "DJI_0009.JPG", "640 × 300 px, but most photographs have 640 × 480 px"),
         ("C1-7", "camera.toml", "there is no such file"),
-        ("away", "DJI_0001.JPG", "wrong_field: no mirror of the field can be in it"),
+        ("away", "DJI_0001.JPG", "wrong_field: no mirror of the field can be in view"),
         ("dark", "no reflection"),
         ("other", "there is no heliostat", "Z9"),
     ):
@@ -265,7 +265,9 @@ def test_interrupted_evaluation_goes_on(flown: Path, tmp_path, monkeypatch) -> N
 
 def test_an_offset_far_beyond_what_was_said_is_told() -> None:
     found = Campaign((), (), np.array([0.02, -0.4, 0.01]), np.eye(3) * 1e-6, 1)
-    assert "offset is 400 mm, its standard deviation was given as 30 mm" in found.warnings(0.03)[0]
+    assert (
+        "offset is 400 mm, but its specified standard deviation is 30 mm" in found.warnings(0.03)[0]
+    )
     assert found.warnings(0.5) == []
 
 
@@ -302,7 +304,9 @@ def test_no_flight_gives_a_reflection(monkeypatch) -> None:
 
     monkeypatch.setattr(campaign, "_together", fails)
     flights = [bare("", [0], camera()), bare("b", [1], camera())]
-    with pytest.raises(InputError, match="no flight of 2 gives a reflection; the first: no mirror"):
+    with pytest.raises(
+        InputError, match="none of 2 flights shows a reflection; the first: no mirror"
+    ):
         campaign.evaluate_campaign(flights)
 
 

@@ -130,4 +130,4 @@ def test_too_few_lights_say_so(night: Night) -> None:
         evaluate(night.flown.recorded[:1], few, night.flown.camera, night.stand, night.shape)
     black = np.zeros((480, 640, 3), np.uint8)
     one = look(black, night.flown.recorded[0], night.flown.camera, night.stand)
-    assert one.problem == "nothing: it is dark and shows 0 lights, 4 are needed"
+    assert one.problem == "nothing: the photograph is dark and shows only 0 lights; 4 are needed"

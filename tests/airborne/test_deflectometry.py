@@ -77,7 +77,7 @@ def _less(root: h5py.File) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_bent, "facet2: a normal looks backwards"),
+        (_bent, "facet2: a normal points backwards"),
         (_elsewhere, "facet2: 0 of 4000 points lie on facet 1"),
         (_short, "facet1: 4000 points and 3 normals"),
         (_linked, "facet1 has no surface_points of its own"),

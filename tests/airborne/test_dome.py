@@ -213,7 +213,7 @@ def test_a_dome_sees_its_targets_from_all_sides() -> None:
     for wrong in ({"radius": 1.0}, {"targets": 2}, {"photographs": 3}, {"spacing": 0.2}):
         with pytest.raises(InputError, match=f"dome: {next(iter(wrong))} "):
             plan_dome([0, 0, 0], **wrong)
-    with pytest.raises(InputError, match="give two or more from 15 to 88"):
+    with pytest.raises(InputError, match="use two or more from 15 to 88"):
         plan_dome([0, 0, 0], elevations=[0.1, 0.5])
 
 
@@ -232,7 +232,7 @@ def test_a_printed_sheet_is_read_as_its_number() -> None:
         np.testing.assert_allclose(
             seen.corners[0], [[39.5, 39.5], [279.5, 39.5], [279.5, 279.5], [39.5, 279.5]], atol=0.1
         )
-    with pytest.raises(InputError, match="target 250: there are numbers from 0 to 249"):
+    with pytest.raises(InputError, match="target 250: numbers run from 0 to 249"):
         white_cells(250)
     one = square_target(1, [0, 0, 0], 0.6, [1, 0, 0], [0, -1, 0])
     np.testing.assert_allclose(one.at(CELLS, CELLS), one.corners[2])
@@ -265,7 +265,7 @@ def test_dome_command_writes_what_is_needed(tmp_path: Path) -> None:
     # Each ring has four at least.
     assert (len(photos) >= 16, problems) == (True, ())
     wrong = run("dome", tmp_path / "plant.toml", "--elevations", "high")
-    assert "give degrees from 0 to 90, such as 35,50,65,80" in str(wrong.exception)
+    assert "use degrees from 0 to 90, such as 35,50,65,80" in str(wrong.exception)
 
 
 def test_rtk_command_by_targets(case: Case, tmp_path: Path) -> None:

@@ -200,7 +200,7 @@ def test_several_flights_in_one_report(
         "reflections-1-2.parquet",
         "reflections-3.parquet",
     ]
-    with pytest.raises(InputError, match=r"give one or more with different names"):
+    with pytest.raises(InputError, match=r"pass one or more flights with different names"):
         write_campaign_report([flights[0], flights[0]], tmp_path)
 
 

@@ -109,7 +109,7 @@ def test_a_wrong_name_is_noticed(case: Case, tmp_path: Path) -> None:
     assert [p.by_hand for p in photos] == [False, *[True] * 2]
     assert len(problems) == 1
     assert "DJI_0001.JPG: H" in problems[0]
-    assert "px from where the other places put it" in problems[0]
+    assert "px from the position that the other places imply" in problems[0]
 
 
 def places(rows: list[tuple[str, str, str, float, float]]) -> Matches:
@@ -125,7 +125,7 @@ def test_places_that_give_no_attitude_are_refused(case: Case) -> None:
 
     one = ("DJI_0001.JPG", "H00", "middle", 100.0, 100.0)
     assert "1 place is named, 2 are needed" in problem([one])
-    assert "all at one point" in problem([one, one])
+    assert "all its places coincide" in problem([one, one])
     assert "heliostat X was not commanded" in problem([one, ("DJI_0001.JPG", "X", "middle", 1, 1)])
 
 
@@ -243,6 +243,6 @@ def test_a_person_fills_in_the_table_of_the_command(case: Case, tmp_path: Path) 
     assert done.exit_code == 0, done.output
     assert "3 of 3 photographs used" in done.output
     again = run("match", case.folder, *common)
-    assert "there is one already" in str(again.exception)
+    assert "this file already exists" in str(again.exception)
     unknown = run("match", case.folder, *common[:2], "--out", tmp_path / "b", "--photo", "z.jpg")
     assert "there is no photograph z.jpg" in str(unknown.exception)

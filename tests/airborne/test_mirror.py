@@ -271,7 +271,7 @@ def test_wrong_mirrors_are_refused() -> None:
         whole.with_slopes(np.zeros((2, 4, 4, 2)))
     with pytest.raises(InputError, match="has holes"):
         whole.with_slopes(np.full((1, 4, 4, 2), np.nan))
-    with pytest.raises(InputError, match="give centres"):
+    with pytest.raises(InputError, match="expected centres"):
         MirrorShape(whole.center, whole.half_width, np.zeros((2, 3)), whole.focal)
     with pytest.raises(InputError, match="an rms of"):
         smooth_slopes(whole, np.random.default_rng(), -1.0)

@@ -128,7 +128,7 @@ def test_uneven_sampling_is_named() -> None:
     s = trial_mirror(SHAPE, replace(EXACT, reflection=0.01), 3)
     part = s.reflections.take(s.reflections.x > 0.0)
     told = measure(part, SHAPE, s.expected_rotation, s.expected_vertex).warnings
-    assert any(w.startswith("unsymmetric sampling: the centre of the points is +0.") for w in told)
+    assert any(w.startswith("asymmetric sampling: the centre of the points is +0.") for w in told)
     assert sum("it may be canted off, dirty or shaded" in w for w in told) == 2
     few = measure(s.reflections.take([3]), SHAPE, s.expected_rotation, s.expected_vertex)
     assert few.warnings[0].startswith("only 1 reflections")
@@ -194,7 +194,7 @@ def test_what_cannot_be_measured_is_refused() -> None:
     two = join([s.reflections, replace(s.reflections, heliostat=s.reflections.heliostat + 1)])
     with pytest.raises(InputError, match="of several heliostats"):
         measure(two, *pose)
-    with pytest.raises(InputError, match="there is no mean 'median'"):
+    with pytest.raises(InputError, match="unknown mean 'median'"):
         measure(s.reflections, *pose, mean="median")  # type: ignore[arg-type]
 
 

@@ -112,7 +112,7 @@ def test_table_beside_goes_first(tmp_path) -> None:
     assert again.time == datetime(2026, 6, 21, 10, 0, tzinfo=UTC)
     assert again.sigma_position.tolist() == [0.02] * 3
     assert len(problems) == 1
-    assert "b.jpg: photos.csv names it, but there is no file" in problems[0]
+    assert "b.jpg: photos.csv lists it, but there is no such file" in problems[0]
 
 
 def test_bad_photographs_get_one_line_each(tmp_path) -> None:

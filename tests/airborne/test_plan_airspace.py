@@ -137,10 +137,10 @@ def test_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"roof": 3}', "roof: unknown; known are fence"),
+        ('{"roof": 3}', "roof: unknown key; known keys are fence"),
         ('{"fence": [[0, 0], [1]]}', r"fence\[1\]: expected \[east, north\], found 1"),
         ('{"keep_out": [{"name": "x", "centre": [0, 0], "radius_m": 0}]}', "0.* is outside"),
-        ('{"keep_out": [{"name": "x", "polygon": [[0, 0], [1, 1]]}]}', "give three or more"),
+        ('{"keep_out": [{"name": "x", "polygon": [[0, 0], [1, 1]]}]}', "specify three or more"),
         ('{"min_height_m": 200}', "heights 200 m to 120 m"),
         ("[", "not valid JSON"),
     ],
@@ -155,7 +155,7 @@ def test_file_refusals(tmp_path: Path, text: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: KeepOut("k", as_float([[0.0, 0.0]])), "1 corners; give three or more"),
+        (lambda: KeepOut("k", as_float([[0.0, 0.0]])), "1 corners; specify three or more"),
         (lambda: KeepOut("k", as_float([[0.0, np.nan]]), 1.0), "give finite"),
         (lambda: KeepOut("k", as_float([[0.0, 0.0]]), 1.0, 5.0, 5.0), "top 5.0 m must be above"),
         (lambda: Airspace(margin=-1.0), "margin -1.0 m"),

@@ -167,9 +167,9 @@ def test_camera_target_on_a_polar_day_and_night() -> None:
     assert equator.days == pytest.approx(200.0 / equator.sunny)
     half = camera_target(Site(0.0, 0.0, 0.0), 6000, minutes=2.0, targets=2, clear=0.5)
     assert half.days == pytest.approx(equator.days)
-    with pytest.raises(InputError, match="minutes 0: give a number above 0"):
+    with pytest.raises(InputError, match="minutes 0: must be above 0"):
         camera_target(Site(0.0, 0.0, 0.0), 10, minutes=0.0)
-    with pytest.raises(InputError, match="the sun is never 60° high"):
+    with pytest.raises(InputError, match="the sun never reaches an elevation of 60°"):
         camera_target(Site(85.0, 0.0, 0.0), 10, min_elevation=float(np.radians(60.0)))
 
 
@@ -178,15 +178,15 @@ def test_refusals(plant: Plant) -> None:
         wanted = PlanSettings(selection=PointSelection(points=9), airspace=Airspace(tower(plant)))
         return plan_flight(plant, replace(wanted, **changes))  # type: ignore[arg-type]
 
-    with pytest.raises(InputError, match="leave no time for a photograph in 30 s"):
+    with pytest.raises(InputError, match="leave no time for a photograph within 30 s"):
         made(craft=Craft(endurance=30.0))
     with pytest.raises(InputError, match=r"home at 0.0 m east, 0.0 m north: it is in a keep-out"):
         made(home=np.zeros(3))
     with pytest.raises(InputError, match="model malan8 has 8 unknowns"):
         made(selection=PointSelection(points=8))
-    with pytest.raises(InputError, match="spread 60°: give more than 0°, up to 45°"):
+    with pytest.raises(InputError, match="spread 60°: must be above 0° and at most 45°"):
         made(spread=float(np.radians(60.0)))
-    with pytest.raises(InputError, match="view 0°: give more than 0°"):
+    with pytest.raises(InputError, match="view 0°: must be above 0°"):
         made(view=0.0)
     with pytest.raises(InputError, match="0 hours a day"):
         made(hours_a_day=0.0)
@@ -203,7 +203,7 @@ def test_no_way_out(flown: FlightPlan) -> None:
         for k, (a, b) in enumerate(zip(ring, ring[1:] + ring[:1], strict=True))
     ]
     air = Airspace(tuple(walls))
-    with pytest.raises(InputError, match="calibration point 1: there is no free route to it"):
+    with pytest.raises(InputError, match="calibration point 1: no free route there"):
         flight.fly(flown.stations, range(len(flown.clusters)), air, home, Craft(), flown.labels)
 
 
@@ -244,9 +244,9 @@ def test_single_axis_trackers_are_refused(plant: Plant) -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"count": 0}, "0 drones: give 1 to 50"),
-        ({"speed": 20.0}, "speed 20 m/s: give more than 0 and at most 15"),
-        ({"endurance": 0.0}, "endurance 0: give a number above 0"),
+        ({"count": 0}, "0 drones: must be 1 to 50"),
+        ({"speed": 20.0}, "speed 20 m/s: must be above 0 and at most 15"),
+        ({"endurance": 0.0}, "endurance 0: must be above 0"),
         ({"change": -1.0}, "battery change -1 s must not be below 0"),
     ],
 )

@@ -268,7 +268,7 @@ def test_jacobian_of_candidates_against_finite_differences() -> None:
 
 def test_more_points_than_unknowns() -> None:
     PointSelection(points=9).check(NAMES, "malan8")
-    with pytest.raises(InputError, match="has 8 unknowns; give 9 or more"):
+    with pytest.raises(InputError, match="has 8 unknowns; use 9 points or more"):
         PointSelection(points=8).check(NAMES, "malan8")
 
 
@@ -304,11 +304,11 @@ def test_pattern_keeps_off_the_limits() -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"distance": 0.0}, "distance 0 m: give a number above 0"),
-        ({"pointing": 0.2}, "pointing error 200 mrad: give 0 to 100 mrad"),
+        ({"distance": 0.0}, "distance 0 m: must be above 0"),
+        ({"pointing": 0.2}, "pointing error 200 mrad: must be 0 to 100 mrad"),
         ({"focal": 0.0}, "focal length 0 m"),
-        ({"led_offset": (1.0, np.nan, 0.0)}, "led_offset: give three numbers"),
-        ({"samples": -1.0}, "samples -1: give a number above 0"),
+        ({"led_offset": (1.0, np.nan, 0.0)}, "led_offset: use three numbers"),
+        ({"samples": -1.0}, "samples -1: must be above 0"),
     ],
 )
 def test_sampling_refuses(change: dict[str, float], text: str) -> None:

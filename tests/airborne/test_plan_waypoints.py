@@ -373,14 +373,14 @@ def _moved(flown: Mission, height: FloatArray) -> Mission:
 def test_refusals(plan: FlightPlan, flown: Mission, tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="there is no aircraft 'M3'"):
         wpml(flown, "M3")
-    with pytest.raises(InputError, match=r"drones accept 500 m"):
+    with pytest.raises(InputError, match=r"drones accept at most 500 m"):
         _moved(flown, flown.height + 450.0)
     near = replace(
         flown,
         latitude_deg=flown.latitude_deg[:1].repeat(len(flown)),
         longitude_deg=flown.longitude_deg[:1].repeat(len(flown)),
     )
-    with pytest.raises(InputError, match=r"Litchi asks for 0.6 m"):
+    with pytest.raises(InputError, match=r"Litchi requires 0.6 m"):
         litchi(near)
     with pytest.raises(InputError, match="format 'kml': give some of dji, qgc, litchi"):
         write_plan(plan, tmp_path, formats=("kml",))

@@ -190,7 +190,7 @@ def test_the_maps_of_a_flight_may_be_deflectometry(folder: Path, tmp_path: Path)
     write_deflectometry(tmp_path / f"{real}.h5", shape.with_slopes(slope))
     result = evaluate_flight(folder, plant(MIRRORS), slopes=tmp_path)
     assert not [line for line in result.warnings if real in line]
-    assert len([line for line in result.warnings if "taken as ideal" in line]) == 7
+    assert len([line for line in result.warnings if "assumed ideal" in line]) == 7
     found = result.flights[0].measured.shape(2).slope
     assert found is not None
     np.testing.assert_allclose(found.mean(axis=(1, 2)), slope.mean(axis=(1, 2)), atol=0.02 * MRAD)
@@ -208,7 +208,7 @@ def test_the_command_compares(folder: Path, tmp_path: Path) -> None:
     ]
     done = CliRunner().invoke(app, [str(a) for a in (folder, *options, "--out", tmp_path)])
     assert done.exit_code == 0, done.output
-    assert "Orientation less reference, mrad" in done.stdout
+    assert "Orientation minus reference, mrad" in done.stdout
     assert (tmp_path / "reference.csv").exists()
     assert not (tmp_path / "reference.html").exists()
 
@@ -220,7 +220,7 @@ def test_the_command_compares(folder: Path, tmp_path: Path) -> None:
         ("heliostat,azimuth_deg,elevation_deg\nA,1,95\n", "95° is beyond ±90°"),
         ("heliostat,azimuth_deg,elevation_deg\nA,x,5\n", "is not a finite number; give degrees"),
         ("heliostat,azimuth_deg,elevation_deg\n", "no rows"),
-        ("heliostat,azimuth_deg,elevation_deg\nA,1,5\nA,2,5\n", "heliostat A is there twice"),
+        ("heliostat,azimuth_deg,elevation_deg\nA,1,5\nA,2,5\n", "heliostat A is listed twice"),
     ],
 )
 def test_a_table_that_is_no_reference_is_refused(tmp_path: Path, text: str, said: str) -> None:

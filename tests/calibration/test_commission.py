@@ -216,8 +216,8 @@ def test_tables_and_page_hold_every_visit(
     ("change", "text"),
     [
         ({"shots": 0}, "0 photographs of a mirror"),
-        ({"clear": 0.0}, "clear 0.0: give 0 to 1, not 0"),
-        ({"worth": 1.0}, "worth 1.0: give a share"),
+        ({"clear": 0.0}, "clear 0.0 must be above 0 and at most 1"),
+        ({"worth": 1.0}, "worth 1.0: must be a fraction"),
         ({"sigma": 0.0}, "sigma 0.0 must be above 0"),
         ({"repeat": -1.0}, "repeat -1.0 must be 0 or more"),
     ],
@@ -308,7 +308,7 @@ def test_missed_beams_go_together_again_or_alone(plant: Plant, fleet: Fleet) -> 
 def test_a_span_without_sun_or_targets_is_refused(plant: Plant, fleet: Fleet) -> None:
     with pytest.raises(InputError, match="the sun never reaches 15°"):
         _plan(plant, fleet, TOGETHER, 3600.0)
-    with pytest.raises(InputError, match="give a span of up to a year"):
+    with pytest.raises(InputError, match="the period must be at most a year"):
         _plan(plant, fleet, TOGETHER, 400.0 * DAY)
     with pytest.raises(InputError, match="at least one target"):
         plan_commission([fleet], plant.site, (), START, START + DAY)

@@ -85,7 +85,7 @@ def test_a_known_ratio_is_not_searched_and_no_ratio_is_fitted() -> None:
     seen, _ = measured(geared(1), 9, days=8, known=WORM)
     assert [e.joint for e in search_periodic_errors(geared(1), seen)] == ["azimuth"]
     assert search_periodic_errors(field(1), seen.take(range(8))) == ()
-    with pytest.raises(InputError, match="elevation_worm_ratio is searched, not fitted"):
+    with pytest.raises(InputError, match="elevation_worm_ratio is found by a search, not by a fit"):
         fit(field(1), seen, ("elevation_bias", "elevation_worm_ratio"))
 
 

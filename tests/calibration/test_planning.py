@@ -355,7 +355,7 @@ def test_refusals(possible: CandidateSightings, year: FloatArray) -> None:
         SightingLimits(max_incidence=2.0)
     with pytest.raises(InputError, match="never reaches 80°"):
         suns_of_year(sun.Site(60.0, 0.0, 0.0), 2026, min_elevation=np.radians(80.0))
-    with pytest.raises(InputError, match="give a day or more"):
+    with pytest.raises(InputError, match="use at least one day"):
         suns_of_year(PLANT.site, 2026, days=0)
 
 
@@ -518,7 +518,7 @@ REFUSED: list[tuple[list[str], str]] = [
     (["--count", "0"], "--count '0': give a whole number from 1 to"),
     (["--campaign", "--count", "0"], "--count '0': give a whole number from 1 to"),
     (["--campaign", "--worth", "2"], "--worth '2': give a number from 0 to 1"),
-    (["--picture", "a.bmp"], "give one of .png"),
+    (["--picture", "a.bmp"], "use one of .png"),
     (["--csv", "nowhere/x.csv"], "there is no folder nowhere"),
     (["--sightings", "no.csv"], "there is no such file"),
     (["--sigma-mrad", "nan"], "--sigma-mrad 'nan': give a number from 0.001"),

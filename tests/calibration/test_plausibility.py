@@ -112,9 +112,9 @@ def _below(seen: Sightings) -> FloatArray:
         (lambda s: {"time": 1.0e10}, "the year is out of range, 1970 to 2099"),
         (lambda s: {"time": NOON + 5e8}, "more than a year ahead of this computer's clock, 2025-"),
         (lambda s: {"source": _below(s)}, "the sun is below the horizon: its elevation is -"),
-        (lambda s: {"time": s.time[4] + 7200.0}, "and stood at"),
-        (lambda s: {"counts": [s.counts[4, 0], 3e7]}, "of elevation are beyond its stops: "),
-        (lambda s: {"counts": [-9e6, s.counts[4, 1]]}, "of azimuth are beyond its stops: "),
+        (lambda s: {"time": s.time[4] + 7200.0}, "but the actual sun was at"),
+        (lambda s: {"counts": [s.counts[4, 0], 3e7]}, "of elevation are beyond its end stops: "),
+        (lambda s: {"counts": [-9e6, s.counts[4, 1]]}, "of azimuth are beyond its end stops: "),
         (lambda s: {"counts": s.counts[4] + [3.8e6, 0]}, "the beam comes from the back"),
         (lambda s: {"destination": s.destination[4] + [0, 0, -9.0]}, "on no target: 8."),
         (lambda s: {"destination": s.destination[4] + [0, -2.0, 0]}, "on no target: 2."),
@@ -170,7 +170,7 @@ def test_a_beam_that_never_moved_was_not_measured() -> None:
     stuck = replace(stuck, destination=np.tile(PLANT.targets[0].center + [0.1, 0.0, 0.0], (20, 1)))
     found = judge(join([seen_of([15]), stuck]))
     assert sorted(found.reasons) == list(range(20, 40))
-    assert found.reasons[20].startswith("the point of the beam is the same to the last digit in")
+    assert found.reasons[20].startswith("the beam position is identical to the last digit in")
     assert not judge(stuck.take([0, 9])).reasons
     # A camera in the field stands still: its sightings have another kind.
     assert not plausibility.judge(stuck, kinds=["field_camera"] * 20).reasons
@@ -180,7 +180,9 @@ def test_suns_of_other_times_are_a_note_where_most_rows_have_them() -> None:
     seen = seen_of([3])
     found = judge(replace(seen, time=seen.time + 3600.0))
     assert not found.reasons
-    assert found.notes[0].startswith("the suns of 20 of 20 sightings do not stand where the sun")
+    assert found.notes[0].startswith(
+        "the sun directions of 20 of 20 sightings do not match their times"
+    )
 
 
 def _reversed(axis: int) -> object:
@@ -315,7 +317,7 @@ def test_sightings_that_contradict_each_other_are_not_learnt() -> None:
     tight = replace(good, sigma=np.full(len(good), 1e-5))
     learned = learning.learn(PLANT, tight, "guo6", rounds=2)
     (line,) = unexplained_mirrors(NAMES, learned)
-    assert "give the true sigma, or check model and counts" in line
+    assert "specify the true sigma, or check model and counts" in line
     assert list(np.flatnonzero(at_moment(NAMES, learned).learnt)) == [15]
 
 
@@ -364,7 +366,7 @@ def test_a_minute_shows_where_several_mirrors_agree() -> None:
     assert right is not None
     assert not right.found
     assert abs(right.error) < 4.0 * right.sigma
-    assert "no error shows" in str(right)
+    assert "no error found" in str(right)
     assert check_clock(NOMINAL, seen_of(rows, count=5), tuple(SIZES), PLANT.site) is None
 
 

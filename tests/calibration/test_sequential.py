@@ -135,7 +135,7 @@ def test_a_mirror_of_wrong_counts_leaves_the_others_alone(
     assert found.unusable.sum() == 16
     assert np.isfinite(found.hyper.vector).all()
     (line,) = unexplained_mirrors(("A", "B", "C"), found)
-    assert line.startswith("C: 16 of 16 sightings have counts beyond the reach of its drives.")
+    assert line.startswith("C: 16 of 16 sightings have counts outside the range of its drives.")
 
 
 def test_photographs_of_another_mirror_are_named(field: tuple[Mechanism, Sightings]) -> None:

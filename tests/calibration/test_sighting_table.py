@@ -139,7 +139,7 @@ def test_covariances_broadcast() -> None:
         ([0.0, np.nan], r"sighting 1: source_covariance"),
         ([0.0, np.inf], r"sighting 1: source_covariance"),
         ([0.0, 1e308], r"sighting 1: source_covariance"),
-        ([1.0, 2.0, 3.0], r"source_covariance of shape \(3,\); give a variance, 2 variances"),
+        ([1.0, 2.0, 3.0], r"source_covariance of shape \(3,\); pass one variance, 2 variances"),
     ],
 )
 def test_covariance_guards(given: object, text: str) -> None:
@@ -157,7 +157,7 @@ def test_parts_keep_their_covariances() -> None:
     _same(join([seen.take(np.arange(9)), seen.take(np.arange(9, len(seen)))]), seen)
     with pytest.raises(InputError, match=r"with \[1, 2\] drives"):
         join([seen, _awkward(1)[0]])
-    with pytest.raises(InputError, match="0 parts"):
+    with pytest.raises(InputError, match="the list is empty"):
         join([])
 
 
@@ -372,7 +372,7 @@ BAD: list[tuple[str, int, str, str]] = [
     ("wide sigma", 13, "500", "column sigma_mrad: 500 mrad is outside 0.001 to 200 mrad"),
     ("tiny sigma", 13, "1e-300", "column sigma_mrad: 1e-300 mrad is outside 0.001 to 200 mrad"),
     ("sigma in rad", 13, "0.0003", "column sigma_mrad: 0.0003 mrad is outside 0.001 to 200 mrad"),
-    ("no sigma", 13, "", "column sigma_mrad: the cell is empty; give the ray's standard"),
+    ("no sigma", 13, "", "column sigma_mrad: the cell is empty; enter the ray's standard"),
     ("half a covariance", 15, "", "column destination_cov_en: the cell is empty; give m² of a"),
     ("no variance", 14, "-1e-4", "column destination_cov_ee to destination_cov_uu: [-0.0001, "),
     ("not definite", 15, "2e-4", "is not a covariance (not positive semidefinite); correct it"),
@@ -412,7 +412,7 @@ def test_all_bad_rows_together(tmp_path: Path) -> None:
     assert len(left_out) == len(BAD) + 4
     # One of the bad cells runs over two lines.
     after = len(BAD) + 4
-    nowhere = "column source_east: 0, 0, 0 is no direction; give the direction from the mirror"
+    nowhere = "column source_east: 0, 0, 0 is not a direction; enter the direction from the mirror"
     # A further cell, though it is empty, may have moved the others: a decimal comma does that.
     assert left_out[-4:] == [
         f"s.csv: line {after}, heliostat AA39, {nowhere}",
@@ -583,7 +583,7 @@ MALAN_GOOD = "2026-06-21T12:00:00Z;30;45;0.25;-0.5;1000;2000"
     [
         ("00Z", "00", "column timestamp: 2026-06-21T12:00:00 has no time zone; append Z"),
         ("2026-06-21T12:00:00Z", "", "column timestamp: the cell is empty; give a time in ISO"),
-        (";30;", ";400;", "column sun_azimuth_deg: 400° is outside −180° to 360°; give degrees"),
+        (";30;", ";400;", "column sun_azimuth_deg: 400° is outside −180° to 360°; use degrees"),
         (";45;", ";95;", "column sun_elevation_deg: 95° is outside −5° to 90°"),
         (
             "0.25",

@@ -128,7 +128,7 @@ REPLACED: list[tuple[str, str, str, str, str]] = [
     ("unknown drive", "toml", 'kind = "rotary"', 'kind = "hydraulic"', "hydraulic"),
     ("an angle twice", "toml", "min_angle_deg = -180", "min_angle_deg = -180\nmin_angle_rad = -3",
      "min_angle is given in deg and rad"),
-    ("target without size", "toml", "width_m = 3\n", "", "give corners_m, or center_m"),
+    ("target without size", "toml", "width_m = 3\n", "", "specify corners_m, or center_m"),
     ("target of no area", "toml", "center_m = [0, 0, 13]",
      "corners_m = [[0,0,0],[1,0,0],[2,0,0],[3,0,0]]\ncenter_m = [0, 0, 13]", "span no area"),
     ("target with 2 numbers", "toml", "center_m = [0, 0, 13]", "center_m = [0, 13]",
@@ -358,9 +358,9 @@ def test_paint_texts(which, text, says, tmp_path, capsys, monkeypatch) -> None: 
 TRACK = ["track", "PLANT", "--heliostat", "P1A"]
 ARGUMENTS: list[tuple[list[str], str]] = [
     (["track", "PLANT", "--heliostat", "P1D"], "there is no heliostat 'P1D'; did you mean"),
-    ([*TRACK, "--aim", "1,2"], "give three numbers in metres"),
-    ([*TRACK, "--aim", "a,b,c"], "give three numbers in metres"),
-    ([*TRACK, "--aim", "nan,0,0"], "give three numbers in metres"),
+    ([*TRACK, "--aim", "1,2"], "write three numbers in metres"),
+    ([*TRACK, "--aim", "a,b,c"], "write three numbers in metres"),
+    ([*TRACK, "--aim", "nan,0,0"], "write three numbers in metres"),
     ([*TRACK, "--target", "tarqet"], "did you mean target"),
     ([*TRACK, "--aim", "0,0,9", "--target", "target"], "not both"),
     ([*TRACK, "--time", "2026-09-02T10:00"], "has no time zone"),

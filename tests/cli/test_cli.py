@@ -159,7 +159,7 @@ def test_track_a_day(call: Any, plant_file: Path) -> None:
     assert sum(row["reachable"] for row in found["day"]) > 18
     assert "P1A" in call(*arguments)
     shown = call("track", plant_file, "--heliostat", "P1A", "--sun", "0.2,0.5,0.8")
-    assert "the one to take" in shown
+    assert "recommended pose" in shown
 
 
 def test_field_check(call: Any, plant_file: Path) -> None:
@@ -235,7 +235,7 @@ def test_track_traces_the_iteration_of_both_branches(call: Any) -> None:
         assert misses[1] < 1e-3
         assert all(b < 0.01 * a for a, b in pairwise(misses))
     assert "Grigoriev's iteration" in call(*words)
-    with pytest.raises(AssertionError, match="--trace prints one moment"):
+    with pytest.raises(AssertionError, match="--trace prints a single time"):
         call(*words, "--local")
 
 
@@ -261,7 +261,7 @@ def test_track_follows_the_sun_with_a_single_axis(call: Any, tmp_path: Path) -> 
     (branch,) = json.loads(call(*words, "--json"))["branches"]
     assert branch["reachable"]
     assert len(branch["angles_rad"]) == 1
-    assert "one axis: sun and aim are taken in the plane across it" in call(*words)
+    assert "single axis: sun and aim are projected onto the plane" in call(*words)
     assert "Grigoriev's iteration" in call(*words, "--trace")
     day = json.loads(call(*words, "--time", "2026-06-21T10:00Z", "--every", "3h", "--json"))
     assert day["joints"] == ["rotation"]
@@ -279,7 +279,7 @@ def test_view_writes_a_page_and_a_model(call: Any, tmp_path: Path) -> None:
     assert "<script src=" not in page, "the page stands by itself"
     call("view", HELIOK, tmp_path / "day.glb", *words)
     assert (tmp_path / "day.glb").read_bytes().startswith(b"glTF")
-    with pytest.raises(AssertionError, match=r"ends in \.html or \.glb"):
+    with pytest.raises(AssertionError, match=r"must end in \.html or \.glb"):
         call("view", HELIOK, tmp_path / "day.obj", *words)
 
 

@@ -90,7 +90,7 @@ def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> N
     ("words", "line"),
     [
         (("--limit=5", "--keep-all"), "no aims were found that hold the flux limit"),
-        (("--limit=much",), "--limit 'much': give kW/m²"),
+        (("--limit=much",), "--limit 'much': use 0.001 to 64000 kW/m²"),
         (("--limit=none.csv",), "none.csv"),
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
         (("--limit=100", "--wanted=even"), "--wanted 'even': give uniform"),

@@ -124,7 +124,7 @@ def test_teach_writes_marks_and_camera(call: Any, shelf: Path, place: Path) -> N
     )
     assert text.count("refined") == 6
     assert re.search(r"^camera at \(-?\d+\.\d\d ± \d+\.\d\d, ", text, re.MULTILINE)
-    assert re.search(r"pixels on their plane good to \d+\.\d mm", text)
+    assert re.search(r"pixels on their plane accurate to \d+\.\d mm", text)
     assert text.rstrip().endswith(f"camera south and 6 marks written to {plant}")
     again = read_plant(plant)
     assert [mark.kind for mark in again.target("target").marks] == ["corner"] * 4 + ["tee", "disc"]
@@ -213,7 +213,7 @@ def test_calibrate_with_a_chessboard(call: Any, shelf: Path, place: Path) -> Non
     text = call(*arguments)
     assert re.search(r"^focal length 5\d\d\.\d ± \d+\.\d, 5\d\d\.\d ± ", text, re.MULTILINE)
     assert re.search(r"board3\.png: 0\.\d\d px", text)
-    assert "note: the camera's pose belonged to the old lens and is dropped" in text
+    assert "note: the camera's pose was found with the old lens and is dropped" in text
     camera = read_plant(plant).camera("south")
     assert camera.size == (480, 360)
     assert camera.matrix[0, 0] == pytest.approx(MATRIX[0, 0], rel=0.02)
@@ -230,7 +230,7 @@ def test_calibrate_with_marks(call: Any, shelf: Path, place: Path) -> None:
     plant = place / "marked.toml"
     text = call("calibrate", plant, shelf / "south.png", shelf / "grey.png", "--camera", "south")
     assert re.search(r"grey\.png: target target: ", text)
-    assert re.search(r"^6 marks, residuals 0\.\d\d px; pixels on their plane good", text, re.M)
+    assert re.search(r"^6 marks, residuals 0\.\d\d px; pixels on their plane accurate", text, re.M)
     camera = read_plant(plant).camera("south")
     assert camera.targets == ("target",)
     assert camera.position is not None
@@ -261,7 +261,7 @@ def test_show(call: Any, place: Path) -> None:
     )
     assert found[0]["targets"]["target"]["marks"] == 6
     assert found[0]["targets"]["target"]["distance"] == pytest.approx(np.sqrt(665.0))
-    assert "no cameras; heliotrope camera teach" in call("show", place / "bare.toml")
+    assert "no cameras; add one with heliotrope camera teach" in call("show", place / "bare.toml")
     assert json.loads(call("show", place / "bare.toml", "--json")) == []
     bare = replace(example_plant(), cameras=(replace(CAMERA, position=None, R_enu_camera=None),))
     write_plant(bare, place / "lens.toml")
@@ -293,7 +293,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         ((*TEACH, *points(), "--kind", "dot=disc"), "point dot: a disc needs its size in metres"),
         ((*TEACH, *points(), "--kind", "nose=disc", "--size", "1"), "among those given: 'nose'"),
         ((*TEACH, *points(), "--size", "big"), "'big' is not a number of metres"),
-        ((*TEACH, *points(), "--size", "0"), "size 0.0 m; give metres above 0"),
+        ((*TEACH, *points(), "--size", "0"), "size 0.0 m; must be above 0"),
         ((*TEACH, *points(), "--size", "1", "--size", "2"), "'2': given twice"),
         ((*TEACH, *points(), "--size", "dot=1", "--size", "dot=2"), "given twice for point dot"),
         (
@@ -301,10 +301,13 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
             "--sigma-px '0': give a number from 0.001 to 1,000",
         ),
         ((*TEACH, *points(), "--out", "plant.xml"), "plant.xml: only plant files (TOML)"),
-        ((*TEACH, *points(), "--out", "no/plant.toml"), "folder no does not exist; make it first"),
+        (
+            (*TEACH, *points(), "--out", "no/plant.toml"),
+            "folder no does not exist; create it first",
+        ),
         (
             ("teach", "tower-measurements.json", "south.png", "--target", "t"),
-            "tower-measurements.json: a tower file alone is not a plant; give the",
+            "tower-measurements.json: a tower file alone is not a plant; specify the",
         ),
         (("teach", ".", "south.png", "--target", "t"), "add --out plant.toml"),
         (
@@ -375,7 +378,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
                 "--square",
                 "0.03",
             ),
-            "2 pictures of a chessboard; give three or more",
+            "2 pictures of a chessboard; pass three or more",
         ),
         (
             (
@@ -409,7 +412,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         (("calibrate", "bare.toml", "south.png", "--camera", "c"), "has marks; teach them first"),
         (
             ("calibrate", "marked.toml", "south.png", "small.png", "--camera", "c"),
-            "camera c: frames of 320 × 240, 640 × 480 px; give pictures of one size",
+            "camera c: frames of 320 × 240, 640 × 480 px; use pictures of one size",
         ),
         (
             ("calibrate", "seen.toml", "small.png", "--camera", "south"),
@@ -470,7 +473,9 @@ def pictures_of(folder: Path) -> list[object]:
 def test_receiver_takes_a_reference_that_measures(call: Any, lit: Path, tmp_path: Path) -> None:
     out = tmp_path / "receiver.toml"
     text = call("receiver", lit / "plant.toml", *pictures_of(lit), "--out", out)
-    assert re.search(r"nominal flux fills \d+ % of the scale; daylight on it counts as \d", text)
+    assert re.search(
+        r"nominal flux uses \d+ % of the scale; daylight on the receiver reads as \d", text
+    )
     assert text.endswith(f"reference written to {out}\n")
     shown = receiver_scene.frame(12, seed=5)
     share = receiver_scene.true_share(receiver_scene.mirrors(12))
@@ -489,11 +494,14 @@ def test_receiver_takes_a_reference_that_measures(call: Any, lit: Path, tmp_path
 def test_receiver_writes_nothing_where_it_refuses(call: Any, lit: Path, tmp_path: Path) -> None:
     out, given = tmp_path / "receiver.toml", pictures_of(lit)
     for words, text in (
-        (("none.toml", *given, "--out", out), "0 receivers; a camera measures the flux where"),
-        (("far.toml", *given, "--out", out), "position is not known; give --outline X,Y"),
+        (("none.toml", *given, "--out", out), "0 receivers; the flux camera needs a plant"),
+        (("far.toml", *given, "--out", out), "position is unknown; specify --outline X,Y"),
         (("plant.toml", *given, "--out", tmp_path / "a.json"), "a reference is written as TOML"),
         (("plant.toml", *given, "--lit", "four.png", "--out", out), "write FILE=SHARE"),
-        (("plant.toml", *given, "--lit", f"{lit / 'four.png'}=0.9", "--out", out), "share wrong"),
+        (
+            ("plant.toml", *given, "--lit", f"{lit / 'four.png'}=0.9", "--out", out),
+            "check the fractions",
+        ),
     ):
         assert text in call("receiver", lit / words[0], *words[1:], code=2)
     assert not list(tmp_path.iterdir())

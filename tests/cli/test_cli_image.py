@@ -195,7 +195,7 @@ def _without_pose(folder: Path) -> None:
 
 def test_the_orientation_is_taken_on_trust_without_a_pose(folder: Path, call: Any) -> None:
     words = (folder / "photographs", "--plant", folder / "plant.toml", "--no-pictures")
-    says = "the orientation of the frames is taken on trust"
+    says = "the orientation of the frames cannot be checked"
     assert says not in call(*words)[1]
     assert json.loads(call(*words, "--json")[1])["notes"] == []
     _without_pose(folder)
@@ -396,7 +396,7 @@ def test_two_targets_for_one_photograph_are_refused(record: str, folder: Path, c
         file.write_text(json.dumps(facts), encoding="utf-8")
     code, _, err = call(*words, "--heliostat", "H0", "--to-sightings", folder / "s.csv")
     assert code == 2
-    assert "its record names target other, and --target target; give the true one alone" in err
+    assert "its record names target other, and --target target; specify only the correct one" in err
     assert not (folder / "s.csv").exists()
 
 

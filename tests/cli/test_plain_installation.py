@@ -87,7 +87,7 @@ def test_a_command_works_or_names_its_extra(tmp_path: Path) -> None:
         ["field", "layout", "-h"],
         ["--version"],
     ]
-    line = r"heliotrope: \w+: \w+ is not installed; say pip install 'heliotrope\[\w+\]'.*\n"
+    line = r"heliotrope: \w+: \w+ is not installed; run pip install 'heliotrope\[\w+\]'.*\n"
     for words, code, err in tried(need + work, tmp_path):
         if words in need:
             assert code == 2, (words, code, err)
@@ -144,4 +144,4 @@ def test_another_missing_package_is_no_matter_of_extras() -> None:
     assert missing(ModuleNotFoundError(name="numpy"), "run") is None
     found = missing(ModuleNotFoundError(name="sqlalchemy.orm"), "run")
     assert found is not None
-    assert str(found) == ("run: sqlalchemy is not installed; say pip install 'heliotrope[console]'")
+    assert str(found) == ("run: sqlalchemy is not installed; run pip install 'heliotrope[console]'")

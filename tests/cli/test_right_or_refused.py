@@ -76,7 +76,7 @@ def test_track_takes_what_is_true(tmp_path: Path, run: Any) -> None:
     code, out, _ = run("track", plant, "--heliostat", "A1", *NOON)
     assert code == 0
     assert "the beam reaches its aim" in out
-    assert "* the one to take; shading and blocking by other mirrors are not considered" in out
+    assert "* recommended pose; shading and blocking by other mirrors are not considered" in out
     # In front of the target's back, and over it.
     for aim in ("0,0.5,13", "0,-5,20"):
         code, out, _ = run("track", plant, "--heliostat", "B1", *NOON, "--aim", aim)
@@ -91,7 +91,7 @@ def test_track_says_that_the_nearest_pose_does_not_serve(tmp_path: Path, run: An
     code, out, _ = run(*words)
     assert code == 1
     assert "* the nearest pose: the beam does not reach its aim" in out
-    assert "the one to take" not in out
+    assert "recommended pose" not in out
     code, out, _ = run(*words, "--json")
     found = json.loads(out)
     assert code == 1
@@ -219,7 +219,7 @@ def test_two_heliostats_at_one_place_are_refused(name: str, tmp_path: Path, run:
     words = ("--heliostat", "A1", "--aim", "0,0,13", "--site", "37,-5,100", *NOON)
     code, out, err = run("track", file, *(words if file != plant else words[:2]))
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "heliostats A1 and A2 stand at one place: 0.00 m east, -30.00 m north" in err
+    assert "heliostats A1 and A2 have the same position: 0.00 m east, -30.00 m north" in err
     # One above the other is another place.
     apart = COPIES[name].replace("30.0,0", "30.0,4").replace("30.001,0", "30.001,4")
     (tmp_path / "field.csv" if file == plant else file).write_text(apart, encoding="utf-8")

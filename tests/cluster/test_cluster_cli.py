@@ -86,7 +86,7 @@ def test_a_cluster_in_its_own_process_over_a_port(line: Line, tmp_path: Path) ->
         for process in started:
             process.kill()
             process.communicate()
-    assert "C1: ended, DEFOCUS sent" in text
+    assert "C1: stopped, DEFOCUS sent" in text
     assert "C1: IDLE 2; silent 0" in text
 
 

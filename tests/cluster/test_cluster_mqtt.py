@@ -88,7 +88,7 @@ def test_a_cluster_with_a_receiver_and_a_broker(
             process.kill()
             process.communicate()
     assert "time gps ±0.25 s" in text
-    assert "C1: ended, DEFOCUS sent" in text
+    assert "C1: stopped, DEFOCUS sent" in text
 
 
 async def follow(plant: Plant, line: Line, receiver: GpsdProcess) -> None:

@@ -122,7 +122,7 @@ def test_ctl_asks_lists_refuses_and_approves(console: LiveConsole, ctl: Ctl) -> 
     assert "the beam moves by" in shown
     assert "needs engineer" in ctl("viewer", "approvals", number, "--withdraw", code=1)
     ctl(SECOND, "approvals", number, "--refuse", "--reason", "look again")
-    assert "no change waits" in ctl("engineer", "approvals")
+    assert "no changes are waiting" in ctl("engineer", "approvals")
     number = asked("tilt_east_mrad=0.5", data=True)
     ctl("engineer", "approvals", number, "--withdraw", data=True)
     number = asked("tilt_east_mrad=0.5")
@@ -130,7 +130,7 @@ def test_ctl_asks_lists_refuses_and_approves(console: LiveConsole, ctl: Ctl) -> 
     assert "1 done" in ctl(SECOND, "approvals", number, "--approve", data=True)
     record = console.call(lambda: console.live.plant.beliefs.record(name))
     assert record.parameters["tilt_east"] == pytest.approx(5e-4)
-    assert "give NUMBER with" in ctl("viewer", "approvals", number, code=1)
+    assert "use NUMBER together with" in ctl("viewer", "approvals", number, code=1)
     assert "--reason" in ctl(SECOND, "approvals", number, "--refuse", code=1)
 
 

@@ -256,7 +256,7 @@ def test_ctl_sets_it_up_and_asks_for_it(holder: Holder, monkeypatch: pytest.Monk
 
     made = CliRunner().invoke(app, [*at, "factor", "--name", NAME], input=f"{PASSWORD}\n0\n")
     assert made.exit_code != 0
-    holder.secret = made.output.split("type the secret there: ")[1].split()[0]
+    holder.secret = made.output.split("enter the secret there: ")[1].split()[0]
     done = holder.http.put("session/factor", json={"code": holder.code(-1)})
     assert done.status_code == 200, done.text
     monkeypatch.setattr("typer.prompt", answer)

@@ -49,7 +49,7 @@ def test_a_flight_of_a_drone_is_taken_by_the_page_and_the_command_line(
     assert (answer.status_code, "Z9" in answer.json()["detail"]) == (404, True)
     answer = ask("engineer", "POST", "flights", {**flight, "covariance": []})
     assert answer.status_code == 422
-    assert "give 3 by 3 values" in answer.text
+    assert "write 3 by 3 values" in answer.text
     # A flight is longer than orders are: 20 KiB for each heliostat are too much.
     many = {**flight, "rows": rows * (len(field["names"]) * 20_480 // len(json.dumps(rows)))}
     assert ask("engineer", "POST", "flights", many).status_code == 413

@@ -124,7 +124,7 @@ def ctl(
 def test_ctl_looks(ctl: Callable[..., Any], console: LiveConsole) -> None:
     shown = ctl("viewer", "status")
     assert shown.exit_code == 0, shown.output
-    assert "2 of 2 clusters heard" in shown.stdout
+    assert "2 of 2 clusters reporting" in shown.stdout
     shown = ctl("viewer", "show", console.live.names[0])
     assert shown.exit_code == 0
     assert '"cluster": "C' in shown.stdout
@@ -184,7 +184,7 @@ def test_ctl_says_what_a_proof_has_measured_and_what_it_believes(
     [
         ("viewer", ("stow", "--all"), "needs operator"),
         ("wrong", ("status",), "sign in"),
-        ("operator", ("stow",), "give --all"),
+        ("operator", ("stow",), "use --all"),
         ("operator", ("aim", "receiver", "nobody"), "nobody"),
         ("operator", ("show", "nobody"), "nobody"),
     ],
@@ -200,7 +200,7 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     """With the plant's folder and a token; nobody is asked at the console's address."""
     name = console.live.names[9]
     where = ("--url", "http://127.0.0.1:1/", "--data", str(console.folder))
-    assert "2 of 2 clusters heard" in ctl("viewer", *where, "status").stdout
+    assert "2 of 2 clusters reporting" in ctl("viewer", *where, "status").stdout
     for what in ("alarms", "events", "packets", "holds", "retries", "schedule", "emergency", name):
         shown = ctl("viewer", *where, "show", what)
         assert shown.exit_code == 0, shown.output

@@ -187,7 +187,9 @@ def test_aim_a_group_at_a_point_of_the_flux_picture(
     page.select_option("dialog [name=where]", receiver.name)
     page.fill("dialog [name=right]", "99")
     page.click("dialog button >> text='Aim'")
-    page.wait_for_selector("dialog [role=alert]:has-text('99 m right of its middle is not on it')")
+    page.wait_for_selector(
+        "dialog [role=alert]:has-text('99 m right of its centre is outside its surface')"
+    )
     assert page.input_value("dialog [name=right]") == "99"
     page.select_option("dialog [name=where]", "standby")
     page.click("dialog button >> text='Aim'")

@@ -81,10 +81,13 @@ def test_what_cannot_be_saved_is_said(
 ) -> None:
     first, _, third, fourth = console.live.names[:4]
     for words, text in (
-        (("--save", tmp_path), "--save needs the heliostat"),
+        (("--save", tmp_path), "--save needs the name of a heliostat"),
         ((first, "--save", tmp_path / "token"), "File exists"),
-        ((third, "--save", tmp_path / "no"), "no photograph of its last calibration is kept"),
-        ((fourth, "--save", tmp_path / "no"), "has no result of a calibration yet"),
+        (
+            (third, "--save", tmp_path / "no"),
+            "no photograph from its last calibration is available",
+        ),
+        ((fourth, "--save", tmp_path / "no"), "no calibration result yet"),
     ):
         found = photographs(*words)
         assert text in str(found.exception), words

@@ -55,7 +55,7 @@ def test_what_cannot_be_is_one_line(
     name = console.live.names[0]
     entry = {"name": "e", "heliostats": [name], "at": ["12:00Z"]}
     for wrong, status, text in (
-        ({"at": ["12:00"]}, 422, "has no zone; write 12:00Z"),
+        ({"at": ["12:00"]}, 422, "has no time zone; write 12:00Z"),
         ({"heliostats": ["nobody"]}, 404, "nobody"),
         ({"every_s": 1.0}, 422, "60"),
     ):
@@ -66,10 +66,10 @@ def test_what_cannot_be_is_one_line(
     secret.write_text(tokens["operator"])
     where = ["ctl", "--url", console.address, "--token-file", str(secret), "timetable"]
     for words, text in (
-        (["noon"], "give NAME HELIOSTAT"),
+        (["noon"], "use NAME HELIOSTAT"),
         (["noon", "--remove"], "there is no timetable entry 'noon'"),
         (["noon", name, "--every", "2 weeks"], "write it as 30s, 5min or 1h"),
-        (["noon", name, "--plant-file"], "--plant-file goes alone"),
+        (["noon", name, "--plant-file"], "--plant-file cannot be combined"),
     ):
         found = CliRunner().invoke(app, [*where, *words])
         assert found.exit_code != 0

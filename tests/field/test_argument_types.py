@@ -27,7 +27,7 @@ UP = np.array([0.0, 0.0, 1.0])
         (lambda: ht.read_field_sightings(PLANT, None), "place is a NoneType"),
         (lambda: ht.read_field_sightings(PLANT, "p", now="today"), "now is a str, 'today'"),
         (lambda: ht.read_field_sightings(PLANT, "p", now=float("nan")), "now is nan"),
-        (lambda: ht.read_field_sightings(PLANT, "p", centroid="x"), "centroid 'x': give 'utis'"),
+        (lambda: ht.read_field_sightings(PLANT, "p", centroid="x"), "centroid 'x': use 'utis'"),
         (lambda: ht.track(ONE, UP, UP, local="no"), "local is a str, 'no'; give True or False"),
         (lambda: ht.track(ONE, UP, UP, newton=None), "newton is a NoneType"),
     ],

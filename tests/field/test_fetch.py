@@ -268,7 +268,7 @@ def test_giving_up_keeps_what_is_there_for_the_next_run(database: Database, tmp_
     text = str(error.value)
     assert re.match(
         r"heliostat AA39: http://127\.0\.0\.1:\d+/WRI1030197/AA39/Properties/AA39-heliostat-properties"
-        r"\.json: the server answers 503 Service Unavailable; gave up after 4 attempts; run it "
+        r"\.json: the server replied 503 Service Unavailable; gave up after 4 attempts; run it "
         r"again later, completed parts are kept$",
         text,
     )
@@ -382,7 +382,7 @@ def test_a_rest_that_is_only_the_next_piece_is_one_more_step(
 
 def test_a_rest_that_nobody_asked_for_is_refused(database: Database, tmp_path: Path) -> None:
     database.fail(BIG, lambda _: Answer(206, {"Content-Range": "bytes 0-1/9"}, b"{}"))
-    assert "the server answers 206 Partial Content" in refused(database, tmp_path)
+    assert "the server replied 206 Partial Content" in refused(database, tmp_path)
 
 
 def test_a_process_that_was_killed_goes_on(database: Database, tmp_path: Path) -> None:

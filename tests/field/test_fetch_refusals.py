@@ -73,12 +73,12 @@ def test_a_missing_file_names_the_heliostat(database: Database, tmp_path: Path, 
     text = refused(database, tmp_path)
     assert text.startswith("heliostat AA39: http://")
     assert gone in text
-    assert "there is no such file (the server answers 404 Not Found)" in text
+    assert "there is no such file (the server replied 404 Not Found)" in text
 
 
 def test_forbidden_is_not_tried_again(database: Database, tmp_path: Path) -> None:
     database.fail(BIG, status(403))
-    assert "the server answers 403 Forbidden" in refused(database, tmp_path)
+    assert "the server replied 403 Forbidden" in refused(database, tmp_path)
     assert len(database.requests(BIG)) == 1
 
 
@@ -89,10 +89,14 @@ ITEM = "AA39/Properties/AA39-item-stac.json"
 @pytest.mark.parametrize(
     ("path", "content", "problem"),
     [
-        (CATALOGUE, b"<html>busy</html>", "the answer is not JSON; it begins '<html>busy</html>'"),
-        (CATALOGUE, b"", "the answer is not JSON; it begins ''"),
-        (CATALOGUE, b'{"links": [', "the answer is not JSON"),
-        (CATALOGUE, b"\xff\xfe\x00", "the answer is not JSON"),
+        (
+            CATALOGUE,
+            b"<html>busy</html>",
+            "the reply is not JSON; it begins with '<html>busy</html>'",
+        ),
+        (CATALOGUE, b"", "the reply is not JSON; it begins with ''"),
+        (CATALOGUE, b'{"links": [', "the reply is not JSON"),
+        (CATALOGUE, b"\xff\xfe\x00", "the reply is not JSON"),
         (CATALOGUE, b"[1, 2]", "not a STAC document but a list or value"),
         (CATALOGUE, b"{}", "not a STAC catalogue: it has no list of links"),
         (CATALOGUE, b'{"links": [3]}', "not a STAC catalogue: it has no list of links"),
@@ -103,7 +107,7 @@ ITEM = "AA39/Properties/AA39-item-stac.json"
         ),
         (ITEM, b'{"links": []}', "not a STAC item: it names no files with addresses"),
         (ITEM, b'{"assets": {"a": {"href": 7}}}', "not a STAC item: it names no files"),
-        (BIG, b"<html>moved</html>", "the answer is not JSON; it begins '<html>moved</html>'"),
+        (BIG, b"<html>moved</html>", "the reply is not JSON; it begins with '<html>moved</html>'"),
     ],
 )
 def test_garbage_is_refused(
@@ -211,7 +215,7 @@ def test_places_that_cannot_be_written_to(database: Database, tmp_path: Path) ->
     (tmp_path / "file").write_text("x")
     assert "cannot be used (File exists)" in refused(database, tmp_path / "file")
     (tmp_path / "AA39").write_text("x")
-    assert "cannot be made (" in refused(database, tmp_path)
+    assert "cannot be created (" in refused(database, tmp_path)
     (tmp_path / "AA39").unlink()
     (tmp_path / (BIG + ".part")).mkdir(parents=True)
     assert "cannot be written (Is a directory)" in refused(database, tmp_path)
@@ -233,7 +237,7 @@ def test_a_silent_server_is_said(database: Database, tmp_path: Path) -> None:
     text = refused(
         database, tmp_path, settings=FetchSettings(timeout=0.1, retries=1, backoff=0.0), client=None
     )
-    assert "the server does not answer in time" in text
+    assert "the server did not reply in time" in text
 
 
 def test_compressed_answers(database: Database, tmp_path: Path) -> None:
@@ -244,7 +248,7 @@ def test_compressed_answers(database: Database, tmp_path: Path) -> None:
     get(database, tmp_path)
     assert (tmp_path / BIG).read_bytes() == database.files[f"/{PLANT}/{BIG}"]
     database.fail(CATALOGUE, *[lambda _: Answer(200, packed, b"no gzip")] * 9)
-    assert "the answer cannot be unpacked" in refused(database, tmp_path)
+    assert "the server's reply cannot be decompressed" in refused(database, tmp_path)
 
 
 def test_endless_redirects_are_said(database: Database, tmp_path: Path) -> None:
@@ -261,7 +265,7 @@ def test_a_bad_address_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", "../AA39", "AA 39", "AA39/x", "x" * 65])
 def test_names_of_heliostats_are_checked(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="give a name of letters and digits, such as AA39"):
+    with pytest.raises(InputError, match="use a name of letters and digits, such as AA39"):
         fetch_heliostats(name, tmp_path)
 
 
@@ -275,7 +279,7 @@ def test_kinds_and_images_are_checked(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("wrong", "problem"),
     [
-        ({"workers": 0}, "workers 0: give 1 to 32"),
+        ({"workers": 0}, "workers 0: must be 1 to 32"),
         ({"workers": 33}, "workers 33"),
         ({"timeout": 0.0}, "timeout 0.0 s must be above 0"),
         ({"timeout": float("nan")}, "timeout nan s"),

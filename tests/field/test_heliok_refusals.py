@@ -10,18 +10,18 @@ from heliotrope.field.formats import heliok
 from support.heliok_files import SCENE, SITE, edited
 
 WRONG = [
-    ('unitLength="m" ', "", "line 3: <HelioK> has no unitLength; give one"),
+    ('unitLength="m" ', "", "line 3: <HelioK> has no unitLength; add the attribute"),
     ('unitLength="m"', 'unitLength="inch"', "unitLength 'inch' is not one of m, cm, mm, km"),
     ('unitAngle="deg"', 'unitAngle="gon"', "unitAngle 'gon' is not one of rad, mrad, deg"),
     ("<HelioK ", "<HelioQ ", "not well-formed XML"),
-    ('translation="0, 0, 1.5"', "", "<Primary> has no translation; give one"),
+    ('translation="0, 0, 1.5"', "", "<Primary> has no translation; add the attribute"),
     ('translation="0, 0, 1.5"', 'translation=" "', "<Primary> has no translation"),
     ('"0, 0, 1.5"', '"0, 0"', "translation has 2 numbers; it needs 3"),
     ('"0, 0, 1.5"', '"0, 0, nan"', "<Primary> translation: 'nan' is not a finite number"),
     ('"0, 0, 1.5"', '"0, 0, 1e999"', "'1e999' is not a finite number"),
     ('"0, 0, 1.5"', '"0, 0, 1_5"', "'1_5' is not a finite number"),
-    ('"0, 0, 1.5"', '"0, 0, 1.5 deg"', "unit 'deg' is not known here; known: m, cm, mm, km"),
-    ('normal="0, 1, 0"', 'normal="0, 1, 0 m"', "unit 'm' is not known here; known: none"),
+    ('"0, 0, 1.5"', '"0, 0, 1.5 deg"', "unknown unit 'deg'; known: m, cm, mm, km"),
+    ('normal="0, 1, 0"', 'normal="0, 1, 0 m"', "unknown unit 'm'; known: none"),
     ('rotationAxis="0, 0, -1"', 'rotationAxis="0, 0, 0"', "a vector of length 0 has no direction"),
     (
         'rotationAxis="0, 0, -1"',
@@ -38,7 +38,7 @@ WRONG = [
     (
         '<Aiming point="0, 0, 20"/>',
         "<Tracking/>",
-        "<HeliostatKit> AzEl has 2 elements <Tracking>; it needs one",
+        "<HeliostatKit> AzEl has 2 elements <Tracking>; it needs exactly one",
     ),
     ('xWidth="2.4"', 'xWidth="-2.4"', "<ApertureRectangular> -2.4 m × 1.8 m: both must be above 0"),
     (
@@ -46,7 +46,7 @@ WRONG = [
         "<Facet>",
         "<Facet> rotation: its normal stands 90° from that",
     ),
-    ('xWidth="2.4"', "", "<ApertureRectangular> has no x; give one"),
+    ('xWidth="2.4"', "", "<ApertureRectangular> has no x; add the attribute"),
     (
         '<ApertureRectangular xWidth="2.4"',
         '<ApertureDisk xWidth="2.4"',
@@ -57,10 +57,14 @@ WRONG = [
         '<HeliostatKit ref="AzIl"/>',
         "there is no HeliostatKit 'AzIl'; did you mean AzEl?",
     ),
-    ('<HeliostatKit ref="AzEl"/>', "<HeliostatKit/>", "<HeliostatKit> has no ref; give one"),
+    (
+        '<HeliostatKit ref="AzEl"/>',
+        "<HeliostatKit/>",
+        "<HeliostatKit> has no ref; add the attribute",
+    ),
     ('name="HeliostatB"', 'name="HeliostatA"', "heliostat HeliostatA: the name occurs twice"),
-    ('name="HeliostatB"', "", "a heliostat whose node has no name; give it one"),
-    ('name="AzEl"', "", "<HeliostatKit> has no name; give one"),
+    ('name="HeliostatB"', "", "a heliostat node has no name; name it"),
+    ('name="AzEl"', "", "<HeliostatKit> has no name; add the attribute"),
     (
         "</HeliostatKit>\n  </Factory>",
         '</HeliostatKit><HeliostatKit name="AzEl"/></Factory>',
@@ -88,9 +92,9 @@ def test_the_line_is_named(tmp_path: Path) -> None:
 
 def test_the_world_is_needed_once(tmp_path: Path) -> None:
     path = edited(tmp_path, "</World>", "</World><World/>")
-    with pytest.raises(FormatError, match="has 2 elements <World>; it needs one"):
+    with pytest.raises(FormatError, match="has 2 elements <World>; it needs exactly one"):
         heliok.sun(heliok.read(path))
-    with pytest.raises(FormatError, match="has 0 elements <Location>; it needs one"):
+    with pytest.raises(FormatError, match="has 0 elements <Location>; it needs exactly one"):
         heliok.site(heliok.read(edited(tmp_path, "<Location", "<Place")), 0.0)
 
 
@@ -99,7 +103,7 @@ def test_a_mirror_needs_a_facet(tmp_path: Path) -> None:
     path = tmp_path / "bare.xml"
     path.write_text(re.sub(r"<Facet.*</Facet>", "", text, flags=re.DOTALL), encoding="utf-8")
     with pytest.raises(
-        FormatError, match="HeliostatKit AzEl: no <Facet>, so its mirror has no size"
+        FormatError, match="HeliostatKit AzEl: no <Facet>, so the mirror has no size"
     ):
         heliok.to_plant(heliok.read(path), SITE)
 

@@ -230,8 +230,8 @@ def test_a_layout_is_written_and_read(table: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "count", "more", "text"),
     [
-        ("six-packs", 0, {}, "layout: 0 heliostats; give 1 to 1000000"),
-        ("rows", 10, {"tower_height": 5.0}, "tower height 5.0 m; give 20 to 500 m"),
+        ("six-packs", 0, {}, "layout: 0 heliostats; must be 1 to 1000000"),
+        ("rows", 10, {"tower_height": 5.0}, "tower height 5.0 m; must be 20 to 500 m"),
         ("radial", 10, {"tower_height": float("nan")}, "tower height nan m"),
     ],
 )
@@ -251,7 +251,7 @@ def test_an_unknown_pattern_names_the_known() -> None:
         ({"width": 0.0}, "mirror: width 0.0 m must be above 0"),
         ({"height": float("inf")}, "mirror: height inf m"),
         ({"clearance": -0.1}, "mirror: clearance -0.1 m must be 0 or more"),
-        ({"pivot_height": 0.9}, "upright it would touch the ground"),
+        ({"pivot_height": 0.9}, "so it would touch the ground when upright"),
     ],
 )
 def test_mirrors_that_cannot_be(values: dict[str, float], text: str) -> None:
@@ -333,8 +333,8 @@ def test_the_command_tells_json(tmp_path: Path) -> None:
     ("arguments", "text"),
     [
         (("rings",), "there is no layout 'rings'"),
-        (("rows", "--table", "xls"), "table 'xls': give csv or parquet"),
-        (("rows", "--picture", "p.bmp"), "give a file that ends in .png, .svg or .pdf"),
+        (("rows", "--table", "xls"), "table 'xls': use csv or parquet"),
+        (("rows", "--picture", "p.bmp"), "the file name must end in .png, .svg or .pdf"),
     ],
 )
 def test_the_command_refuses_and_leaves_nothing(

@@ -164,11 +164,11 @@ def test_a_receiver_turns_and_a_renamed_target_stays_with_its_camera(file: Path)
     ("who", "given", "text"),
     [
         ("A1", {"east_m": "90000"}, "outside -50000 to 50000 m"),
-        ("A1", {"cluster": ""}, "has these values already"),
+        ("A1", {"cluster": ""}, "the values are already in use"),
         ("A1", {"group": "azal"}, "group 'azal' is not in plant.toml"),
-        ("A1", {"east_m": "ten"}, "give a number"),
+        ("A1", {"east_m": "ten"}, "enter a number"),
         ("target", {"center_m": "1,2"}, "three numbers in metres"),
-        ("target", {"tilt_deg": "90"}, "less than 90°"),
+        ("target", {"tilt_deg": "90"}, "between -90° and 90°"),
         ("target", {"width_m": "-3"}, "greater than 0"),
     ],
 )
@@ -222,5 +222,5 @@ def test_the_command_shows_sets_lists_and_restores(file: Path) -> None:
     assert "until" not in run("set", place, "A1", "up_m=0.5")
     listed = run("versions", place)
     assert "A1: up_m 0 -> 0.5" in listed
-    assert "brought back" in run("restore", place, listed.split()[0])
+    assert "restored" in run("restore", place, listed.split()[0])
     assert file.with_name("field.csv").read_text() == TABLE

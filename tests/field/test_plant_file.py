@@ -230,7 +230,7 @@ def test_the_parameter_of_an_own_joint_is_refused(tmp_path: Path) -> None:
     leaning = replace(
         still, groups={name: still.groups[name].with_parameters({"mast_north": 0.01})}
     )
-    with pytest.raises(InputError, match="parameter mast_north belongs to an own joint"):
+    with pytest.raises(InputError, match="parameter mast_north belongs to a user-defined joint"):
         plant_file.write_plant(leaning, tmp_path / "leaning.toml")
     assert not (tmp_path / "leaning.toml").exists()
 
@@ -449,16 +449,24 @@ def test_group_without_a_machine_reads_and_is_refused_where_one_is_needed(tmp_pa
 @pytest.mark.parametrize(
     ("before", "after", "text"),
     [
-        ("stow_deg = [90, 88]", "", "give either stow_steps or stow_deg"),
+        ("stow_deg = [90, 88]", "", "set either stow_steps or stow_deg"),
         ("stow_deg = [90, 88]", "stow_deg = [90, 100]", "stow at 111111 steps of the secondary"),
         ("defocus_mrad", "defocus_rad", "defocus by 5.73e+03°; one axis must turn by 1.15°"),
-        ("defocus_mrad = [100, 50]", "", "give one of defocus_deg, defocus_mrad, defocus_rad"),
+        ("defocus_mrad = [100, 50]", "", "set one of defocus_deg, defocus_mrad, defocus_rad"),
         ("rate_steps_per_s = 8000", "rate_steps_per_s = 20000", "controller emits 10000 at most"),
         ("backlash_steps = 40", "", "groups.azel.machine.axes.azimuth.backlash_steps"),
         ("max_deg = 93.6", "", "max_deg is missing; its drive does not give it"),
-        ("max_steps = 222222", "max_steps = 222222\nmax_deg = 1", "in steps and in deg; keep one"),
+        (
+            "max_steps = 222222",
+            "max_steps = 222222\nmax_deg = 1",
+            "in steps and in degrees; keep one",
+        ),
         ("max_steps = 222222", "max_steps = -222222", "the low end comes first"),
-        ("axes.elevation]", "axes.roll]", "axes of azimuth, roll; give those of azimuth and elev"),
+        (
+            "axes.elevation]",
+            "axes.roll]",
+            "axes of azimuth, roll; specify those of azimuth and elev",
+        ),
         ('"elevation"', '"roll"', "'roll' is no driven joint"),
         ("standby_m = [12, 0, 40]", "standby_m = [12, 0]", "groups.azel.machine.standby_m"),
     ],
@@ -513,7 +521,7 @@ def test_joint_visits_are_read_and_survive(tmp_path: Path) -> None:
         ("most = 25", "most = 2.5", "joint_visits.most: "),
         ("known_mrad = 3", "known_mrad = 0", "known_mrad 0 (largest"),
         ("known_mrad = 3", "known = 3", "joint_visits.known: "),
-        ("most = 25", "known_rad = 0.003", "known is given twice, the second time as known_rad"),
+        ("most = 25", "known_rad = 0.003", "known is set twice, the second time as known_rad"),
     ],
 )
 def test_joint_visits_that_cannot_be_are_one_line(
@@ -628,10 +636,10 @@ def test_receiver_visits_are_read_and_survive(tmp_path: Path) -> None:
     [
         (
             "power = 0.02",
-            "receiver_visits: receiver visits: power 0.02 (largest share of the power",
+            "receiver_visits: receiver visits: power 0.02 (largest fraction of the power",
         ),
         ("movement = 1", "receiver_visits.movement: "),
-        ("worth_mrad = 1\nworth_rad = 0.001", "worth is given twice"),
+        ("worth_mrad = 1\nworth_rad = 0.001", "worth is set twice"),
     ],
 )
 def test_receiver_visits_that_cannot_be_are_one_line(more: str, text: str, tmp_path: Path) -> None:
@@ -704,7 +712,7 @@ def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]
         ({"center": (-19.0, -20.0, 1.0)}, "receiver receiver: its centre is 0."),
         ({"center": (0.0, 0.0, -16.5)}, "its centre, -16.50 m up, is below every heliostat"),
         ({"normal": (0.0, 1.0, 0.0)}, "18 of 18 heliostats stand behind its plane"),
-        ({"center": (0.0, 0.0, 13.0)}, "target and receiver have one centre"),
+        ({"center": (0.0, 0.0, 13.0)}, "target and receiver have the same centre"),
     ],
 )
 def test_check_names_a_receiver_that_cannot_be_meant(

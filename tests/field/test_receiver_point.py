@@ -35,5 +35,7 @@ def test_on_a_sector_the_middle_is_its_centre() -> None:
 @pytest.mark.parametrize(("right", "up"), [(3.1, 0.0), (0.0, -2.1), (float("nan"), 0.0)])
 def test_beside_it_is_refused(right: float, up: float) -> None:
     plate = Receiver("r", "planar", CENTER, SOUTH, 6.0, 4.0)
-    with pytest.raises(InputError, match=r"receiver r: a point .* is not on it; give at most"):
+    with pytest.raises(
+        InputError, match=r"receiver r: a point .* is outside its surface; use at most"
+    ):
         plate.point(right, up)

@@ -342,22 +342,25 @@ def test_degrees_of_a_header_become_metres(tmp_path: Path) -> None:
     np.testing.assert_allclose(plant.position, expected, atol=1e-9)
     # A degree of latitude is 111 km: 0.0009° north and 0.0011° west.
     np.testing.assert_allclose(plant.position[0], [-97.2, 99.9, 1.0], atol=0.1)
-    with pytest.raises(FormatError, match="line 1: positions are in degrees; give the site"):
+    with pytest.raises(FormatError, match="line 1: positions are in degrees; specify the site"):
         solarpilot.read_layout(tmp_path / "layout.csv")
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("id,x,y\n1,2,3\n", "line 1: the header (id, x, y) gives no positions; give id,x,y,z"),
-        ("Vorlage,Länge,Höhe,z\n0,1,2,3\n", "the header (Vorlage, Länge, Höhe, z) gives no"),
-        ("id,lat,lon\n1,37.5,-5.25\n", "the header (id, lat, lon) gives no positions"),
-        ("id,x [mm],y,z\n1,2000,3,0\n", "column x [mm] is in mm; give m"),
-        ("id,x,y,z\n,[ft],[ft],[ft]\n1,2,3,0\n", "column x is in ft; give m"),
-        ("id,x_km,y_km,z\n1,2,3,0\n", "column x_km is in km; give m"),
-        ("id,lat_rad,lon,alt\n1,0.65,-5.25,100\n", "column lat_rad is in rad; give deg"),
-        ("id,x,east,y,z\n1,2,3,4,0\n", "two columns give x; keep one"),
-        ("id,x,y,z,z\n1,2,3,4,0\n", "two columns give z; keep one"),
+        (
+            "id,x,y\n1,2,3\n",
+            "line 1: the header (id, x, y) names no position columns; give id,x,y,z",
+        ),
+        ("Vorlage,Länge,Höhe,z\n0,1,2,3\n", "the header (Vorlage, Länge, Höhe, z) names no"),
+        ("id,lat,lon\n1,37.5,-5.25\n", "the header (id, lat, lon) names no position columns"),
+        ("id,x [mm],y,z\n1,2000,3,0\n", "column x [mm] is in mm; use m"),
+        ("id,x,y,z\n,[ft],[ft],[ft]\n1,2,3,0\n", "column x is in ft; use m"),
+        ("id,x_km,y_km,z\n1,2,3,0\n", "column x_km is in km; use m"),
+        ("id,lat_rad,lon,alt\n1,0.65,-5.25,100\n", "column lat_rad is in rad; use deg"),
+        ("id,x,east,y,z\n1,2,3,4,0\n", "two columns hold x; keep one"),
+        ("id,x,y,z,z\n1,2,3,4,0\n", "two columns hold z; keep one"),
         ("id,x,y,z\nunits,east,north,up\n1,2,3,4\n", "no number below the header"),
         ("id,x,y,z\n1,2,3\n", "line 2: heliostat 1: 3 cells under 4 columns"),
         ("Template,x,y,z\n0,2,3,0,5,6\n", "6 cells under 4 columns; correct the line"),
@@ -366,9 +369,12 @@ def test_degrees_of_a_header_become_metres(tmp_path: Path) -> None:
         ("id,lat,lon,alt\n1,91,-5.25,100\n", "column lat: heliostat 1: 91 is outside -90 to 90"),
         ("id,lat,lon,alt\n1,-5.25,37.5,100\n", "puts it outside -50000 to 50000 m from the site"),
         ("id,lat,lon,alt\n1,37.5,-5.25,2500\n", "column alt: heliostat 1: 2500 puts it outside"),
-        ("1,7.25,79.5,0\n2,21,77,0\n3,35,70,0\n", "another number in column 1, as ids have"),
+        (
+            "1,7.25,79.5,0\n2,21,77,0\n3,35,70,0\n",
+            "column 1 has a different number in each row, like ids",
+        ),
         ("name,group,east_m,north_m,up_m\nA1,azel,1,2,0\n", "this is the table of a plant file"),
-        ("id|x|y|z\n", "there is no heliostat in it"),
+        ("id|x|y|z\n", "there are no heliostats"),
         ('{"id": [0, 1]}', "this is JSON, not a table of heliostats"),
         ("<HelioK/>", "this is a HelioK scene, not a table of heliostats"),
         ('# c\nformat = "heliotrope-plant"\n', "this is a plant file, not a table of heliostats"),
@@ -400,7 +406,7 @@ def test_two_rows_for_a_photograph_are_refused_with_both_lines(tmp_path: Path) -
     def change(t: list[list[str]]) -> bytes:
         return _text([*t, ["17.png", *t[2][1:]]]).encode()
 
-    with pytest.raises(FormatError, match=r"line 4, column file: 17\.png has the row line 2 too"):
+    with pytest.raises(FormatError, match=r"line 4, column file: 17\.png also appears in line 2"):
         _written(tmp_path, "log", change)
 
 
@@ -414,7 +420,7 @@ def test_a_file_and_an_id_of_one_photograph_are_refused(
     if not same:
         _written(tmp_path, "log", change)
         return
-    says = r"line 2, column file: 17\.png and 17 of line 4 name one photograph; keep the true row"
+    says = r"17\.png and 17 of line 4 refer to the same photograph; keep the correct row"
     with pytest.raises(FormatError, match=says):
         _written(tmp_path, "log", change)
 
@@ -425,7 +431,7 @@ def test_a_log_names_columns_times_and_rows_without_a_photograph(tmp_path: Path)
         ("file", "photo", "there is no column file; add it"),
         ("10:00:00Z", "10:00:00", "column timestamp: 2026-09-02T10:00:00 has no time zone"),
         ("2026-09-02T10:00:00Z", "02.09.2026 10:00", "is not an ISO 8601 time"),
-        ("17.png", "", "line 2, column file: neither file nor id is given; give one"),
+        ("17.png", "", "line 2, column file: neither file nor id is filled in; enter one"),
     ):
         with pytest.raises(FormatError) as error:
             _written(tmp_path, "log", lambda t, o=old, n=new: _text(t).replace(o, n, 1).encode())
@@ -599,18 +605,20 @@ def test_a_site_of_another_type_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_a_layout_with_two_heliostats_at_one_place_is_refused_with_its_file(tmp_path: Path) -> None:
     layout = tmp_path / "layout.csv"
     layout.write_text("id,x,y,z\nA,10,20,0\nB,10,20,0\n")
-    with pytest.raises(FormatError, match=r"layout\.csv: heliostats A and B stand at one place"):
+    with pytest.raises(
+        FormatError, match=r"layout\.csv: heliostats A and B have the same position"
+    ):
         open_plant(layout, site=SITE)
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("id,x,y,z,units\nA,10,20,0,ft\n", "a column of units is not read; give metres"),
-        ("1,10,20,0\n2,30,20,0\n", "each row has another number in column 1, as ids have"),
-        ("id,x_mm,y_mm,z_mm\nA,10,20,0\n", "column x_mm is in mm; give m"),
-        ("id,x/m,y/km,z/m\nA,10,20,0\n", "column y/km is in km; give m"),
-        ("id,x,y,z\nA,10m,20m,0m\n", "'10m' has more than a number: give metres without"),
+        ("id,x,y,z,units\nA,10,20,0,ft\n", "unit columns are not read; use metres"),
+        ("1,10,20,0\n2,30,20,0\n", "column 1 has a different number in each row, like ids"),
+        ("id,x_mm,y_mm,z_mm\nA,10,20,0\n", "column x_mm is in mm; use m"),
+        ("id,x/m,y/km,z/m\nA,10,20,0\n", "column y/km is in km; use m"),
+        ("id,x,y,z\nA,10m,20m,0m\n", "'10m' is not a plain number: write metres without"),
     ],
 )
 def test_units_and_ids_of_a_layout_are_not_guessed(tmp_path: Path, text: str, says: str) -> None:
@@ -629,9 +637,9 @@ def test_a_layout_with_metres_and_degrees_says_which_it_reads(tmp_path: Path) ->
 def test_an_argument_that_a_format_has_no_use_for_is_refused(tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     write_plant(example_plant(), plant)
-    with pytest.raises(FormatError, match="site is given, but files of this format"):
+    with pytest.raises(FormatError, match="site is specified, but files of this format"):
         open_plant(plant, site=SITE)
     layout = tmp_path / "layout.csv"
     layout.write_text("id,x,y,z\nA,10,20,0\n")
-    with pytest.raises(FormatError, match="centroids is given"):
+    with pytest.raises(FormatError, match="centroids is specified"):
         open_plant(layout, site=SITE, centroids=layout)

@@ -71,16 +71,16 @@ def test_no_time_is_missed_or_taken_twice(
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({"heliostats": ()}, "give it a name and at least one heliostat"),
-        ({"name": ""}, "give it a name"),
-        ({"heliostats": ("A", "B", "A")}, "heliostat A stands in it twice"),
-        ({"at": ()}, "no time; give times of day"),
-        ({"at": ("8:30",)}, "'8:30' is no time of day; write 08:30Z"),
-        ({"at": ("25:00Z",)}, "'25:00Z' is no time of day"),
-        ({"at": ("08:30",)}, "'08:30' has no zone; write 08:30Z for UTC"),
-        ({"at": ("08:30Z",) * 97}, "97 times of day; give at most 96"),
-        ({"every": 30.0}, "an interval of 30 s; give 60 to 86400 s"),
-        ({"every": float("nan")}, "an interval of nan s"),
+        ({"heliostats": ()}, "needs a name and at least one heliostat"),
+        ({"name": ""}, "needs a name"),
+        ({"heliostats": ("A", "B", "A")}, "heliostat A is listed twice"),
+        ({"at": ()}, "no time is set; specify times of day"),
+        ({"at": ("8:30",)}, "'8:30' is not a time of day; write 08:30Z"),
+        ({"at": ("25:00Z",)}, "'25:00Z' is not a time of day"),
+        ({"at": ("08:30",)}, "'08:30' has no time zone; write 08:30Z for UTC"),
+        ({"at": ("08:30Z",) * 97}, "97 times of day; at most 96"),
+        ({"every": 30.0}, "interval is 30 s; must be 60 to 86400 s"),
+        ({"every": float("nan")}, "interval is nan s"),
     ],
 )
 def test_entries_that_cannot_be(values: dict[str, Any], text: str) -> None:
@@ -125,10 +125,10 @@ def test_a_timetable_is_written_and_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "text"),
     [
-        ('"12:00Z"', '"12:00"', "timetable[0]: timetable entry 'noon': '12:00' has no zone"),
+        ('"12:00Z"', '"12:00"', "timetable[0]: timetable entry 'noon': '12:00' has no time zone"),
         ("P0001C", "P0009C", "there is no heliostat 'P0009C'"),
         ("every_s = 3600.0", "every = 3600.0", "timetable.1.every"),
-        ("every_s = 3600.0", "every_s = 1", "an interval of 1 s; give 60 to 86400 s"),
+        ("every_s = 3600.0", "every_s = 1", "interval is 1 s; must be 60 to 86400 s"),
     ],
 )
 def test_a_file_with_a_wrong_timetable_is_one_line(

@@ -489,7 +489,7 @@ def test_like_targets_are_told_by_the_camera_alone() -> None:
     frame = plain().frame
     unsure = find_targets(frame, (TARGET, other))
     assert [f.reason for f in unsure] == [
-        f"the frame may show {name} there; name the targets that the camera sees"
+        f"the frame may show {name} there; specify which targets the camera sees"
         for name in ("other", "target")
     ]
     first, second = find_targets(frame, (TARGET, other), CAMERA)

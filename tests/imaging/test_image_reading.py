@@ -281,8 +281,8 @@ CLEAR = np.dstack([COLOUR, np.zeros(COLOUR.shape[:2], COLOUR.dtype)])
 BMP, WEBP = _encode(".bmp", COLOUR), _encode(".webp", COLOUR)
 PAGES = TIFF[:130] + struct.pack("<I", len(TIFF)) + TIFF[134:]
 BAD: dict[str, tuple[bytes, str]] = {
-    "empty": (b"", "the file is empty; give an image (PNG, JPEG, TIFF, BMP or WebP)"),
-    "text": (b"not an image at all", "not an image of a known kind; give a PNG"),
+    "empty": (b"", "the file is empty; use an image (PNG, JPEG, TIFF, BMP or WebP)"),
+    "text": (b"not an image at all", "not a supported image format; use a PNG"),
     "gif": (b"GIF89a" + bytes(50), "this is a GIF file; convert it to a PNG"),
     "pdf": (b"%PDF-1.7", "this is a PDF file"),
     "heic": (b"\0\0\0\x18ftypheic", "this is an AVIF, a HEIC or a video file"),
@@ -293,7 +293,7 @@ BAD: dict[str, tuple[bytes, str]] = {
     "png few rows": (_png(0, 8, (32, 20), ROWS[:300]), "this PNG is truncated"),
     "png text": (PNG[:33] + _flip(_chunk(b"tEXt", b"a\0b"), -1) + PNG[33:], "PNG is damaged"),
     "png small": (
-        _png(0, 8, (15, 20), ROWS), "15 × 20 px; an image needs 16 × 16 px or more"
+        _png(0, 8, (15, 20), ROWS), "15 × 20 px; an image must have at least 16 × 16 px or more"
     ),
     "png huge": (
         _huge(PNG), "10000 × 10000 px are 100 million, above the limit of 64 million; reduce"
@@ -301,7 +301,7 @@ BAD: dict[str, tuple[bytes, str]] = {
     "png animated": (
         _png(0, 8, (32, 20), ROWS, _chunk(b"acTL", bytes(8))), "this PNG is animated"
     ),
-    "png transparent": (_encode(".png", CLEAR), "every pixel is transparent: it shows nothing"),
+    "png transparent": (_encode(".png", CLEAR), "every pixel is transparent, so the image"),
     "jpeg half": (JPEG[: len(JPEG) // 2], "this JPEG is truncated: it ends after 1031 bytes"),
     "jpeg start": (JPEG[:30], "this JPEG is truncated: it ends after 30 bytes"),
     "jpeg no end": (JPEG[:-2], "this JPEG is truncated"),
@@ -322,7 +322,7 @@ BAD: dict[str, tuple[bytes, str]] = {
     "tiff float": (_tiff(RAMP * 4, t258=[32], t339=[3]), "its pixels are floats of 32 bits"),
     "tiff signed": (_tiff(RAMP * 2, t258=[16], t339=[2]), "pixels of 16 bits, form 2; convert"),
     "tiff lab": (_tiff(RAMP * 3, t258=[8] * 3, t262=[8], t277=[3]), "3 channels of kind 8"),
-    "tiff no strips": (_tiff(RAMP, t279=[1, 2]), "its directory names no strips"),
+    "tiff no strips": (_tiff(RAMP, t279=[1, 2]), "its TIFF directory lists no strips"),
     "bigtiff": (b"II+\0" + bytes(40), "this is a BigTIFF file; convert it"),
     "bmp half": (BMP[: len(BMP) // 2], "this BMP is truncated"),
     "bmp old": (BMP[:14] + struct.pack("<I", 12) + BMP[18:], "this BMP cannot be read (Unsupp"),
@@ -354,7 +354,7 @@ def test_bad_places_get_one_line(tmp_path: Path) -> None:
     link.symlink_to(tmp_path / "gone.png")
     os.mkfifo(pipe)
     cases: dict[Path, str] = {
-        tmp_path: "this is a folder; give an image file",
+        tmp_path: "this is a folder; specify an image file",
         tmp_path / "none.png": "there is no such file",
         link: f"a link to {tmp_path / 'gone.png'}, which does not exist",
         pipe: "this is a device or a pipe",

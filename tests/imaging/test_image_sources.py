@@ -217,7 +217,7 @@ def test_a_video_that_broke_off_says_how_much_is_missing(video: Path) -> None:
     assert 2 <= found <= 4
     assert source.missing == 7 - found
     video.write_bytes(whole[: len(whole) // 10])
-    with pytest.raises(FormatError, match="no video that OpenCV can read"):
+    with pytest.raises(FormatError, match="OpenCV cannot read this video"):
         list(VideoSource(video))
 
 
@@ -225,7 +225,7 @@ def test_bad_videos_get_one_line(tmp_path: Path) -> None:
     bad = tmp_path / "bad.avi"
     bad.write_bytes(b"RIFF nonsense")
     for path, text in (
-        (bad, "no video that OpenCV can read"),
+        (bad, "OpenCV cannot read this video"),
         (tmp_path / "none.avi", "there is no such file"),
         (tmp_path, "there is no such file"),
     ):
@@ -364,7 +364,7 @@ def test_streams_that_cannot_be_opened() -> None:
     with _server(camera) as port:
         lost = StreamSource(f"http://u:secret@127.0.0.1:{port}/other", **QUICK)
         with (
-            pytest.raises(FetchError, match=r"other: it answers, but not with video") as error,
+            pytest.raises(FetchError, match=r"other: it responds, but not with video") as error,
             lost,
         ):
             pass
@@ -376,7 +376,7 @@ def test_streams_that_cannot_be_opened() -> None:
     with pytest.raises(InputError, match="it is not open; use it in a with block"):
         next(iter(closed))
     for url in ("ftp://a/b", "http://", "http://h:99999999/", "nonsense"):
-        with pytest.raises(InputError, match=r"give rtsp://host/… or http://host/…"):
+        with pytest.raises(InputError, match=r"use rtsp://host/… or http://host/…"):
             StreamSource(url)
 
 
@@ -477,11 +477,11 @@ def test_what_goes_wrong_in_the_thread_is_told() -> None:
 
 def test_a_device_that_is_absent_is_a_clear_error() -> None:
     with (
-        pytest.raises(InputError, match=r"usb:/dev/video97: there is no such device; present: "),
+        pytest.raises(InputError, match=r"usb:/dev/video97: no such device; available: "),
         UsbSource(97),
     ):
         pass
-    with pytest.raises(InputError, match="source usb:front: give the number of a device"):
+    with pytest.raises(InputError, match="source usb:front: use a device number"):
         UsbSource("front")
 
 
@@ -574,11 +574,11 @@ def test_a_source_is_chosen_by_its_text(video: Path) -> None:
 def test_texts_that_are_no_source(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").touch()
     for text, wanted in {
-        "": "no source given; name a folder",
+        "": "no source specified; name a folder",
         "ftp://me:secret@host/a": r"source ftp://host/a: frames come over rtsp://, rtsps://, http://",
-        "none": "there is no such file: give a folder, an image or a video",
+        "none": "no such file: specify a folder, an image or a video",
         "a.xyz": "is neither a folder, an image or a video",
-        "usb:front": "give the number of a device",
+        "usb:front": "use a device number",
     }.items():
         with pytest.raises(InputError, match=wanted):
             open_source(text, folder=tmp_path)
@@ -639,7 +639,7 @@ def test_frames_that_have_no_average() -> None:
     with pytest.raises(InputError, match="no frame to average"):
         average([])
     for other in (_pixels(1), still.pixels.astype(np.uint16), np.dstack([still.pixels] * 3)):
-        with pytest.raises(InputError, match="differ; give frames of one kind"):
+        with pytest.raises(InputError, match="differ; use frames of the same kind"):
             average([still, Frame(other, "other")])
 
 

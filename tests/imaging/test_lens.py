@@ -225,15 +225,15 @@ GREY = np.full((60, 80), 128, np.uint8)
 @pytest.mark.parametrize(
     ("pictures", "pattern", "square", "text"),
     [
-        ([GREY] * 2, PATTERN, 0.03, r"^2 pictures of a chessboard; give three or more$"),
-        ([GREY] * 3, (2, 6), 0.03, r"2 × 6 inner corners; give 3 to 200 each"),
-        ([GREY] * 3, PATTERN, 0.0, r"squares of 0.0 m; give their side in metres, above 0"),
+        ([GREY] * 2, PATTERN, 0.03, r"^2 pictures of a chessboard; pass three or more$"),
+        ([GREY] * 3, (2, 6), 0.03, r"2 × 6 inner corners; use 3 to 200 each"),
+        ([GREY] * 3, PATTERN, 0.0, r"squares of 0.0 m; specify their side in metres, above 0"),
         ([GREY] * 3, PATTERN, float("nan"), r"squares of nan m"),
         (
             [GREY, GREY, GREY[:, 1:]],
             PATTERN,
             0.03,
-            r"^picture 3: 79 × 60 px, but picture 1 has 80 × 60 px; give pictures of one camera",
+            r"^picture 3: 79 × 60 px, but picture 1 has 80 × 60 px; use pictures from one camera",
         ),
         (
             [GREY] * 3,
@@ -241,7 +241,12 @@ GREY = np.full((60, 80), 128, np.uint8)
             0.03,
             r"^the pattern of 9 × 6 inner corners is found in none of 3 pictures; three or more",
         ),
-        ([GREY / 2.0] * 3, PATTERN, 0.03, r"of float64; give grey \(H, W\), uint8 or uint16"),
+        (
+            [GREY / 2.0] * 3,
+            PATTERN,
+            0.03,
+            r"of float64; pass a grey image \(H, W\), uint8 or uint16",
+        ),
         ([np.dstack([GREY] * 3)] * 3, PATTERN, 0.03, r"picture \(60, 80, 3\) of uint8"),
     ],
 )
@@ -435,7 +440,7 @@ SEEN = project(camera(SIDE), FACE)
         (FACE, SEEN, 0.0, "a variance is not finite and above 0"),
         (FACE, SEEN, -0.3, "a variance is not finite and above 0"),
         (FACE, SEEN, float("nan"), "a variance is not finite and above 0"),
-        (FACE, SEEN, [0.3, 0.3], r"sigma \(2,\); give one number"),
+        (FACE, SEEN, [0.3, 0.3], r"sigma \(2,\); pass one number"),
         (FACE, SEEN, np.zeros((9, 2, 2)), "a variance is not finite and above 0"),
     ],
 )

@@ -100,7 +100,7 @@ def test_tags_are_those_of_opencv() -> None:
 
 
 def test_codes_that_name_no_tag_are_refused() -> None:
-    with pytest.raises(InputError, match=r"code '4X4:7' names no tag; write 4X4_50:7"):
+    with pytest.raises(InputError, match=r"code '4X4:7' is not a tag; write for example 4X4_50:7"):
         tag_dictionary(replace(MARKS["tag"], code="4X4:7"))
     with pytest.raises(InputError, match=r"the dictionary holds 0 to 49"):
         tag_cells(replace(MARKS["tag"], code="4X4_50:50"))

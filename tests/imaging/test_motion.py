@@ -274,11 +274,13 @@ def test_bad_arguments() -> None:
     frame = _shoot(SCENES[0], np.random.default_rng(33))
     with pytest.raises(InputError, match="frames of 560 × 420 and 280 × 420 px cannot"):
         detect_motion(frame, frame[:, ::2])
-    with pytest.raises(InputError, match=r"a mask of \(3, 4\) does not fit frames of \(420, 560\)"):
+    with pytest.raises(
+        InputError, match=r"a mask of \(3, 4\) does not match frames of \(420, 560\)"
+    ):
         detect_motion(frame, frame, np.ones((3, 4)))
     with pytest.raises(InputError, match="the mask excludes the whole frame"):
         detect_motion(frame, frame, np.zeros((H, W)))
-    with pytest.raises(InputError, match="a frame of 15 × 420 px; motion needs 16"):
+    with pytest.raises(InputError, match="a frame of 15 × 420 px; motion detection needs 16"):
         detect_motion(frame[:, :15], frame[:, :15])
     wrong: list[tuple[str, Callable[[], object]]] = [
         ("false alarms 0.5 must be", lambda: MotionSettings(false_alarms=0.5)),

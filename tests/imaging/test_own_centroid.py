@@ -149,7 +149,7 @@ def test_places_count_from_the_centre_of_the_beams_own_target() -> None:
     [
         (None, "a NoneType for target target; return a place"),
         ((1.0, 2.0, 3.0), "a tuple for target target; return a place"),
-        (("here", OWN), "no array of numbers"),
+        (("here", OWN), "not an array of numbers"),
         (((1.0, np.nan), OWN), "2 finite numbers"),
         (((1.0, 2.0, 3.0), OWN), r"place \[1.0, 2.0, 3.0\] on target target"),
         (((140.0, 90.0), OWN), r"place \[140.0, 90.0\] m is not on target target, 8 × 8 m"),
@@ -179,7 +179,7 @@ def test_a_photograph_becomes_a_sighting() -> None:
 
 def test_a_time_or_a_sun_of_ones_own_replaces_that_of_the_frame() -> None:
     timeless = replace(read(), frame=replace(frame(), time=None))
-    with pytest.raises(InputError, match="its time is unknown; give time="):
+    with pytest.raises(InputError, match="its time is unknown; pass time="):
         sighting_of(timeless, "P6A", COUNTS, SITE)
     later = sighting_of(timeless, "P6A", COUNTS, SITE, time="2026-09-02T12:00Z")
     assert later.time[0] == TIME.timestamp() + 7200.0
@@ -199,5 +199,5 @@ def test_a_spot_that_cannot_be_trusted_gives_no_sighting() -> None:
         CAMERA,
         settings=PhotographSettings(centroid=lambda beam: (PLACE, np.eye(2))),
     )
-    with pytest.raises(InputError, match=r"uncertain: .*; a sighting needs a spot"):
+    with pytest.raises(InputError, match=r"uncertain: .*; a sighting needs a reliable spot"):
         sighting_of(unsure, "P6A", COUNTS, SITE)

@@ -138,7 +138,7 @@ def test_memory_is_kept_and_comes_back(tmp_path: Path) -> None:
 
 def test_memory_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="not a folder; give one"):
+    with pytest.raises(InputError, match="not a folder; specify a folder"):
         Memory.load(tmp_path / "file")
     (tmp_path / "target.npz").write_bytes(b"PK nothing")
     with pytest.raises(
@@ -308,7 +308,7 @@ def test_nothing_but_a_good_frame_is_good() -> None:
 
 def test_an_empty_frame_of_something_else_is_refused() -> None:
     blank = render(replace(scene(), lens=LensEffects(defocus=45.0)), 14)
-    with pytest.raises(InputError, match="give an empty frame of the same camera"):
+    with pytest.raises(InputError, match="use an empty frame from the same camera"):
         read(render(scene(beam()), 13), without=blank)
 
 

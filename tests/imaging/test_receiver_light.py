@@ -125,13 +125,13 @@ LONG = replace(SENSOR, exposure=1000 * SENSOR.exposure)
         (lambda: capped(5), "show 0% of the reference's daylight"),
         (lambda: replace(capped(), pixels=np.zeros_like(capped().pixels)), "covers the lens"),
         (lambda: frame(ambient=5.0), "night, or something covers the lens"),
-        (lambda: frame(ambient=800.0), "times as bright as in the reference, the limit is 4"),
+        (lambda: frame(ambient=800.0), "times as bright as in the reference; the limit is 4"),
         (lambda: replace(frame(sensor=LONG), exposure=np.nan), "surroundings .* overexposed"),
         (lambda: frame(sensor=LONG), "exposure times gain is 0.3 s, that of the reference 0.0003"),
         (lambda: moved(frame(), 6), "the picture has moved by 6 px"),
-        (lambda: moved(frame(), 25), "not those of the reference; the camera was moved"),
+        (lambda: moved(frame(), 25), "do not match the reference; the camera was moved"),
         (lambda: covered(frame()), "something is in front of it"),
-        (lambda: replace(frame(), pixels=np.flipud(frame().pixels)), "not those of the reference"),
+        (lambda: replace(frame(), pixels=np.flipud(frame().pixels)), "do not match the reference"),
     ],
 )  # fmt: skip
 def test_darkness_that_is_not_proven(known: ReceiverReference, shown: object, text: str) -> None:
@@ -146,7 +146,7 @@ def test_darkness_that_is_not_proven(known: ReceiverReference, shown: object, te
 def test_another_kind_of_frame_is_not_measured(known: ReceiverReference, pixels: object) -> None:
     light = receiver_light(Frame(pixels), known)  # type: ignore[arg-type]
     assert not light.share >= 0.0
-    assert "those of the reference 320 × 240 px of 16 bit" in light.doubt
+    assert "but the reference has 320 × 240 px of 16 bit" in light.doubt
 
 
 def test_overexposed_pixels_leave_a_lower_bound(known: ReceiverReference) -> None:
@@ -205,12 +205,12 @@ def auto(on: int) -> Frame:
     ("dark", "lit", "text"),
     [
         (lambda: capped(1), lambda: [(frame(4), 0.2)], "shows 0 sides .* brighter than a capped"),
-        (frame, list, "no photograph with beams; give one with its share"),
+        (frame, list, "no photograph with beams; pass one with its fraction"),
         (frame, lambda: [(frame(4), 0.0)], "at a share of 0; give above 0 to 2"),
         (frame, lambda: [(auto(4), 0.2)], "with one fixed exposure, within a minute"),
         (frame, lambda: [(frame(4, sensor=LONG), 0.2)], "of the receiver is overexposed; use few"),
-        (frame, lambda: [(frame(4), 0.2), (frame(8), 0.7)], "is a share wrong, or the response"),
-        (frame, lambda: [(frame(0), 0.2), (frame(4), 0.2)], "is a share wrong"),
+        (frame, lambda: [(frame(4), 0.2), (frame(8), 0.7)], "check the fractions and the line"),
+        (frame, lambda: [(frame(0), 0.2), (frame(4), 0.2)], "check the fractions"),
         (frame, lambda: [(moved(frame(4), 30), 0.2)], "4 mirrors: the surroundings of the"),
         (frame, lambda: [(Frame(np.zeros((9, 9), np.uint16), "b.png"), 0.2)], "b.png has 9 × 9 px"),
     ],
@@ -224,9 +224,9 @@ def test_an_outline_that_cannot_be_measured() -> None:
     corners = sight().outline
     for outline, text in (
         (corners + [200.0, 0.0], "its outline leaves the frame of 320 × 240 px"),
-        (corners.mean(axis=0) + 0.05 * (corners - corners.mean(axis=0)), "px in the frame, the"),
-        (corners[:2], "give 3 corners or more"),
-        ([[0, 0], [319, 0], [319, 239], [0, 239]], "0 of its four sides have room about it"),
+        (corners.mean(axis=0) + 0.05 * (corners - corners.mean(axis=0)), "px in the frame, below"),
+        (corners[:2], "specify 3 corners or more"),
+        ([[0, 0], [319, 0], [319, 239], [0, 239]], "0 of its four sides have a margin"),
     ):
         with pytest.raises(InputError, match=text):
             ReceiverSight("eye", "receiver", CAMERA.size, np.array(outline, dtype=float))

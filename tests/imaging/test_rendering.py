@@ -447,7 +447,7 @@ def test_the_example_camera_frames_the_target() -> None:
         (lambda: Sensor(gain=0.0), "gain 0.0"),
         (lambda: Sensor(read_noise=-1.0), "read_noise -1.0"),
         (lambda: Sensor(offset=1.0), "offset 1.0"),
-        (lambda: Sensor(bits=10), "10 bits; give 8 or 12"),
+        (lambda: Sensor(bits=10), "10 bits; must be 8 or 12"),
         (lambda: exposed(scene()), "nothing to expose for"),
         (lambda: exposed(scene(ambient=1.0), -0.1), "peak -0.1"),
         (lambda: render(scene(), -1), "seed -1"),

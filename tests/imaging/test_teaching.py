@@ -306,7 +306,7 @@ def test_an_edge_or_nothing_is_no_mark(frame: Frame) -> None:
     for point in taught.points[4:]:
         assert point.mark is None
         assert "only an edge, or nothing" in point.note
-        assert "the point locates the camera only" in point.note
+        assert "the point is used only to locate the camera" in point.note
     assert [m.name for m in taught.plant.target("target").marks] == list(TURNS)
     assert taught.fit.residuals.shape == (6, 2)
 
@@ -407,7 +407,7 @@ def test_another_file_is_not_written_over(frame: Frame, tmp_path: Path) -> None:
     place = tmp_path / "notes.toml"
     place.write_text("not = [toml")
     taught = teach(BARE, "target", frame, clicked(ALL), wishes=DRAWN)
-    with pytest.raises(FormatError, match="not a plant file; write to another place"):
+    with pytest.raises(FormatError, match="not a plant file; choose another output file"):
         write_taught(taught, place)
     assert place.read_text() == "not = [toml"
 
@@ -477,12 +477,12 @@ FOUR = list(TURNS)
         ),
         (changed(lambda g: g.update(dot=(float("nan"), 10.0))), r"point dot: nan, 10.0 is not in"),
         (changed(lambda g: g.update(dot=g["middle"])), r"points middle and dot are at the same"),
-        (changed(mirror), r"are mirrored in the picture; are left and right swapped\?"),
+        (changed(mirror), r"are mirrored in the picture; check whether left and right are swapped"),
         (
             changed(lambda g: exchange(g, "upper_left", "upper_right")),
-            r"are not arranged as on the target; are two swapped\?",
+            r"are not arranged as on the target; check for swapped names",
         ),
-        (changed(lambda g: exchange(g, "dot", "middle")), r"are two swapped\?"),
+        (changed(lambda g: exchange(g, "dot", "middle")), r"check for swapped names"),
     ],
 )
 def test_points_that_cannot_be(frame: Frame, given: dict[str, Any], text: str) -> None:
@@ -493,14 +493,14 @@ def test_points_that_cannot_be(frame: Frame, given: dict[str, Any], text: str) -
 def test_four_points_with_two_exchanged(frame: Frame) -> None:
     given = {name: tuple(TRUE[name]) for name in FOUR}
     exchange(given, "upper_left", "lower_left")
-    with pytest.raises(InputError, match="as on the target; are two swapped"):
+    with pytest.raises(InputError, match="as on the target; check for swapped names"):
         teach(BARE, "target", frame, given)
 
 
 def test_points_on_a_line(frame: Frame) -> None:
     line = {f"p{k}": np.array([0.5 * k - 1.0, 0.0, 13.0 + 0.2 * k]) for k in range(4)}
     plant = replace(BARE, targets=(replace(BARE.targets[0], markers=line),))
-    with pytest.raises(InputError, match="p0, p1, p2, p3 lie on one line; give some that span"):
+    with pytest.raises(InputError, match="p0, p1, p2, p3 lie on one line; use points that span"):
         teach(plant, "target", frame, at(line))
 
 
@@ -508,7 +508,7 @@ def test_other_refusals(frame: Frame) -> None:
     given = clicked(ALL)
     with pytest.raises(UnknownNameError, match="there is no target 'targte'; did you mean target"):
         teach(BARE, "targte", frame, given)
-    with pytest.raises(InputError, match=r"sigma 0.0 px; give a standard deviation above 0"):
+    with pytest.raises(InputError, match=r"sigma 0.0 px; must be above 0"):
         teach(BARE, "target", frame, given, sigma=0.0)
     with pytest.raises(UnknownNameError, match="among those given: 'upper_lef'; did you mean"):
         teach(BARE, "target", frame, given, wishes={"upper_lef": Wish("picture")})
@@ -531,9 +531,9 @@ def test_other_refusals(frame: Frame) -> None:
         ("star", 0.1, None, r"kind 'star' cannot be taught; known: corner, tee, square, disc, pic"),
         ("tag", 0.1, None, "kind 'tag' cannot be taught"),
         ("corner", None, None, r"a corner needs its size in metres \(--size\)"),
-        ("disc", 0.0, None, r"size 0.0 m; give metres above 0"),
-        (None, float("nan"), None, r"size nan m; give metres above 0"),
-        ("corner", 0.4, -0.1, r"stroke -0.1 m; give metres above 0"),
+        ("disc", 0.0, None, r"size 0.0 m; must be above 0"),
+        (None, float("nan"), None, r"size nan m; must be above 0"),
+        ("corner", 0.4, -0.1, r"stroke -0.1 m; must be above 0"),
     ],
 )
 def test_wishes_that_cannot_be(kind: Any, size: Any, stroke: Any, text: str) -> None:
@@ -661,20 +661,20 @@ def test_an_answer_ends_the_page(asked: Asked) -> None:
 
 def test_cancelling_ends_it_too(asked: Asked) -> None:
     assert httpx.post(asked.address + "cancel").status_code == 200
-    assert asked.answer() == "a.png: target target: cancelled in the browser; nothing is written"
+    assert asked.answer() == "a.png: target target: cancelled in the browser; nothing was written"
 
 
 @pytest.mark.parametrize(
     ("body", "text"),
     [
-        (b"{", "the answer is not JSON"),
-        (b"[]", 'the answer has no "points"'),
-        (b'{"points": []}', 'the answer has no "points"'),
+        (b"{", "the reply is not JSON"),
+        (b"[]", 'the reply has no "points"'),
+        (b'{"points": []}', 'the reply has no "points"'),
         (b'{"points": {"nose": [1, 2]}}', "point 'nose' was not asked for"),
         (b'{"points": {"dot": [1, 2]}}', "point 'dot' was not asked for"),
-        (b'{"points": {"middle": [1]}}', "point middle: give two numbers"),
-        (b'{"points": {"middle": [1, "2"]}}', "point middle: give two numbers"),
-        (b'{"points": {"middle": [true, 2]}}', "point middle: give two numbers"),
+        (b'{"points": {"middle": [1]}}', "point middle: enter two numbers"),
+        (b'{"points": {"middle": [1, "2"]}}', "point middle: enter two numbers"),
+        (b'{"points": {"middle": [true, 2]}}', "point middle: enter two numbers"),
         (b'{"points": {"middle": [NaN, 2]}}', "point middle: nan, 2.0 is not in the picture"),
         (b'{"points": {"middle": [640, 2]}}', "point middle: 640.0, 2.0 is not in the picture"),
         (b'{"points": {"middle": [1e999, 2]}}', "point middle: inf, 2.0 is not in the picture"),
@@ -713,7 +713,7 @@ def test_nobody_else_gets_in(asked: Asked) -> None:
             with line.makefile("rb") as stream:
                 reply = stream.read().decode()
         assert " 400 " in reply.splitlines()[0]
-        assert f"the answer's length '{length}' is not a number up to" in reply
+        assert f"the reply's length '{length}' is not a number up to" in reply
     assert asked.thread.is_alive()
 
 

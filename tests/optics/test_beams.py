@@ -122,7 +122,7 @@ def test_several_beams_as_one_have_their_light_at_its_places() -> None:
     alone = Beam.together([one])
     assert np.array_equal(alone.flux, one.flux)
     for bad in (fine, one.shifted((0.01, 0.0))):
-        with pytest.raises(InputError, match="fall on one grid"):
+        with pytest.raises(InputError, match="on a common grid"):
             Beam.together([one, bad])
 
 
@@ -287,7 +287,7 @@ def _reflected(**changes: object) -> Beam:
     [
         (lambda: Beam(np.zeros(3), 0.1, np.zeros(2)), r"flux of shape \(3,\)"),
         (lambda: Beam(-np.ones((2, 2)), 0.1, np.zeros(2)), "nowhere below 0"),
-        (lambda: Beam(np.zeros((2, 2)), 0.1, np.zeros(2)), "give a beam with light"),
+        (lambda: Beam(np.zeros((2, 2)), 0.1, np.zeros(2)), "pass a beam with light"),
         (lambda: Beam(np.ones((2, 2)), 0.0, np.zeros(2)), "step 0.0 m must be above 0"),
         (lambda: Beam(np.ones((2, 2)), 0.1, np.zeros(3)), "origin"),
         (lambda: Beam.from_image(np.ones(3), 0.1), "picture of shape"),
@@ -304,7 +304,7 @@ def _reflected(**changes: object) -> Beam:
         (lambda: _reflected(focal=-5.0), "focal -5.0 m"),
         (lambda: _reflected(elements=0), "0 elements"),
         (lambda: _reflected(facets=(0, 2)), "0 × 2 facets"),
-        (lambda: _reflected(step=1e-4), "take a larger step"),
+        (lambda: _reflected(step=1e-4), "use a larger step"),
         (lambda: _reflected(normal=-SUN), "misses target"),
         (lambda: _reflected(R_enu_mirror=np.ones((3, 3))), "must be a rotation"),
         (lambda: _reflected(aim=np.zeros((2, 3))), r"aim \(2, 3\)"),

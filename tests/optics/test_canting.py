@@ -56,14 +56,14 @@ def test_the_engine_and_rays_agree_on_canted_facets() -> None:
 @pytest.mark.parametrize(
     ("facets", "canting", "line"),
     [
-        ((0, 3), "slant", "0 × 3 facets; give 1 to 50 each way"),
+        ((0, 3), "slant", "0 × 3 facets; must be 1 to 50 each way"),
         ((3, 2), -5.0, "a focal length of -5.0 m must be above 0"),
-        ((3, 2), -NOON, "give one sun above the horizon"),
+        ((3, 2), -NOON, "pass one sun vector above the horizon"),
     ],
 )
 def test_bad_canting_is_refused(facets: tuple[int, int], canting: object, line: str) -> None:
     mirrors = scene_of(PLANT, NOON).mirrors
     with pytest.raises(InputError, match=line):
         canted(mirrors, facets, canting, plant=PLANT)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="off axis it needs the plant"):
+    with pytest.raises(InputError, match="off-axis canting needs the plant"):
         canted(mirrors, (3, 2), NOON)

@@ -490,7 +490,7 @@ def test_what_cannot_be_is_refused() -> None:
         ),
         (
             lambda: optics.beams(np.zeros((2, 2, 3)), (0, 1, 0), MirrorOptics.of(1, 1)),
-            "give .N, 3.",
+            "expected .N, 3.",
         ),
         (
             lambda: optics.beams((0, 0, 0), (0, 1, 0), MirrorOptics.of(1, 1), reach=-1.0),
@@ -501,7 +501,7 @@ def test_what_cannot_be_is_refused() -> None:
         with pytest.raises(InputError, match=text):
             call()
     arm, mirror = kinds.azimuth_elevation((0, 0, 0)).armature, MirrorOptics.of(1, 1)
-    with pytest.raises(InputError, match="give finite joint angles"):
+    with pytest.raises(InputError, match="pass finite joint angles"):
         optics.sweep(arm, (0.0, 1.0), SUN, mirror, ZOO)
     with pytest.raises(InputError, match=r"resolution 0\.0 rad must be above 0"):
         optics.sweep(arm, [(0.0, 1.0)], SUN, mirror, ZOO, resolution=0.0)
@@ -510,7 +510,7 @@ def test_what_cannot_be_is_refused() -> None:
         optics.sweep(many, np.zeros((3, 2, 2)), SUN, mirror, ZOO)
     with pytest.raises(InputError, match="give one heliostat"):
         optics.safe_way(many, (0, 1), SUN, FOOT, STANDBY, mirror, ZOO)
-    with pytest.raises(InputError, match="give the 2 joint angles"):
+    with pytest.raises(InputError, match="pass the 2 joint angles"):
         optics.safe_way(arm, (0, 1, 2), SUN, FOOT, STANDBY, mirror, ZOO)
     with pytest.raises(InputError, match=r"first_distance 0\.0 m must be above 0"):
         optics.safe_way(arm, (0, 1), SUN, FOOT, STANDBY, mirror, ZOO, first_distance=0.0)

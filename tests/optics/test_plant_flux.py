@@ -176,7 +176,7 @@ def test_solartherm_gets_declination_by_hour_angle(tmp_path: Path) -> None:
     assert table[3, 7] == pytest.approx(year().shares["total"][k], abs=1e-6)
     assert (table[1:, [1, -1]] == 0.0).all()  # midnight
     times = ht.sun.daylight("2026-09-02", plant().site, every=timedelta(hours=6))
-    with pytest.raises(InputError, match="SolarTherm takes a table over a year"):
+    with pytest.raises(InputError, match="SolarTherm needs a table over a year"):
         files.write_solartherm(tmp_path / "d.motab", ht.flux_day(plant(), times))
 
 
@@ -187,8 +187,11 @@ def no_receiver() -> Plant:
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda: ht.flux(plant()), "give either a time or the sun"),
-        (lambda: ht.flux(plant(), "2026-09-02T10:00Z", sun=SUN), "give either a time or the sun"),
+        (lambda: ht.flux(plant()), "pass either a time or a sun vector"),
+        (
+            lambda: ht.flux(plant(), "2026-09-02T10:00Z", sun=SUN),
+            "pass either a time or a sun vector",
+        ),
         (lambda: ht.flux(plant(), "2026-09-02T22:00Z"), r"the sun stands -\d+\.\d° above the hor"),
         (lambda: ht.flux(plant(), ["2026-09-02T10:00Z"]), "give one time"),
         (lambda: ht.flux(no_receiver(), sun=SUN), "has no receiver; add one to the plant file"),
@@ -207,7 +210,7 @@ def no_receiver() -> Plant:
                 ),
                 sun=SUN,
             ),
-            "receiver receiver: no mirror sends light to it; turn it to the field",
+            "receiver receiver: no mirror sends light to it; turn the receiver towards the field",
         ),
         (lambda: ht.flux_year(plant(), declinations=1), "1 declinations and steps of 1.0 h"),
         (lambda: ht.flux_day(plant(), ["2026-09-02T22:00Z"]), "above 2° at none of the times"),

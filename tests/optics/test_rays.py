@@ -179,7 +179,7 @@ def test_the_number_of_rays_and_the_extra_are_checked(monkeypatch: pytest.Monkey
         with pytest.raises(InputError, match="must be from 1,000 to 1,000,000,000"):
             trace(given, rays)
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
-    with pytest.raises(InputError, match=r"embreex is not installed; say pip install 'helio"):
+    with pytest.raises(InputError, match=r"embreex is not installed; run pip install 'helio"):
         trace(given, 1e4)
 
 

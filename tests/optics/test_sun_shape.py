@@ -120,5 +120,5 @@ def test_a_shape_is_made_of_its_name_and_number() -> None:
     assert SunShape.of("gaussian:0.003").sigma == 0.003
     assert SunShape.of(SunShape("limb")) == SunShape("limb")
     assert {SunShape.of(name).name for name in SUN_SHAPES} == set(SUN_SHAPES)
-    with pytest.raises(InputError, match="5 Gaussians; give 1 to 4"):
+    with pytest.raises(InputError, match="5 Gaussians; must be 1 to 4"):
         SunShape().gaussians(5)

@@ -107,7 +107,7 @@ def test_one_that_does_not_move_is_named_and_not_waited_for(others: int) -> None
         assert not good
         assert plant.assembly.left() == f"not in stow: {plant.names[-1]} LOCKED"
         assert np.flatnonzero(~plant.field.at_stow()).tolist() == [3]
-        assert lines[-1] == "not every heliostat is stowed"
+        assert lines[-1] == "not all heliostats are stowed"
         assert took < (PATH if others else NOTICED)
 
     played(scene)

@@ -192,7 +192,7 @@ def test_clouds_and_mirrors_that_trade_places_teach_nothing() -> None:
         results = await here.run()
         bad = {name for name, r in results.items() if r.outcome is _NOT_VERIFIED}
         assert bad == {one, other}, results
-        assert "exchange" in results[one].text or "another mirror's code" in results[one].text
+        assert "exchange" in results[one].text or "another heliostat's code" in results[one].text
         good = [r for name, r in results.items() if name not in bad]
         assert {r.outcome for r in good} == {_CALIBRATED}, results
         for name in bad:
@@ -307,8 +307,8 @@ def test_automatic_control_begins_with_them() -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"first": 3}, "3 heliostats without a calibration; give 0, or 4 to 127"),
-        ({"first": 128}, "first 128 .heliostats without a calibration.*; give 0 to 127$"),
+        ({"first": 3}, "3 heliostats without a calibration; must be 0, or 4 to 127"),
+        ({"first": 128}, "first 128 .heliostats without a calibration.*; must be 0 to 127$"),
         ({"first_movement": 6e-3}, "first_movement_mrad 6 .*; give above 0 to 5$"),
     ],
 )

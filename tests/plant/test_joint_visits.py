@@ -317,7 +317,7 @@ def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> N
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"least": 9, "most": 8}, "least 9 is above most 8; give the smaller"),
+        ({"least": 9, "most": 8}, "least 9 is above most 8; least must be the smaller"),
         ({"movement": 0.0}, "movement_mrad 0 .coded.*; give above 0 to 5$"),
         ({"brightest": 0.0}, "brightest_suns 0 .*; give above 0$"),
     ],
@@ -482,7 +482,9 @@ def test_the_error_on_the_target_decides_who_shares_codes() -> None:
     sure, _, ready = joint_visits(3.7e-3, first=0)
     assert asyncio.run(sure.chosen("left", ready, follow)) == ("A", "B", "C", "D", "E")
     vague, _, ready = joint_visits(3.75e-3, first=0)
-    assert asyncio.run(vague.chosen("left", ready, follow)) == ("A", "B", "C"), "codes of their own"
+    assert asyncio.run(vague.chosen("left", ready, follow)) == ("A", "B", "C"), (
+        "assign different codes"
+    )
     vague, _, ready = joint_visits(3.75e-3, first=0, together=0)
     assert asyncio.run(vague.chosen("left", ready, follow)) == ()
     # A mirror that cannot reach the target is neither.

@@ -546,7 +546,7 @@ def test_a_beam_too_bright_or_too_dim_for_its_mirror_is_joined_with_other_light(
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"least": 9, "most": 8}, "least 9 is above most 8; give the smaller"),
+        ({"least": 9, "most": 8}, "least 9 is above most 8; least must be the smaller"),
         ({"movement": 0.003}, "movement_mrad 3 .coded.*; give above 0 to 2$"),
         ({"power": 0.02}, "power 0.02 .*; give above 0 to 0.01$"),
         ({"known": 0.0}, "known_mrad 0 .*; give above 0 to 20$"),

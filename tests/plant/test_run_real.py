@@ -289,7 +289,9 @@ def test_a_real_plant_over_tcp_mqtt_and_its_own_bus(
     # Ctrl-C stows whom it can, and names the others.
     assert set(states(lines).values()) == {"STOWED"}
     assert re.search(
-        r"\nstowing \d heliostats \(\d tracking.*\), about \d+ s; Ctrl-C again ends at once\n", text
+        r"\nstowing \d heliostats \(\d tracking.*\), about \d+ s; press Ctrl-C again to stop "
+        r"immediately\n",
+        text,
     )
     assert "not in stow: H7 silent, H8 silent" in text
     assert "1 of 4 clusters silent: K4 (" in text
@@ -556,8 +558,11 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("--clusters", "links.toml"), "--clusters needs the plant file"),
-        (("plant.toml", "--clusters", "links.toml"), "a real plant keeps its records; give --data"),
+        (("--clusters", "links.toml"), "--clusters needs a plant file"),
+        (
+            ("plant.toml", "--clusters", "links.toml"),
+            "a real plant must keep its records; use --data",
+        ),
         (("plant.toml", "--clusters", "no.toml"), "no.toml: there is no such file"),
         (
             ("plant.toml", "--clusters", "links.toml", "--speed", 2),
@@ -567,12 +572,15 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
             ("plant.toml", "--clusters", "links.toml", "--start", "2012-09-02"),
             "run: --start: only available in simulation, because real clusters track the actual",
         ),
-        (("--start", "1979-12-31"), "--start 1979-12-31: give a time in the years 1981 to 2099"),
+        (
+            ("--start", "1979-12-31"),
+            "--start 1979-12-31: the time must be in the years 1981 to 2099",
+        ),
         (("--start", "2012-09-02T10:00"), "has no time zone; append Z for UTC or an offset"),
         (("--check",), "need a real plant; give --clusters"),
         (("--configure",), "need a real plant; give --clusters"),
         (("--prototype", "--heliostats", 5), "--prototype is a plant of its own; leave out"),
-        (("plant.toml", "--heliostats", 5), "--heliostats is for the default plant"),
+        (("plant.toml", "--heliostats", 5), "--heliostats applies only to the default plant"),
         (("--speed", 0), "--speed '0': give a number from 0.001 to 1,000"),
         (("--minutes", 0), "--minutes '0': give a number from 0.001 to"),
         (("--every", "nan"), "--every 'nan': give a number from 0.1 to 86,400"),
@@ -722,7 +730,7 @@ def test_a_group_without_a_machine_is_told_and_not_configured(folder: Path) -> N
     words = (folder / "plant.toml", "--clusters", folder / "links.toml", "--check")
     code, out, _ = call(*words)
     assert code == 0
-    assert out.endswith("no machine table, which --configure needs: group all\n")
+    assert out.endswith("--configure needs a machine table, which is missing in group all\n")
     code, _, err = call(*words, "--configure")
     assert (code, err.count("\n")) == (2, 1)
     assert "group all: the plant file has no table [groups.all.machine]; add it" in err

@@ -266,7 +266,7 @@ def test_evidence_of_a_plant_at_work_shows_an_event_that_was_altered(
     ]
     good = CliRunner().invoke(app, command)
     assert good.exit_code == 0, good.exception
-    assert re.search(r"^[1-9]\d* of \d+ heads fit; ", good.output)
+    assert re.search(r"^[1-9]\d* of \d+ heads match; ", good.output)
     alter = "UPDATE event SET text = 'quiet' WHERE number = ?"
     with contextlib.closing(sqlite3.connect(data / "store.sqlite")) as store, store:
         assert store.execute(alter, (newest,)).rowcount == 1

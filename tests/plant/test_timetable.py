@@ -180,8 +180,8 @@ def test_some_come_first_and_some_never_unless_a_person_asks() -> None:
     ("given", "text"),
     [
         ({"rule": "often"}, "rule 'often'; give first or never"),
-        ({"rule": "never", "at": ("12:00Z",)}, "leave times and target out"),
-        ({"rule": "first", "target": "left"}, "leave times and target out"),
+        ({"rule": "never", "at": ("12:00Z",)}, "remove times and target"),
+        ({"rule": "first", "target": "left"}, "remove times and target"),
     ],
 )
 def test_a_rule_stands_alone(given: dict[str, object], text: str) -> None:

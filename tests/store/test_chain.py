@@ -218,7 +218,7 @@ def test_from_the_command_line(tmp_path: Path) -> None:
     assert head.startswith("event:5:")
     good = run.invoke(app, ["store", "verify", str(tmp_path), "--head", head])
     assert good.exit_code == 0, good.output
-    assert "every record fits" in good.stdout
+    assert "all records verified" in good.stdout
     keeper.do(lambda c: c.execute(text("UPDATE event SET text = 'x' WHERE number = 1")))
     bad = run.invoke(app, ["store", "verify", str(tmp_path)])
     assert isinstance(bad.exception, StoreError)
@@ -243,11 +243,11 @@ def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
     command = ["store", "verify", str(tmp_path / "data"), "--head", str(file)]
     said = CliRunner().invoke(app, command)
     assert said.exit_code == 0, said.exception
-    assert "4 of 4 heads fit; events are kept since 1970-01-01T00:01:40Z\n" in said.output
+    assert "4 of 4 heads match; events are kept since 1970-01-01T00:01:40Z\n" in said.output
     again = Keeper(tmp_path / "data", inline=True)
     again.forget_events(104.0)
     again.close()
-    assert "4 of 4 heads fit" in CliRunner().invoke(app, command).output
+    assert "4 of 4 heads match" in CliRunner().invoke(app, command).output
     shutil.copytree(tmp_path / "data", tmp_path / "later")
     again = Keeper(tmp_path / "later", inline=True)
     again.record_event(Event(400.0, "test", "later still"))
@@ -255,7 +255,9 @@ def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
     again.close()
     later = [str(each).replace("/data", "/later") for each in command]
     told = CliRunner().invoke(app, later).output
-    assert "3 of 4 heads fit; events are kept since 1970-01-01T00:06:40Z, those of earlier" in told
+    assert (
+        "3 of 4 heads match; events are kept since 1970-01-01T00:06:40Z, heads of earlier" in told
+    )
     old = " ".join(str(head) for head in chain.read_heads(file)[:1])
     failed = CliRunner().invoke(app, [*later[:-1], old])
     assert failed.exit_code == 1

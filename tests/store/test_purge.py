@@ -76,4 +76,4 @@ def test_it_asks_first(data: Path) -> None:
     assert (data / "store.sqlite").exists()
     done = run.invoke(app, ["store", "purge", str(data), "--yes"])
     assert done.exit_code == 0, done.exception
-    assert "left, since no plant made it: notes of a person" in done.output
+    assert "left in place, not created by a plant: notes of a person" in done.output

@@ -147,7 +147,7 @@ def test_commands_sign_and_demand_a_key_or_the_word(tmp_path: Path) -> None:
     assert run("backup", tmp_path / "data", "--to", plain)[0] == 0
     code, said = run("restore", backup, tmp_path / "new")
     assert code != 0
-    assert "give --key FILE.pub, or --unsigned" in said
+    assert "use --key FILE.pub, or --unsigned" in said
     assert run("restore", backup, tmp_path / "new", "--key", tmp_path / "k.pub")[0] == 0
     code, said = run("restore", plain, tmp_path / "two", "--key", tmp_path / "k.pub")
     assert "it is not signed" in said

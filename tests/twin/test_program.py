@@ -306,7 +306,7 @@ def test_a_plant_outlives_its_field_and_leads_it_again(tmp_path: Path) -> None:
     field = Program(MAIN, *words, str(tmp_path / "plant.toml"))
     plant = None
     try:
-        field.says("now start")
+        field.says("now run")
         plant = Program(
             MAIN, "run", str(folder / "plant.toml"), "--clusters", str(folder / "links.toml"),
             "--no-console", "--data", str(tmp_path / "data"), "--every", "1", "--automatic",
@@ -338,7 +338,7 @@ def test_a_plant_leads_boards_on_pseudo_terminals(tmp_path: Path) -> None:
     )  # fmt: skip
     plant = None
     try:
-        field.says("now start")
+        field.says("now run")
         plant = Program(
             MAIN, "run", str(folder / "plant.toml"), "--clusters", str(folder / "links.toml"),
             "--no-console", "--data", str(tmp_path / "data"), "--every", "1", "--automatic",
@@ -354,7 +354,7 @@ def test_a_pseudo_terminal_needs_boards(tmp_path: Path) -> None:
     field = Program(MAIN, "twin", "--folder", str(tmp_path / "desk"), "--pty")
     try:
         assert field.ends() == 2
-        assert "--pty: only boards have a bus of bytes; give --boards too" in field.text
+        assert "--pty needs --boards, because only boards have a serial bus" in field.text
         assert not (tmp_path / "desk").exists()
     finally:
         field.close()
@@ -367,7 +367,7 @@ def test_its_sensors_read_before_its_plant_begins(tmp_path: Path) -> None:
         "--plant", f"127.0.0.1:{free_port()}",
     )  # fmt: skip
     try:
-        field.says("now start")
+        field.says("now run")
         document = read_links(folder / "links.toml").document
         with contextlib.closing(ClockReader(document.twin)) as reader:
             until = time.monotonic() + 60.0

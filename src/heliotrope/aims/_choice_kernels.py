@@ -26,7 +26,7 @@ def _dot(values, at, line, start, count):
 
 @njit(**_INNER_SUMS)
 def _worth(i, images, shifts, price, spans, out):
-    """Write the sums of price times flux of all candidates of mirror i."""
+    """Compute the sums of price times flux for all candidates of mirror i."""
     values, begin, box, looks, weight = images
     count, wide = shifts.shape[1], len(price)
     for k in range(looks):
@@ -53,7 +53,7 @@ def _worth(i, images, shifts, price, spans, out):
 
 @njit(**_SUMS)
 def worths(first, last, mirrors, images, shifts, price, spans, out):
-    """Write the sum over cells of price times flux, of each candidate of ``mirrors[first:last]``.
+    """Sum price times flux over the cells, for each candidate of ``mirrors[first:last]``.
 
     ``price`` (columns, rows) in 32 bits; ``spans`` (columns, 2): rows where it is not zero; ``out``
     (H, A).

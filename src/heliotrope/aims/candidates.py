@@ -26,12 +26,12 @@ ASIDE = 0.4
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Aims of H mirrors: K places across the receiver at S heights each.
+    """Candidate aims of H mirrors: K positions across the receiver at S heights each.
 
     Attributes
     ----------
     images
-        At the K places, at half height.
+        Images at the K positions, at half height.
     weight
         Ratio of each mirror's light to the light in its images, (H,).
     shifts
@@ -59,7 +59,7 @@ class Candidates:
 
     @property
     def middle_power(self) -> float:
-        """Power with every mirror at half height and in the middle, W."""
+        """Power with every mirror aimed at half height in the middle, W."""
         middle = self.shifts.shape[1] * (self.images.looks // 2) + self.shifts.shape[1] // 2
         return float(self.power[:, middle].sum())
 
@@ -89,7 +89,7 @@ class Candidates:
 
 
 def spans_of(price: FloatArray) -> IntArray:
-    """Return the rows where a column's prices are not 0, first and end, (columns, 2)."""
+    """Return the first and end row of each column's nonzero prices, (columns, 2)."""
     some = (price > 0.0).astype(np.int64)
     first = some.argmax(axis=1)
     end = price.shape[1] - np.flip(some, axis=1).argmax(axis=1)
@@ -110,7 +110,8 @@ def surface_in(scene: Scene) -> Plate | Cylinder:
     surface = scene.surfaces[0]
     if not isinstance(surface, Plate | Cylinder):
         raise InputError(
-            f"receiver {surface.name}: aims are chosen on plates and cylinders; give one of these"
+            f"receiver {surface.name}: aims can be chosen only on flat and cylindrical receivers; "
+            "use one of these"
         )
     return surface
 
@@ -170,6 +171,6 @@ def candidates(engine: FieldFlux) -> Candidates:
     if not power.any():
         raise InputError(
             f"receiver {surface.name}: none of the {len(mirrors)} mirrors sends light to any of "
-            "its cells; turn it to the field, or choose another sun"
+            "its cells; turn the receiver towards the field, or choose another sun position"
         )
     return replace(built, power=power)

@@ -141,7 +141,7 @@ def assess(
     engine
         The expected flux; the mirrors' ``pointing`` is the covariance of their own errors.
     modes
-        Of `SharedErrors.modes`, (H, 5, 2).
+        Displacements from `SharedErrors.modes`, (H, 5, 2).
     groups
         Cluster of each mirror, 0 to G − 1, (H,).
     probability
@@ -182,7 +182,7 @@ def gains(engine: FieldFlux, risk: Risk, prices: FloatArray) -> FloatArray:
     engine, risk
         Flux, and its uncertainty.
     prices
-        Of the cells, $λ_c$, W per W/m², (rows, columns).
+        Prices of the cells, $λ_c$, W per W/m², (rows, columns).
     """
     count, sigma = len(engine.scene.mirrors), risk.sigma
     worth = np.where(sigma > 0.0, 0.5 * risk.factor * prices / np.maximum(sigma, 1e-300), 0.0)

@@ -52,18 +52,18 @@ class AimPlan(Value, Framed):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the heliostats."""
+        """Names of the heliostats."""
         return self.light.names
 
     @property
     def aim(self) -> FloatArray:
-        """ENU m, (N, 3); NaN of defocused heliostats."""
+        """Aims, ENU m, (N, 3); NaN for defocused heliostats."""
         off = self.defocused | self.out_of_reach
         return np.where(off[:, None], np.nan, self.light.aim)
 
     @property
     def power(self) -> float:
-        """Expected, W."""
+        """Expected power, W."""
         return self.light.power
 
     @property
@@ -73,12 +73,12 @@ class AimPlan(Value, Framed):
 
     @property
     def gap(self) -> float:
-        """Share of power that better aims could add at most; NaN of strategies without a bound."""
+        """Upper bound on the power that better aims could add, as a fraction; NaN if none."""
         return self.scene.choice.gap
 
     @property
     def excess(self) -> float:
-        """Greatest ratio of the flux quantile to the limit, less 1; 0 or less: the limit holds."""
+        """Largest ratio of the flux quantile to the limit, minus 1; ≤ 0 if the limit holds."""
         return self.scene.excess
 
     @property
@@ -88,7 +88,7 @@ class AimPlan(Value, Framed):
 
     @property
     def limit(self) -> FloatArray:
-        """Allowable flux in each cell, less the margin, W/m², (rows, columns)."""
+        """Allowable flux in each cell minus the margin, W/m², (rows, columns)."""
         return self.scene.limit
 
     @property

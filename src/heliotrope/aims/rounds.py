@@ -52,7 +52,7 @@ PathImages = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """What is known of H mirrors when aims are computed.
+    """The state of H mirrors when aims are computed.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Move:
     rows
         Indices of the mirrors, (K,).
     aims
-        ENU m, (K, 3); NaN: they rest.
+        New aims, ENU m, (K, 3); NaN if the mirror is to rest.
     """
 
     rows: Rows
@@ -117,7 +117,7 @@ class Answer:
     moves
         One after the other.
     safe
-        The safe spread: aims of the plant file for as many mirrors as hold the limit, (H, 3).
+        The safe spread: aims from the plant file for as many mirrors as the limit allows, (H, 3).
     flux, above, limit
         Flux of the beams that shine now, what errors may add, and the limit less the margin, W/m²,
         (rows, columns).
@@ -143,7 +143,7 @@ class Answer:
 
     @property
     def excess(self) -> float:
-        """Greatest ratio of the flux, with its errors, to the limit, less 1."""
+        """Largest ratio of the flux, including errors, to the limit, minus 1."""
         return float(((self.flux + self.above) / self.limit).max()) - 1.0
 
     @property
@@ -182,7 +182,7 @@ def next_round(now: Round, **light: Any) -> Answer:
         room = limit - fixed - _risk(engine, now.demand, limit).above
         if (room <= 0.0).any():
             raise InputError(
-                f"aims: {int(stays.sum())} beams that keep their aims, by an operator or for their "
+                f"aims: {int(stays.sum())} beams whose aims are kept, by an operator or for their "
                 "return from a visit, bring up to "
                 f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of "
                 "them, or raise the limit"
@@ -340,7 +340,7 @@ class _Walk:
         return batch
 
     def _resting(self, paths: dict[int, PathImages]) -> list[int]:
-        """Return mirrors that rest, so that others may move, and come back later."""
+        """Select mirrors to rest, so that others can move; they return later."""
         if self._moved >= self._now.most:
             return []
         stuck = [row for row in paths if self._path.aimed[row] and self._path.goes[row]]

@@ -30,7 +30,7 @@ ROUNDS, BELOW = 16, 5e-4
 FREE = 3
 #: From then on the remaining excess times this factor is subtracted from the limit.
 BEYOND = 1.5
-#: Least share of the limit left to the next choice after errors; excess that counts as zero.
+#: Minimum share of the limit left to the next choice after errors; excess that counts as zero.
 LEAST, HOLDS = 0.02, 1e-3
 #: Sweeps of every choice after the first.
 AGAIN = 2
@@ -100,7 +100,7 @@ class SceneAims:
     defocused
         (H,).
     limit
-        Allowable flux in each cell, less the margin, W/m², (rows, columns).
+        Allowable flux in each cell minus the margin, W/m², (rows, columns).
     risk
         Uncertainty of the flux.
     light
@@ -123,7 +123,7 @@ class SceneAims:
 
     @property
     def excess(self) -> float:
-        """Greatest ratio of the quantile to the limit, less 1; 0 or less: the limit holds."""
+        """Largest ratio of the quantile to the limit, minus 1; at most 0 if the limit holds."""
         return float((self.quantile / self.limit).max()) - 1.0
 
     @cached_property
@@ -284,8 +284,8 @@ def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
     """Return earlier candidates rescaled to the present light."""
     if len(scene.mirrors) != len(start.aims):
         raise InputError(
-            f"aims: the start has {len(start.aims)} mirrors, the scene {len(scene.mirrors)}; begin "
-            "without it"
+            f"aims: the start has {len(start.aims)} mirrors, but the scene has "
+            f"{len(scene.mirrors)}; omit the start"
         )
     before, now = start.engine.leaving, base.leaving
     # A mirror that is defocused now or was then has no light of its own to compare; use the
@@ -330,7 +330,7 @@ def _refuse(scene: Scene, trial: SceneAims, demand: Demand) -> None:
     cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
     advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
     raise InputError(
-        f"receiver {surface_in(scene).name}: no aims were found that hold the flux limit; "
+        f"receiver {surface_in(scene).name}: no aims were found that respect the flux limit; "
         f"{_place(scene, cell)} gets {1e-3 * trial.quantile[cell]:.4g} kW/m², of which errors are "
         f"{1e-3 * trial.risk.above[cell]:.4g}, {100 * trial.excess:.2g} % above its "
         f"{1e-3 * trial.limit[cell]:.4g}; raise the limit by that, or {advice}"

@@ -74,12 +74,12 @@ def read_metadata(path: str | Path) -> Metadata:
             size, packet, exif = image.size, image.info.get("xmp", b""), image.getexif()
             tags = dict(exif.get_ifd(_EXIF_IFD))
     except FileNotFoundError:
-        raise FormatError(file, "no such file; give a photograph") from None
+        raise FormatError(file, "no such file; specify a photograph") from None
     except (OSError, SyntaxError, ValueError, LookupError, TypeError, struct.error) as error:
         text = str(error).split(":")[-1].strip() or "damaged"
         raise FormatError(file, f"not a readable image ({text}); copy it again") from None
     pixels = size[0] * size[1]
-    check_count(file, pixels, PHOTOGRAPH_PIXELS, "pixels", "give a smaller photograph")
+    check_count(file, pixels, PHOTOGRAPH_PIXELS, "pixels", "use a smaller photograph")
     values = _xmp(file, packet) if packet else {}
 
     def number(*names: str) -> float:
@@ -128,7 +128,7 @@ def _xmp(file: Path, packet: bytes | str) -> dict[str, str]:
 
 
 def _time(values: dict[str, str], tags: dict[int, object]) -> datetime | None:
-    """Return the time of exposure in UTC, from the most exact statement."""
+    """Return the time of exposure in UTC, from the most precise entry."""
     taken = str(tags.get(_TAKEN, "")).replace(":", "-", 2)
     part = str(tags.get(_SUBSECOND, "")).strip()
     taken += f".{part}" if taken and part.isdigit() else ""

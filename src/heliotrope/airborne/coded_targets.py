@@ -56,7 +56,7 @@ def white_cells(number: int) -> npt.NDArray[np.bool_]:
     import cv2
 
     if not 0 <= number < NUMBERS:
-        raise InputError(f"target {number}: there are numbers from 0 to {NUMBERS - 1}")
+        raise InputError(f"target {number}: numbers run from 0 to {NUMBERS - 1}")
     codes = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
     return np.asarray(cv2.aruco.generateImageMarker(codes, number, CELLS) > 127)
 

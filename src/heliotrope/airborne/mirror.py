@@ -76,15 +76,15 @@ class MirrorShape:
             object.__setattr__(self, name, as_vectors(getattr(self, name), f"mirror: {name}"))
         shape = self.center.shape
         if self.center.ndim != 2 or {self.half_width.shape, self.half_height.shape} != {shape}:
-            raise InputError(f"mirror: facets of shape {shape}; give centres and edges (F, 3)")
+            raise InputError(f"mirror: facets of shape {shape}; expected centres and edges (F, 3)")
         focal = np.array(np.broadcast_to(as_float(self.focal), shape[:1]))
         if not (focal != 0.0).all():
-            raise InputError("mirror: a focal length is 0 m or not a number; give inf for flat")
+            raise InputError("mirror: a focal length is 0 m or not a number; use inf for flat")
         object.__setattr__(self, "focal", focal)
         area = np.linalg.norm(np.cross(self.half_width, self.half_height), axis=-1)
         if not (area > 0.0).all():
             k = int(np.argmin(area))
-            raise InputError(f"mirror: facet {k} has no area; give edges that are not parallel")
+            raise InputError(f"mirror: facet {k} has no area; its edges must not be parallel")
         if self.slope is None:
             return
         slope = as_float(self.slope)
@@ -260,7 +260,7 @@ class Patch:
     corner_11: FloatArray
 
     def at(self, st: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the function at (K, 2) shares of the cells, and its derivatives by metres."""
+        """Return the function at fractional cell positions (K, 2), and its slopes per metre."""
         s, t = st[:, :1], st[:, 1:]
         by_s = self.corner_10 - self.corner_00
         by_t = self.corner_01 - self.corner_00
@@ -532,7 +532,7 @@ def _newton(
     ends: tuple[FloatArray, FloatArray],
     st: FloatArray,
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return the shares of the cells (K, 2) at which g is 0, and where that was reached."""
+    """Return fractional cell positions (K, 2) at which g is 0, and which of them converged."""
     good = np.zeros(len(st), dtype=np.bool_)
     for _ in range(_ITERATIONS):
         g, slope = _law(shape, facet, patch, ends, st)
@@ -567,7 +567,7 @@ def _law(
     ends: tuple[FloatArray, FloatArray],
     st: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return g (K, 2) and its derivatives by metres along the facet's axes, (K, 2, 2)."""
+    """Return g (K, 2) and its derivatives along the facet's axes, per metre, (K, 2, 2)."""
     uv = patch.low + st * patch.size
     point, axes = shape.on_facet(facet, uv), shape.axes[facet]
     curve = 1.0 / (2.0 * shape.focal[facet])
@@ -590,7 +590,7 @@ def _law(
 
 
 def _distinct(position: IntArray, facet: IntArray, uv: FloatArray) -> IntArray:
-    """Return rows in order of position, without those within 1e-7 m of another."""
+    """Return reflections ordered by position, without duplicates within 1e-7 m."""
     order = np.lexsort((uv[:, 1], uv[:, 0], facet, position))
     kept: list[int] = []
     for row in order:

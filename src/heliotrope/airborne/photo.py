@@ -64,7 +64,7 @@ class LedCamera:
         size, matrix, distortion = checked_pinhole("camera", self, smallest=16)
         offset = as_vectors(self.led_offset, "camera: led_offset")
         if offset.shape != (3,) or np.linalg.norm(offset) > 5.0:
-            raise InputError(f"camera: led_offset {offset} m; give right, down, forward within 5 m")
+            raise InputError(f"camera: led_offset {offset} m; use right, down, forward within 5 m")
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", distortion)
@@ -112,7 +112,7 @@ class Photo:
         if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
             raise InputError(f"photo {self.name}: sigma_position {sigma} m must be above 0")
         if self.time is not None and self.time.tzinfo is None:
-            raise InputError(f"photo {self.name}: time {self.time} has no zone; give UTC")
+            raise InputError(f"photo {self.name}: time {self.time} has no time zone; use UTC")
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "rotation", turned)
         object.__setattr__(self, "sigma_position", sigma)
@@ -249,12 +249,12 @@ def read_photos(
     """
     place = Path(folder)
     if not place.is_dir():
-        raise InputError(f"{place}: no such folder; give one with photographs")
+        raise InputError(f"{place}: no such folder; specify a folder with photographs")
     files = sorted(f for f in check_entries(place, place.iterdir()) if f.suffix.lower() in SUFFIXES)
     table = place / "photos.csv"
     rows = _read_table(table) if table.exists() else {}
     if not files and not rows:
-        raise InputError(f"{place}: there are no photographs ({', '.join(SUFFIXES)}) in it")
+        raise InputError(f"{place}: no photographs ({', '.join(SUFFIXES)}) in it")
     photos: list[Photo] = []
     problems: list[str] = []
     sizes: dict[str, tuple[int, int]] = {}
@@ -264,14 +264,16 @@ def read_photos(
             sizes[file.name] = metadata.size
             if rows:
                 if file.name not in rows:
-                    raise FormatError(file, f"{table.name} has no row for it; add one")
+                    raise FormatError(file, f"{table.name} has no row for this photograph; add one")
                 photos.append(_of_row(rows[file.name], table, file, plant_origin))
             else:
                 photos.append(_of_metadata(metadata, file, plant_origin))
         except InputError as error:
             problems.append(str(error))
     missing = sorted(set(rows) - {f.name for f in files})
-    problems += [f"{place / name}: {table.name} names it, but there is no file" for name in missing]
+    problems += [
+        f"{place / name}: {table.name} lists it, but there is no such file" for name in missing
+    ]
     if not photos:
         raise InputError(f"{place}: no photograph of {len(problems)} can be used: {problems[0]}")
     return _of_one_camera(photos, problems, sizes, place)
@@ -287,7 +289,7 @@ def _of_one_camera(
             width, height = sizes[photo.name]
             problems.append(
                 f"{place / photo.name}: {width} × {height} px, but most photographs have "
-                f"{usual[0]} × {usual[1]} px; give each camera a folder of its own"
+                f"{usual[0]} × {usual[1]} px; use a separate folder for each camera"
             )
         photos = [p for p in photos if sizes[p.name] == usual]
     return tuple(photos), tuple(problems)

@@ -32,7 +32,7 @@ def smooth_slopes(
     length
         Correlation length of the slopes, m: that of a Gaussian filter of the heights.
     cells
-        Along each edge of a facet.
+        Number of cells along each edge of a facet.
 
     Raises
     ------
@@ -41,8 +41,8 @@ def smooth_slopes(
     """
     if not (rms >= 0.0 and length > 0.0 and cells > 1):
         raise InputError(
-            f"smooth_slopes: rms {rms} rad, length {length} m and {cells} cells; give an rms of "
-            "0 or more, a length above 0 and two cells or more"
+            f"smooth_slopes: rms {rms} rad, length {length} m and {cells} cells; use an rms of 0 "
+            "or more, a length above 0 and at least two cells"
         )
     from scipy.ndimage import gaussian_filter
 

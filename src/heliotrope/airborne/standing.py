@@ -78,7 +78,7 @@ def join_standing(parts: Sequence[MirrorPoses]) -> MirrorPoses:
         If there are none.
     """
     if not parts:
-        raise InputError("no mirror is commanded; list those that the photographs show")
+        raise InputError("no heliostat is commanded; list the heliostats that the photographs show")
     return MirrorPoses(
         tuple(name for p in parts for name in p.names),
         np.concatenate([p.vertex for p in parts]),
@@ -142,7 +142,9 @@ def read_commands(
     )
     if not len(rows):
         of = f" of cluster {cluster!r}, point {point!r}" if cluster or point else ""
-        raise InputError(f"{path}: no heliostat{of} in it; list those that the photographs show")
+        raise InputError(
+            f"{path}: no heliostat{of} in it; list the heliostats that the photographs show"
+        )
     rows.heliostat = rows.texts("heliostat")
     index = {name: i for i, name in enumerate(names)}
     commands: dict[int, int] = {}
@@ -151,7 +153,7 @@ def read_commands(
             place = f"heliostat ({path}, {rows.places[i]}) in this field:"
             raise UnknownNameError(place, name, names)
         if commands.setdefault(index[name], i) != i:
-            twice = "it is listed twice, but photographs show one pose; give the cluster and the"
+            twice = "it is listed twice, but photographs show one pose; specify the cluster and the"
             rows.refuse(i, "heliostat", f"{twice} point of the photographs")
     counts = [rows.numbers(name, "drive counts") for name in _COUNTS if name in rows.columns]
     rows.refuse_bad()

@@ -67,10 +67,10 @@ class Visibility:
     Attributes
     ----------
     share
-        Share of each mirror's area on which a reflection can be found, (N,): not hidden by a nearer
+        Fraction of each mirror's area where a reflection can be found, (N,): not hidden by a nearer
         mirror, and not closer to an edge than `MARGIN`.
     hidden
-        Share of each mirror's area that nearer mirrors hide, (N,).
+        Fraction of each mirror's area hidden by nearer mirrors, (N,).
     side
         Root of each mirror's area in the picture, px, (N,).
     """
@@ -81,14 +81,14 @@ class Visibility:
 
     @property
     def overlapping(self) -> bool:
-        """Whether mirrors merge into shapes that show no single mirror."""
+        """Whether mirrors merge into shapes in which single mirrors cannot be distinguished."""
         return bool(np.mean(self.hidden > _TOUCHED) > _MERGED)
 
 
 def seen_from(stand: MirrorPoses, place: npt.ArrayLike, focal: float) -> Visibility:
     """Return how well a camera of focal length ``focal`` (px) at ``place`` (3,) sees mirrors.
 
-    The camera looks at their middle; mirrors seen from behind hide others but show nothing.
+    The camera is aimed at their centre; mirrors seen from behind hide others but show nothing.
     """
     import cv2
 
@@ -114,7 +114,7 @@ def seen_from(stand: MirrorPoses, place: npt.ArrayLike, focal: float) -> Visibil
         usable = cv2.erode(own, square, iterations=MARGIN)
         share[row] = np.count_nonzero(usable) / max(area[row], 1.0)
         whole[row] = np.count_nonzero(own) / max(area[row], 1.0)
-    # The edge of a drawn mirror takes whole pixels.
+    # The edge of a drawn mirror covers whole pixels.
     return Visibility(share, np.clip(1.0 - whole, 0.0, 1.0), np.sqrt(np.nan_to_num(area)))
 
 

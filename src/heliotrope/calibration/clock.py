@@ -68,16 +68,17 @@ class ClockCheck:
         if not self.found:
             least = abs(self.error) + CLEAR * self.sigma
             return (
-                f"clock: no error shows, {self.error:+.0f} ± {self.sigma:.0f} s; one below "
-                f"{least:.0f} s ({1e3 * RATE * least:.1f} mrad of the sun) would not, so check it "
-                "by other means"
+                f"clock: no error found, {self.error:+.0f} ± {self.sigma:.0f} s; one below "
+                f"{least:.0f} s ({1e3 * RATE * least:.1f} mrad of the sun) would not show, so "
+                "check the clock by other means"
             )
         side = "fast" if self.error > 0.0 else "slow"
         return (
-            f"the clock may be wrong by {abs(self.error):.0f} s ± {self.sigma:.0f} s ({side}): by "
-            f"that the sightings of {amount(self.heliostats, 'heliostat')} fit far better "
-            f"({abs(self.error) / self.sigma:.0f} standard deviations). Check it and its zone, "
-            "correct times and suns, and calibrate again; the plant file keeps its parameters"
+            f"the clock may be wrong by {abs(self.error):.0f} s ± {self.sigma:.0f} s ({side}): "
+            f"with this correction the sightings of {amount(self.heliostats, 'heliostat')} fit "
+            f"far better ({abs(self.error) / self.sigma:.0f} standard deviations). Check the "
+            "clock and its time zone, correct times and sun directions, and calibrate again; the "
+            "plant file keeps its parameters"
         )
 
     def document(self) -> dict[str, float | bool]:
@@ -134,7 +135,7 @@ def check_clock(
 
 @dataclass(frozen=True)
 class _Step:
-    """The shift of the suns that the sightings at another one ask for, and its sigma, s."""
+    """The further shift of the sun positions that shifted sightings require, and its sigma, s."""
 
     shift: float
     sigma: float
@@ -232,7 +233,7 @@ def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
 
 
 def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings:
-    """Return at most a given number of sightings per heliostat, spread over all its sightings."""
+    """Return at most a given number of sightings per heliostat, spread evenly over all of them."""
     rows, place = [], []
     for k, row in enumerate(chosen):
         mine = np.flatnonzero(suns.heliostat == row)

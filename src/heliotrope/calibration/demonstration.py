@@ -28,14 +28,14 @@ def measure(
     noise: float = 5e-3,
     seed: int = 0,
 ) -> Sightings:
-    """Return sightings of every heliostat every 70 minutes, as a camera on the target takes them.
+    """Return sightings of every heliostat every 70 minutes, as a target camera would measure them.
 
     Parameters
     ----------
     nominal, truth
         Mechanisms as commanded and as built, (N,).
     target, site
-        Target of the beams; place and air.
+        Target of the beams; site and atmosphere.
     days
         Days of measurement.
     noise
@@ -78,7 +78,7 @@ class TrackedDay:
     times
         T times.
     before, after
-        Commanded by the nominal mechanisms, and by the calibrated ones.
+        Errors when commanded by the nominal and by the calibrated mechanisms.
     """
 
     times: list[datetime]

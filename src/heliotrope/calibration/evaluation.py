@@ -25,7 +25,7 @@ Split = Literal[
     "balanced",
     "high-variance",
 ]
-#: Share of the sightings that a held-out neighbourhood has; at least three sightings.
+#: Fraction of the sightings in a held-out neighbourhood; at least three sightings.
 NEIGHBOURHOOD = 0.1
 
 
@@ -139,7 +139,7 @@ def split(
     """
     check_fraction(fraction)
     if kind not in get_args(Split):
-        raise InputError(f"split {kind!r}: give one of {', '.join(get_args(Split))}")
+        raise InputError(f"split {kind!r}: use one of {', '.join(get_args(Split))}")
     if kind in KINDS:
         return paint_split(sightings, kind, seed)[0]
     chosen = np.zeros(len(sightings), dtype=np.bool_)
@@ -158,7 +158,7 @@ def split(
 def partition(
     sightings: Sightings, kind: Split = "random", fraction: float = 0.7, seed: int = 0
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Return the masks (M,) of the training part and of the tested part, as `split`.
+    """Return the masks (M,) of the training part and of the test part, as in `split`.
 
     PAINT's splits have a part for validation, which belongs to neither.
     """
@@ -169,7 +169,7 @@ def partition(
 
 
 def check_fraction(fraction: float) -> None:
-    """Refuse a training share that leaves nothing to learn from or nothing to test.
+    """Raise an error for a training fraction that leaves nothing to learn from or to test on.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def check_fraction(fraction: float) -> None:
 def _by_neighbourhood(
     sightings: Sightings, rows: npt.NDArray[np.intp], fraction: float, seed: int
 ) -> npt.NDArray[np.intp]:
-    """Rows of one heliostat with whole neighbourhoods of the sky at the end."""
+    """Order the sightings of one heliostat so that whole neighbourhoods of the sky come last."""
     rng = np.random.default_rng((seed, int(sightings.heliostat[rows[0]])))
     sky = sightings.source[rows]
     many = max(3, round(NEIGHBOURHOOD * len(rows)))

@@ -44,28 +44,28 @@ class _Strict(BaseModel):
 
 
 class FlightRow(_Strict):
-    """One orientation: what the drone saw of one mirror in one pose.
+    """One orientation: the drone's measurement of one mirror in one pose.
 
     Attributes
     ----------
     heliostat, time
-        Name, and POSIX s.
+        Name of the heliostat, and POSIX time, s.
     counts
-        Of its drives.
+        Counts of its drives.
     place_m
         Point on the mirror's normal at the distance of the drone, ENU: as if lamp and camera were
         one.
     sigma_rad
-        Standard deviation of the normal about each axis, beside the errors below.
+        Standard deviation of the normal about each axis, excluding the errors below.
     turn_rad
-        Standard deviation of the turn that all poses of this mirror show alike: unknown slopes, and
-        the survey of its position.
+        Standard deviation of the rotation common to all poses of this mirror, due to unknown slopes
+        and the survey of its position.
     covariance_m2
-        Covariance of the mirror's position relative to the drone that this row shares with no
-        other, ENU.
+        Covariance of the mirror's position relative to the drone that is specific to this record,
+        ENU.
     shift
-        Displacement of the drone relative to the mirror by one unit of each shared error, recorded
-        less true, ENU, m: three lists, east, north and up.
+        Displacement of the drone relative to the mirror per unit of each shared error, recorded
+        minus true, ENU, m: three lists, east, north and up.
     """
 
     heliostat: _Name
@@ -79,16 +79,16 @@ class FlightRow(_Strict):
 
 
 class FlightDocument(_Strict):
-    """A flight as its file has it.
+    """A flight as stored in its file.
 
     Attributes
     ----------
     format, version
-        Of the file.
+        Format and version of the file.
     name
-        Of the flight: unique in a plant.
+        Name of the flight, unique in a plant.
     shared
-        Names of the K errors that all rows share.
+        Names of the K errors shared by all records.
     covariance
         Their covariance, (K, K).
     rows
@@ -109,18 +109,21 @@ class FlightDocument(_Strict):
         Raises
         ------
         ValueError
-            Shapes that do not fit, or a matrix that is not a covariance.
+            If shapes do not match, or a matrix is not a covariance.
         """
         count = len(self.shared)
         if len(self.covariance) != count or any(len(r) != count for r in self.covariance):
-            raise ValueError(f"covariance: give {count} by {count} values, one for each of shared")
+            raise ValueError(
+                f"covariance: write {count} by {count} values, a row and a column for each of "
+                "shared"
+            )
         if count and not _positive(np.array(self.covariance)):
             raise ValueError("covariance: it is not symmetric and positive definite")
         for k, row in enumerate(self.rows):
             if any(len(line) != count for line in row.shift):
-                raise ValueError(f"rows.{k}.shift: give 3 lists of {count} values")
+                raise ValueError(f"rows.{k}.shift: write 3 lists of {count} values")
             if any(len(line) != 3 for line in row.covariance_m2):
-                raise ValueError(f"rows.{k}.covariance_m2: give 3 lists of 3 values")
+                raise ValueError(f"rows.{k}.covariance_m2: write 3 lists of 3 values")
         good = is_covariance(np.array([row.covariance_m2 for row in self.rows]))
         if not good.all():
             k = int(np.flatnonzero(~good)[0])
@@ -139,23 +142,23 @@ def _positive(matrix: FloatArray) -> bool:
 
 @dataclass(frozen=True)
 class Flight:
-    """M orientations of N heliostats from the air, with the K errors that they share.
+    """M orientations of N heliostats measured from the air, with their K shared errors.
 
     Attributes
     ----------
     name
-        Unique in a plant.
+        Name, unique in a plant.
     heliostats
         Names of the N heliostats.
     sightings
-        M sightings, rows of ``heliostats``; their covariances are what they do not share.
+        M sightings, with indices into ``heliostats``; their covariances exclude the shared errors.
     turn_sigma
-        Standard deviation of the turn that all poses of a mirror show alike, rad, (N,).
+        Standard deviation of the rotation common to all poses of a mirror, rad, (N,).
     shared, covariance
         Names of the shared errors, and their covariance, (K, K).
     shift
-        Displacement of the drone relative to each sighting's mirror by one unit of each shared
-        error, recorded less true, ENU, m, (M, 3, K).
+        Displacement of the drone relative to each sighting's mirror per unit of each shared error,
+        recorded minus true, ENU, m, (M, 3, K).
     """
 
     name: str
@@ -168,7 +171,7 @@ class Flight:
 
     @classmethod
     def of(cls, document: FlightDocument) -> "Flight":
-        """Return the flight of a document."""
+        """Convert a document to a flight."""
         rows = document.rows
         names = tuple(dict.fromkeys(row.heliostat for row in rows))
         index = {name: i for i, name in enumerate(names)}
@@ -182,7 +185,7 @@ class Flight:
             places,
             places,
             time=np.array([row.time for row in rows]),
-            # The ray turns by twice the error of the normal, and lamp and camera move together.
+            # The ray rotates by twice the error of the normal, and lamp and camera move together.
             sigma=2.0 * np.array([row.sigma_rad for row in rows]),
             camera_covariance=4.0 * np.array([row.covariance_m2 for row in rows]),
         )
@@ -198,7 +201,7 @@ class Flight:
         )
 
     def rows_by_heliostat(self) -> dict[str, npt.NDArray[np.intp]]:
-        """Return the rows of the sightings of each heliostat."""
+        """Return the sighting indices of each heliostat."""
         order = np.argsort(self.sightings.heliostat, kind="stable")
         count = np.bincount(self.sightings.heliostat, minlength=len(self.heliostats))
         parts = np.split(order, np.cumsum(count)[:-1])
@@ -206,12 +209,12 @@ class Flight:
 
 
 def parse_flight(data: bytes | str) -> FlightDocument:
-    """Return the document in the text of a flight's file.
+    """Parse and check the text of a flight file.
 
     Raises
     ------
     InputError
-        If it cannot be used; the text names the place.
+        If the text cannot be used; the message names the location.
     """
     try:
         return FlightDocument.model_validate_json(data)
@@ -222,12 +225,12 @@ def parse_flight(data: bytes | str) -> FlightDocument:
 
 
 def read_flight(path: str | Path) -> FlightDocument:
-    """Return the document of a flight's file.
+    """Read the document from a flight file.
 
     Raises
     ------
     FormatError
-        If it cannot be read or used.
+        If the file cannot be read or used.
     """
     text = read_text(path, "the flight.json of `heliotrope drone evaluate`", LARGEST)
     try:
@@ -237,7 +240,7 @@ def read_flight(path: str | Path) -> FlightDocument:
 
 
 def write_flight(path: str | Path, document: FlightDocument) -> None:
-    """Write the file of a flight, one row a line."""
+    """Write a flight file, with one record per line."""
     content = document.model_dump()
     rows = ",\n  ".join(_text(row) for row in content.pop("rows"))
     head = ",\n ".join(f"{json.dumps(key)}: {_text(value)}" for key, value in content.items())
@@ -249,6 +252,6 @@ def _text(value: Any) -> str:
 
 
 def flight_name(parts: Sequence[str], at: float) -> str:
-    """Return a name for a flight: those of its parts, and its time (POSIX s)."""
+    """Return a name for a flight, composed of its parts and its time (POSIX s)."""
     day = np.datetime_as_string(np.datetime64(round(at), "s"))
     return f"{day}Z {' '.join(part for part in parts if part)}".strip()[:64]

@@ -26,12 +26,12 @@ from heliotrope.mechanism.chain import Mechanism
 class Growth:
     """Growth of the variances of parameters with time; without arguments nothing grows.
 
-    Equal figures make equal objects: the mirrors of a group are computed together.
+    Objects with equal values are equal, so the heliostats of a group are computed together.
 
     Attributes
     ----------
     source
-        Where the figures come from, for people.
+        Source of the values, for display.
     processes, variance, tau
         Parameter, variance and time constant (days) of each process, C.
     stepping, rate
@@ -49,8 +49,8 @@ class Growth:
     def of(cls, hyper: Hyperparameters, source: str) -> "Growth":
         """Return the growth under hyperparameters.
 
-        A process of hours is left out: it is over before the next visit, and is part of the noise
-        of each sighting.
+        Processes within hours are left out, because they decay before the next visit and are part
+        of the noise of each sighting.
         """
         slow = [c for c, process in enumerate(hyper.processes) if process.group != "hours"]
         steps = np.flatnonzero(hyper.step > 0.0)
@@ -71,7 +71,7 @@ class Growth:
         names
             P parameters; those that do not drift keep their variance.
         days
-            Since the calibration, (...); a time before it adds nothing.
+            Days since the calibration, (...); negative values add nothing.
         """
         since = np.maximum(as_float(days), 0.0)[..., None]
         of_processes = 2.0 * as_float(self.variance) * -np.expm1(-since / as_float(self.tau))
@@ -89,7 +89,7 @@ class Growth:
 
 
 def default_growth(mechanism: Mechanism) -> Growth:
-    """Return the growth of a kind of mechanism before its field has sightings."""
+    """Return the growth for a kind of mechanism before its field has any sightings."""
     hyper = drift.start(mechanism, drift.zeros(mechanism))
     tau, rate = drift.START_DAYS["slow"], drift.step_rate(())
     wander = f"zeros wander by {1e3 * drift.START_RAD['slow']:g} mrad over {tau:.0f} days"
@@ -98,7 +98,7 @@ def default_growth(mechanism: Mechanism) -> Growth:
 
 
 def _places(parameters: tuple[str, ...], names: Sequence[str]) -> FloatArray:
-    """Return the matrix that adds figures of parameters to those of the same name, (C, P)."""
+    """Return the matrix that maps values of processes to parameters of the same name, (C, P)."""
     columns = np.array(names, dtype=np.str_)
     rows = np.array(parameters, dtype=np.str_)
     return as_float(rows[:, None] == columns)

@@ -9,7 +9,7 @@ from heliotrope.jit import INNER
 
 @njit(**INNER)
 def _select(values, k):
-    """Put the k-th smallest in its place, none larger before and none smaller after it (Hoare)."""
+    """Partition so that the k-th smallest element is at index k (Hoare)."""
     low, high = 0, values.shape[0] - 1
     while low < high:
         pivot = values[(low + high) // 2]

@@ -89,13 +89,13 @@ class Members:
         if sightings.names and len(sightings.names) != count:
             raise InputError(
                 f"sightings: they name {len(sightings.names)} heliostats, the first "
-                f"{sightings.names[0]}, but the {count} mechanisms have no names; give the plant, "
+                f"{sightings.names[0]}, but the {count} mechanisms have no names; pass the plant, "
                 "its group or one of its heliostats"
             )
         if len(sightings) and int(sightings.heliostat.max()) >= count:
             raise InputError(
-                f"sightings: one is of heliostat row {int(sightings.heliostat.max())}; there are "
-                f"{count} heliostats"
+                f"sightings: a sighting has heliostat index {int(sightings.heliostat.max())}, but "
+                f"there are {count} heliostats"
             )
         return sightings
 
@@ -111,7 +111,7 @@ def members(field: Field, state: Literal["nominal", "calibrated"] = "nominal") -
     if isinstance(field, Mechanism):
         if len(field.shape) > 1:
             raise InputError(
-                f"mechanism: shape {field.shape}; give one mechanism, or N of shape (N,)"
+                f"mechanism: shape {field.shape}; pass one mechanism, or N mechanisms of shape (N,)"
             )
         return Members(field if field.shape else field[None], single=not field.shape)
     if isinstance(field, Heliostat):
@@ -124,7 +124,7 @@ def members(field: Field, state: Literal["nominal", "calibrated"] = "nominal") -
         chosen = field.nominal if state == "nominal" else field.calibrated
         return Members(chosen, field.names, around=Surroundings(field.site, field.targets))
     raise InputError(
-        f"mechanism: {kind_of(field)} is not a Mechanism; give nominal mechanisms, plant[name], a "
+        f"mechanism: {kind_of(field)} is not a Mechanism; pass nominal mechanisms, plant[name], a "
         "group of the plant, or the plant"
     )
 

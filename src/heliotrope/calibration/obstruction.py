@@ -27,7 +27,7 @@ _ON_PLANE = 0.1
 
 @dataclass(frozen=True)
 class Unobstructed:
-    """Sightings as if no neighbour stood in the light.
+    """Sightings corrected as if no neighbour shaded or blocked the mirror.
 
     Attributes
     ----------
@@ -142,14 +142,14 @@ def shift_of(
     *,
     unknown: float = UNKNOWN,
 ) -> tuple[FloatArray, npt.NDArray[np.float64], float]:
-    """Return how far neighbours moved a centroid, its covariance, and the hidden share.
+    """Return the shift of a centroid caused by neighbours, its covariance, and the hidden fraction.
 
     Parameters
     ----------
     heliostats, i
-        A group, and the row of the mirror in it.
+        A group, and the index of the heliostat in it.
     target, centroid
-        The centroid, ENU metres, (3,), is on the target.
+        Target, and centroid on it, ENU metres, (3,).
     sun
         Unit vector to the sun, (3,).
     center
@@ -157,7 +157,7 @@ def shift_of(
     neighbours
         Mirrors beside it.
     unknown
-        Share of the shift that remains uncertain.
+        Fraction of the shift that remains uncertain.
 
     Returns
     -------

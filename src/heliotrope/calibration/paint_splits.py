@@ -21,7 +21,7 @@ from heliotrope.geometry import FloatArray
 KINDS = ("azimuth", "solstice", "balanced", "high-variance")
 #: Measurements for training and for validation where a heliostat has enough for both and a test.
 TRAINING, VALIDATION = 100, 30
-#: Neighbours whose mean distance says how lonely a measurement is.
+#: Number of neighbours whose mean distance measures how isolated a measurement is.
 NEIGHBOURS = 3
 
 Rows = npt.NDArray[np.intp]

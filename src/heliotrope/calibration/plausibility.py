@@ -114,9 +114,9 @@ def judge(
     _add(
         reasons,
         _repeated(sightings, photographed, reasons),
-        "the point of the beam is the same to the last digit in all sightings of this mirror, "
-        "though sun and counts change: it was not measured; if the beam was steered to a mark by "
-        "hand, leave kind empty",
+        "the beam position is identical to the last digit in all sightings of this heliostat, "
+        "although sun and counts change, so it was not measured; if the beam was steered to a "
+        "mark by hand, leave kind empty",
     )
     if surfaces and kinds:
         _add(
@@ -132,7 +132,7 @@ def judge(
 def judge_in(
     plant: Plant, sightings: Sightings, kinds: Sequence[str] = (), now: float | None = None
 ) -> Judgement:
-    """Return the judgement with everything that a plant knows; rows are those of its heliostats."""
+    """Judge sightings with all of a plant's data; heliostat indices refer to the plant."""
     return judge(
         sightings,
         mechanism=plant.nominal if len(plant.groups) == 1 else None,
@@ -229,15 +229,14 @@ def _contradicted(
     if whole.any():
         middle = float(np.degrees(np.median(away[whole])))
         note = (
-            f"the suns of {whole.sum()} of {able.sum()} sightings do not stand where the sun stood "
-            f"at their times (median {middle:.1f}° off): check clock, time zone and the plant's "
-            "[site]"
+            f"the sun directions of {whole.sum()} of {able.sum()} sightings do not match their "
+            f"times (median {middle:.1f}° off): check clock, time zone and the plant's [site]"
         )
         rows = rows & ~whole
     stated, computed = azimuth_elevation(sightings.source[rows]), azimuth_elevation(expected[rows])
     texts = [
-        f"the sun is given at azimuth {a % 360.0:.1f}°, elevation {e:.1f}°, and stood at "
-        f"{b % 360.0:.1f}°, {f:.1f}° at that time: correct one of them"
+        f"the recorded sun is at azimuth {a % 360.0:.1f}°, elevation {e:.1f}°, but the actual sun "
+        f"was at {b % 360.0:.1f}°, {f:.1f}° at that time: correct the direction or the time"
         for a, e, b, f in zip(*np.degrees(stated), *np.degrees(computed), strict=True)
     ]
     return rows, texts, note
@@ -302,7 +301,7 @@ def _beyond_machine(
             rows,
             [
                 f"the counts {sightings.counts[i, drive]:.10g} of {mechanism.joints[joint]} are "
-                f"beyond its stops: {value[i]:.5g}{unit} is outside {low[i]:.5g} to "
+                f"beyond its end stops: {value[i]:.5g}{unit} is outside {low[i]:.5g} to "
                 f"{high[i]:.5g}{unit}"
                 for i in np.flatnonzero(rows)
             ],

@@ -94,7 +94,7 @@ class HeliostatCalibration(Value, Framed):
         Covariance of the values at the time of the fit, with the noise scaled to the residuals,
         (P, P).
     prior
-        Standard deviations of the priors that the covariance stands on, (P,).
+        Standard deviations of the priors behind the covariance, (P,).
     before, after
         Beam error over the sightings under the nominal and the calibrated mechanism, rad RMS;
         NaN if unknown.
@@ -122,13 +122,13 @@ class HeliostatCalibration(Value, Framed):
         1, 2, ... for each heliostat; 0 before it is numbered.
     growth
         How the covariance grows after the fit. The growth belongs to the group: a fit sets the
-        default of its kind, the plant's beliefs set what is known of the group, and no store keeps
-        it here.
+        default for its kind of mechanism, the plant's beliefs replace it with that of the group,
+        and it is not stored with the record.
 
     Raises
     ------
     InputError
-        Shapes that do not match, or parameters that are not finite.
+        If shapes do not match, or parameters are not finite.
     """
 
     heliostat: str
@@ -178,7 +178,8 @@ class HeliostatCalibration(Value, Framed):
         for name in ("values", "covariance", "prior"):
             if not np.isfinite(getattr(self, name)).all():
                 raise InputError(
-                    f"calibration of {self.heliostat}: {name} is not finite; keep no failed fit"
+                    f"calibration of {self.heliostat}: {name} is not finite; do not keep a failed "
+                    "fit"
                 )
 
     def _labelled(self) -> Labelled:
@@ -298,7 +299,7 @@ class HeliostatCalibration(Value, Framed):
 
     @property
     def heliostats(self) -> tuple[str, ...]:
-        """The name, in the form that `Mechanism.with_calibration` and others take."""
+        """The name, in the form that functions such as `Mechanism.with_calibration` accept."""
         return (self.heliostat,)
 
     @property

@@ -234,13 +234,13 @@ def read_malan(
         "sun_azimuth_deg",
         (azimuth < -180.0) | (azimuth > 360.0),
         azimuth,
-        "° is outside −180° to 360°; give degrees clockwise from north",
+        "° is outside −180° to 360°; use degrees clockwise from north",
     )
     rows.check(
         "sun_elevation_deg",
         (elevation <= -5.0) | (elevation > 90.0),
         elevation,
-        "° is outside −5° to 90°; give the sun's elevation in degrees",
+        "° is outside −5° to 90°; use the sun's elevation in degrees",
     )
     for name, values in zip(_MALAN[3:5], offsets, strict=True):
         rows.check(
@@ -306,10 +306,11 @@ def _points(rows: Rows, end: str, far: npt.NDArray[np.bool_]) -> FloatArray:
             name,
             ~far & (np.abs(values) > _FARTHEST),
             values,
-            f" m is more than {_FARTHEST / 1e3:g} km from the plant; give ENU metres about it",
+            f" m is more than {_FARTHEST / 1e3:g} km from the plant; use ENU metres relative to "
+            "the plant",
         )
     for i in np.flatnonzero(far & ~points.any(axis=-1)):
-        rows.refuse(i, names[0], "0, 0, 0 is no direction; give the direction from the mirror")
+        rows.refuse(i, names[0], "0, 0, 0 is not a direction; enter the direction from the mirror")
     return points
 
 
@@ -357,7 +358,7 @@ def _covariance(rows: Rows, end: str) -> FloatArray:
         values = rows.numbers(names[pair], what, empty=0.0)
         matrices[:, a, b] = matrices[:, b, a] = values
         for i in np.flatnonzero(some & ~filled[k]):
-            rows.refuse(i, names[pair], f"the cell is empty; give {what}")
+            rows.refuse(i, names[pair], f"the cell is empty; enter {what}")
     for i in np.flatnonzero(~is_covariance(matrices)):
         rows.refuse(
             i,
@@ -374,13 +375,13 @@ def _columns(
     rows_of(names)
     if len(s) and int(s.heliostat.max()) >= len(names):
         raise InputError(
-            f"sightings: heliostat row {int(s.heliostat.max())} of {len(names)} names; give the "
+            f"sightings: heliostat row {int(s.heliostat.max())} of {len(names)} names; pass the "
             "names of all heliostats"
         )
     all_kinds = [""] * len(s) if kinds is None else list(kinds)
     if len(all_kinds) != len(s):
         raise InputError(
-            f"sightings: {len(all_kinds)} kinds for {len(s)} sightings; give one for each"
+            f"sightings: {len(all_kinds)} kinds for {len(s)} sightings; pass one kind per sighting"
         )
     for kind in all_kinds:
         if kind and kind not in KINDS:

@@ -208,8 +208,8 @@ def sightings(
     table = np.atleast_2d(_numbers(counts, "counts"))
     if not table.shape[-1]:
         raise InputError(
-            f"sightings: counts of shape {np.shape(counts)} are of no drive; give them as (M, 2), "
-            "or as (0, 2) for no sightings"
+            f"sightings: counts of shape {np.shape(counts)} have no drives; pass shape (M, 2), or "
+            "(0, 2) for no sightings"
         )
     batch = table.shape[:-1]
     table = table.reshape(-1, table.shape[-1])
@@ -273,8 +273,8 @@ def _rows(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
     except ValueError:
         shape_text = "3 numbers" if name in ("source", "destination") else "a number"
         raise InputError(
-            f"sightings: {name} of shape {values.shape}; there are {shape[0]} rows of counts: give "
-            f"{shape_text} for all of them, or shape {shape}"
+            f"sightings: {name} of shape {values.shape}; there are {shape[0]} rows of counts: "
+            f"pass {shape_text} for all of them, or shape {shape}"
         ) from None
 
 
@@ -284,7 +284,7 @@ def _heliostats(heliostat: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
         raise InputError(
-            f"sighting {i}: heliostat {values[i]:g} is not a row; give whole numbers from 0 on"
+            f"sighting {i}: heliostat {values[i]:g} is not a heliostat index; use integers from 0"
         )
     return np.array(values, dtype=np.intp)
 
@@ -315,7 +315,7 @@ def _covariances(covariance: npt.ArrayLike, rows: int, name: str) -> FloatArray:
         matrices = np.array(np.broadcast_to(values, (rows, 3, 3)))
     except ValueError:
         raise InputError(
-            f"sightings: {name} of shape {np.shape(covariance)}; give a variance, {rows} "
+            f"sightings: {name} of shape {np.shape(covariance)}; pass one variance, {rows} "
             f"variances, or matrices (3, 3) or ({rows}, 3, 3)"
         ) from None
     bad = ~is_covariance(matrices)
@@ -323,7 +323,7 @@ def _covariances(covariance: npt.ArrayLike, rows: int, name: str) -> FloatArray:
         i = int(np.flatnonzero(bad)[0])
         raise InputError(
             f"sighting {i}: {name} {matrices[i].tolist()} is not symmetric and positive "
-            "semidefinite; give variances and covariances in m² of a point, rad² of a direction"
+            "semidefinite; use variances and covariances in m² for points and rad² for directions"
         )
     return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
 
@@ -588,13 +588,13 @@ def join(parts: Iterable[Sightings]) -> Sightings:
         If there are no sightings, or their mechanisms have different numbers of drives.
     """
     if isinstance(parts, Sightings):
-        raise InputError("join: one Sightings; give a list of them")
+        raise InputError("join: got a single Sightings; pass a list of Sightings")
     parts = list(parts)
     for k, part in enumerate(parts):
         if not isinstance(part, Sightings):
-            raise InputError(f"join: part {k} is {kind_of(part)}; give a list of Sightings")
+            raise InputError(f"join: part {k} is {kind_of(part)}; pass a list of Sightings")
     if not parts:
-        raise InputError("join: 0 parts; give at least 1")
+        raise InputError("join: the list is empty; pass at least one Sightings")
     drives = sorted({part.counts.shape[-1] for part in parts})
     if len(drives) != 1:
         raise InputError(

@@ -76,7 +76,7 @@ def precision(
     if made is not None and len(made):
         if int(made.heliostat.max()) >= count:
             raise InputError(
-                f"a sighting is of heliostat row {int(made.heliostat.max())}; there are "
+                f"a sighting has heliostat index {int(made.heliostat.max())}, but there are "
                 f"{count} heliostats"
             )
         slope = linearise(mechanism[made.heliostat], made, names).jacobian
@@ -223,7 +223,9 @@ def suns_of_year(
         If the sun never rises above ``min_elevation``.
     """
     if days < 1 or not 0.0 < hours <= 24.0:
-        raise InputError(f"{days} days at {hours} h: give a day or more and a step up to 24 h")
+        raise InputError(
+            f"{days} days at {hours} h: use at least one day and a step of at most 24 h"
+        )
     begin = datetime(year, 1, 1, tzinfo=UTC).timestamp()
     noon = begin + (np.arange(days) + 0.5) * 365.25 * 86400.0 / days
     # The golden ratio shifts the hours from day to day; otherwise all days would show the same.
@@ -234,8 +236,8 @@ def suns_of_year(
     suns = position.vector[position.elevation >= min_elevation]
     if not len(suns):
         raise InputError(
-            f"{site.label}: the sun never reaches {np.degrees(min_elevation):g}° in {year}; "
-            "lower the least elevation"
+            f"{site.label}: the sun never reaches {np.degrees(min_elevation):g}° in {year}; lower "
+            "the minimum elevation"
         )
     return suns
 
@@ -380,5 +382,5 @@ def year_map(
 
 def _batch(mechanism: Mechanism) -> int:
     if len(mechanism.shape) != 1:
-        raise InputError(f"mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
+        raise InputError(f"mechanisms of shape {mechanism.shape}; must have one batch axis (N,)")
     return len(mechanism)

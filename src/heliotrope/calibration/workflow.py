@@ -111,18 +111,19 @@ def read_field_sightings(
     require("place", place, (str, Path), "the file or folder that the plant was read from")
     place = Path(place)
     if centroid not in ("utis", "helios"):
-        raise InputError(f"centroid {shown(centroid)}: give 'utis' or 'helios'")
+        raise InputError(f"centroid {shown(centroid)}: use 'utis' or 'helios'")
     if now is not None:
         require("now", now, numbers.Real, "Unix seconds")
         if not math.isfinite(now):
-            raise InputError(f"now is {now}; give Unix seconds")
+            raise InputError(f"now is {now}; pass Unix seconds")
     if table is not None:
         field = _read_table(plant, place, Path(table), now)
     elif place.is_dir():
         field = _read_folder(plant, place, centroid, now)
     else:
         raise InputError(
-            f"{place}: a plant without measurements; give --sightings TABLE, or a folder with both"
+            f"{place}: the plant has no measurements; specify --sightings TABLE, or a folder with "
+            "plant and measurements"
         )
     if not len(field.sightings):
         reason = f"; the first: {field.left_out[0]}" if field.left_out else ""
@@ -133,8 +134,8 @@ def read_field_sightings(
 def _read_table(plant: Plant, place: Path, table: Path, now: float | None) -> FieldSightings:
     if len(plant.groups) != 1:
         raise InputError(
-            f"{place}: {len(plant.groups)} groups of heliostats; calibrate them one by one: "
-            "give a plant with one group"
+            f"{place}: {len(plant.groups)} groups of heliostats; calibrate them one at a time, "
+            "each as a plant with one group"
         )
     ((group, heliostats),) = plant.groups.items()
     judged: list[Judgement] = []
@@ -374,7 +375,7 @@ def calibrate(
     require("fraction", fraction, numbers.Real, "a share from 0 to 1")
     require("seed", seed, numbers.Integral, "a whole number, 0 or more")
     if seed < 0:
-        raise InputError(f"seed {seed} is below 0; give a whole number, 0 or more")
+        raise InputError(f"seed {seed} is below 0; use a whole number, 0 or more")
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
     names, mechanism = field.heliostats.names, field.heliostats.mechanism

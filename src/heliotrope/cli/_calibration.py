@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 # Options with the same meaning in every calibration command.
 Place = Annotated[
-    Path, typer.Argument(help="Folder with measurements, properties and tower; or a plant file.")
+    Path,
+    typer.Argument(help="Folder with measurements, properties and tower file; or a plant file."),
 ]
 ModelOption = Annotated[
     str,

@@ -101,7 +101,7 @@ def parse_numbers(
 
 def parse_point(text: str, what: str) -> tuple[float, float, float]:
     """Return three numbers within ± 1e6 from "E,N,U"."""
-    refusal = f"{what} {shown(text)}: give three numbers in metres, east,north,up"
+    refusal = f"{what} {shown(text)}: write three numbers in metres as east,north,up"
     east, north, up = parse_numbers(text, refusal, count=3)
     return east, north, up
 
@@ -118,8 +118,8 @@ def parse_site(text: str) -> "Site":
     from heliotrope.sun import Site
 
     refusal = (
-        f"site {shown(text)}: give three numbers, latitude and longitude in degrees and the height "
-        "in m, as in 50.913,6.388,87"
+        f"site {shown(text)}: write latitude and longitude in degrees and height in m, such as "
+        "50.913,6.388,87"
     )
     latitude, longitude, height = parse_numbers(text, refusal, count=3)
     return Site(latitude, longitude, height)

@@ -90,8 +90,8 @@ def _sign_in(client: "Client", name: str, password: str) -> None:
     except RemoteError as error:
         if error.status == _REFUSED:
             raise RemoteError(
-                f"{error}; an account that the one-time link opened has no password until you set "
-                "one on the page /account",
+                f"{error}; an account opened with the one-time link has no password until you set "
+                "one on its /account page",
                 error.status,
             ) from None
         if error.status != _NEEDS_CODE:
@@ -113,9 +113,9 @@ def _client(context: typer.Context) -> "Client | AtPlant":
         return AtPlant(secret, data)
     if not secret:
         raise InputError(
-            "ctl: no token; make one with `heliotrope ctl token LABEL`, then set HELIOTROPE_TOKEN "
-            "or give --token-file; on the plant's computer EMERGENCY, DEFOCUS and STOW need none: "
-            "give --data with its data folder"
+            "ctl: no token; create one with `heliotrope ctl token LABEL`, then set "
+            "HELIOTROPE_TOKEN or use --token-file; on the plant's computer EMERGENCY, DEFOCUS and "
+            "STOW need no token: use --data with its data folder"
         )
     from heliotrope.console.client import Client
 
@@ -194,10 +194,10 @@ def _set_up_factor(client: "Client", own: str) -> None:
 
     made = client.ask("POST", "session/factor", {"own_password": own})
     segno.make(made["uri"]).terminal(compact=True)
-    print(f"Read it with an authenticator, or type the secret there: {made['secret']}")
-    code = typer.prompt("Code that it shows")
+    print(f"Scan it with an authenticator app, or enter the secret there: {made['secret']}")
+    code = typer.prompt("Code shown by the app")
     answer = client.ask("PUT", "session/factor", {"code": code})
-    print("The second factor is in force. Recovery codes, shown only now, each good once:")
+    print("The second factor is enabled. Recovery codes, shown only now, each valid once:")
     print("\n".join(answer["codes"]))
 
 
@@ -212,16 +212,16 @@ def account(
     name: Annotated[str, typer.Argument(help="Name of the account.")],
     role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "viewer",
     by: Annotated[
-        str, typer.Option(help="Your account, which must be an engineer's.")
+        str, typer.Option(help="Your account, which must have the engineer role.")
     ] = "engineer",
     disable: Annotated[bool, typer.Option("--disable", help="Disable the account.")] = False,
     reset: Annotated[
-        bool, typer.Option("--reset", help="Create a new password, which is printed once.")
+        bool, typer.Option("--reset", help="Create a new password and print it once.")
     ] = False,
 ) -> None:
     """Create or disable an account, or set a password that must be changed at first use."""
     if disable and reset:
-        raise InputError("ctl: give --disable or --reset, not both")
+        raise InputError("ctl: use --disable or --reset, not both")
     own = typer.prompt("Your password", hide_input=True)
     with _sign_in_client(context) as client:
         _sign_in(client, by, own)
@@ -229,7 +229,7 @@ def account(
         if reset:
             made = client.ask("POST", f"{_account(name)}/password", again)
             print(
-                f"new password of {name}, shown only now, to be changed at first use: "
+                f"new password of {name}, shown only now; change it at the first sign-in: "
                 f"{made['password']}"
             )
         elif disable:
@@ -256,10 +256,10 @@ def status(context: typer.Context, as_json: Json = False) -> None:
         return
     print(f"{answer['name']}, {answer['at']}")
     print_table(("state", "heliostats"), [(k, str(v)) for k, v in answer["states"].items()])
-    print(f"{answer['clusters_alive']} of {answer['clusters']} clusters heard")
+    print(f"{answer['clusters_alive']} of {answer['clusters']} clusters reporting")
     for name, value in answer["readings"].items():
         print(f"{name}: {'no reading' if value is None else f'{value:.3g}'}")
-    print(f"{answer['alarms']} alarms active or not acknowledged")
+    print(f"{answer['alarms']} alarms active or unacknowledged")
     print(f"{answer['holder'] or 'nobody'} has the command authority")
     if answer["emergency"]:
         print(f"EMERGENCY ({order['act']}): {order['text']}")
@@ -277,21 +277,21 @@ def aims(context: typer.Context, as_json: Json = False) -> None:
         print_json(answer)
         return
     if answer["strategy"] != "limit":
-        print("aims of the plant file; it has no flux limit")
+        print("aims from the plant file; no flux limit is set")
         return
     if answer["problem"]:
         print(answer["problem"])
-    print(f"aims by {answer['source'] or 'nobody yet'}")
+    print(f"aims computed by {answer['source'] or 'nobody yet'}")
     if answer["peak"] is not None:
         print(
-            f"limit {1e-3 * answer['limit']:.4g} kW/m², flux with its errors up to "
+            f"limit {1e-3 * answer['limit']:.4g} kW/m², flux including errors up to "
             f"{1e-3 * answer['peak']:.4g} kW/m², {100 * answer['reserve']:.1f} % left, "
             f"{answer['binding']} cells at the limit"
         )
         print(f"{1e-3 * answer['power']:.5g} kW of {1e-3 * answer['planned']:.5g} kW")
     print(
-        f"{answer['aimed']} heliostats have an aim, {answer['resting']} rest for the limit, "
-        f"{answer['left']} still have to move"
+        f"{answer['aimed']} heliostats have an aim, {answer['resting']} are off the receiver "
+        f"because of the limit, {answer['left']} still have to move"
     )
     if answer["moved"]:
         names = answer["moved"]
@@ -426,7 +426,7 @@ def journal(
     kind: Annotated[
         str, typer.Option(help="event, alarm, command or note.", show_default=False)
     ] = "",
-    person: Annotated[str, typer.Option(help="Name of the person.", show_default=False)] = "",
+    person: Annotated[str, typer.Option(help="Name of the user.", show_default=False)] = "",
     heliostat: Annotated[str, typer.Option(help="Heliostat.", show_default=False)] = "",
     text: Annotated[
         str, typer.Option(help="Text to search for, ignoring case.", show_default=False)
@@ -456,7 +456,7 @@ def journal(
     for row in rows:
         print("  ".join(row))
     if not rows:
-        print("nothing is found")
+        print("no entries found")
 
 
 @app.command()
@@ -483,7 +483,7 @@ def report(
         return
     print(f"{answer['plant']}, {_utc(answer['since'])} to {_utc(answer['until'])}")
     hours = answer["recorded"] / 3600.0
-    print(f"figures are kept for {hours:.1f} h of it, {answer['daylight'] / 3600.0:.1f} h by day")
+    print(f"records cover {hours:.1f} h of this period, {answer['daylight'] / 3600.0:.1f} h by day")
     for one in answer["production"]:
         print(
             f"{one['receiver']}: {one['energy'] / 3.6e9:.3f} MWh predicted, at most "
@@ -613,7 +613,10 @@ def aim(
         typer.Option(
             min=-1e5,
             max=1e5,
-            help="Point on the unrolled receiver, right of its middle as seen from outside, m.",
+            help=(
+                "Point on the unrolled receiver: distance right of its centre as seen from "
+                "outside, m."
+            ),
             show_default=False,
         ),
     ] = None,
@@ -622,7 +625,7 @@ def aim(
         typer.Option(
             min=-1e5,
             max=1e5,
-            help="Point on the unrolled receiver, above its middle, m.",
+            help="Point on the unrolled receiver: height above its centre, m.",
             show_default=False,
         ),
     ] = None,
@@ -648,13 +651,13 @@ def aim(
 def emergency(
     context: typer.Context,
     act: Annotated[str, typer.Option(help="DEFOCUS or STOW.")] = "DEFOCUS",
-    reason: Annotated[str, typer.Option(help="Reason, recorded in the audit.")] = "",
+    reason: Annotated[str, typer.Option(help="Reason, recorded in the audit trail.")] = "",
     withdraw: Annotated[
         bool, typer.Option("--withdraw", help="Withdraw your order instead.")
     ] = False,
     owner: Annotated[
         str,
-        typer.Option(help="With --withdraw, as an engineer: the person whose order to withdraw."),
+        typer.Option(help="With --withdraw, as an engineer: the user whose order to withdraw."),
     ] = "",
 ) -> None:
     """Move all beams off the receiver now."""
@@ -773,7 +776,7 @@ def error_parameters(
                 _show_waiting(list(mine))
             return
         if not reason.strip():
-            raise InputError("ctl: give the reason for other parameters with --reason")
+            raise InputError("ctl: new parameters need a reason; add --reason")
         answer = client.get(f"heliostats/{quote(heliostat, safe='')}/parameters")
         units = {parameter["name"]: parameter["unit"] for parameter in answer["parameters"]}
         order["values"] = dict(_parameter(text, units) for text in values or ())
@@ -788,12 +791,18 @@ def approvals(
     context: typer.Context,
     number: Annotated[
         int,
-        typer.Argument(min=0, max=2**53, help="Of the change; none: list all.", show_default=False),
+        typer.Argument(
+            min=0, max=2**53, help="Number of the change; default: list all.", show_default=False
+        ),
     ] = 0,
-    approve: Annotated[bool, typer.Option("--approve", help="Approve it: it is written.")] = False,
-    refuse: Annotated[bool, typer.Option("--refuse", help="Refuse it; needs --reason.")] = False,
-    withdraw: Annotated[bool, typer.Option("--withdraw", help="Withdraw your own.")] = False,
-    reason: Annotated[str, typer.Option(help="Why it is refused.")] = "",
+    approve: Annotated[
+        bool, typer.Option("--approve", help="Approve the change and write it.")
+    ] = False,
+    refuse: Annotated[
+        bool, typer.Option("--refuse", help="Refuse the change; needs --reason.")
+    ] = False,
+    withdraw: Annotated[bool, typer.Option("--withdraw", help="Withdraw your own change.")] = False,
+    reason: Annotated[str, typer.Option(help="Reason for the refusal.")] = "",
     wait: Wait = 60.0,
     as_json: Json = False,
 ) -> None:
@@ -802,9 +811,11 @@ def approvals(
     The author or whoever approves must have the command authority; else it is taken for the moment.
     """
     if (approve + refuse + withdraw > 1) or bool(number) != (approve or refuse or withdraw):
-        raise InputError("ctl approvals: give NUMBER with --approve, --refuse or --withdraw")
+        raise InputError(
+            "ctl approvals: use NUMBER together with --approve, --refuse or --withdraw"
+        )
     if refuse and not reason.strip():
-        raise InputError("ctl approvals: give the reason for the refusal with --reason")
+        raise InputError("ctl approvals: --refuse needs a reason; add --reason")
     path = f"parameters/waiting/{number}"
     with _client(context) as client:
         waiting = client.get("parameters/waiting")
@@ -848,7 +859,7 @@ def _show_waiting(waiting: list[dict[str, Any]], as_json: bool = False) -> None:
                 f"{1e3 * change['beam_most']:.1f} mm"
             )
     if not waiting:
-        print("no change waits for approval")
+        print("no changes are waiting for approval")
 
 
 #: Displayed units: name, and size in the unit of the API.
@@ -864,7 +875,7 @@ def _parameter(text: str, units: dict[str, str]) -> tuple[str, float]:
     if name not in units:
         raise UnknownNameError("parameter", name, units)
     size = 0.017453292519943295 if key.endswith("_deg") else _SHOWN[units[name]][1]
-    refusal = f"{text!r}: give NAME=VALUE with a number, {_SHOWN[units[name]][0]}"
+    refusal = f"{text!r}: write NAME=VALUE with a number, {_SHOWN[units[name]][0]}"
     return name, parse_numbers(number, refusal)[0] * size
 
 
@@ -893,7 +904,9 @@ def _show_parameters(answer: dict[str, Any], as_json: bool) -> None:
 def versions(
     context: typer.Context,
     heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
-    first: Annotated[int, typer.Argument(min=0, max=1_000_000_000, help="0: the plant file.")],
+    first: Annotated[
+        int, typer.Argument(min=0, max=1_000_000_000, help="First version; 0: the plant file.")
+    ],
     second: Annotated[
         int | None,
         typer.Argument(
@@ -967,7 +980,7 @@ def photographs(
 ) -> None:
     """List the stored photographs of a heliostat, each with the result of its visit."""
     if save is not None and not heliostat:
-        raise InputError("ctl photographs: --save needs the heliostat whose calibration it is")
+        raise InputError("ctl photographs: --save needs the name of a heliostat")
     with _client(context) as client:
         answer = client.get(f"photographs?heliostat={quote(heliostat, safe='')}&limit={limit}")
         if save is not None:
@@ -994,12 +1007,12 @@ def _save_calibration(
     """
     results = client.get(f"heliostats/{quote(heliostat, safe='')}")["results"]
     if not results:
-        raise InputError(f"{heliostat}: it has no result of a calibration yet")
+        raise InputError(f"{heliostat}: no calibration result yet")
     *_, before, last = [{"at": 0.0}, *sorted(results, key=lambda result: result["at"])]
     mine = [picture for picture in kept if before["at"] < picture["at"] <= last["at"] + 1.0]
     mine.sort(key=lambda picture: picture["at"])
     if not mine:
-        raise InputError(f"{heliostat}: no photograph of its last calibration is kept")
+        raise InputError(f"{heliostat}: no photograph from its last calibration is available")
     print(f"{last['outcome']}, {_utc(last['at'])}, {last['target']}: {last['text']}")
     name = re.sub(r"[^\w.-]", "_", heliostat)
     try:
@@ -1122,10 +1135,10 @@ def timetable(
     """Show or change the calibrations scheduled at times of day and at intervals."""
     gives = bool(heliostats or target or at or every or rule)
     if plant_file and (name or gives or remove):
-        raise InputError("ctl timetable: --plant-file goes alone")
+        raise InputError("ctl timetable: --plant-file cannot be combined with other options")
     if bool(name) != (gives or remove):
         raise InputError(
-            "ctl timetable: give NAME HELIOSTAT… with --at, --every or --rule, or NAME --remove"
+            "ctl timetable: use NAME HELIOSTAT… with --at, --every or --rule, or NAME --remove"
         )
     with _client(context) as client:
         answer = client.get("timetable")
@@ -1164,10 +1177,12 @@ def _entries(in_force: list[dict[str, Any]], name: str, remove: bool) -> list[di
 @app.command()
 def reading(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Reading of the safety table.")],
+    name: Annotated[str, typer.Argument(help="Name of the reading in the safety table.")],
     value: Annotated[
         float,
-        typer.Argument(min=-1e9, max=1e9, help="Value, measured now, in the unit of its row."),
+        typer.Argument(
+            min=-1e9, max=1e9, help="Value measured now, in the unit that the safety table states."
+        ),
     ],
 ) -> None:
     """Submit a sensor reading to the safety table, if the links file says "api"."""
@@ -1211,9 +1226,9 @@ def give_back(
     receivers: LockedReceivers = None,
     tower: LockedTower = False,
     owner: Annotated[
-        str, typer.Option(help="As an engineer: the person whose lock to remove; needs --reason.")
+        str, typer.Option(help="As an engineer: the user whose lock to remove; needs --reason.")
     ] = "",
-    reason: Annotated[str, typer.Option(help="Why another person's lock is removed.")] = "",
+    reason: Annotated[str, typer.Option(help="Reason for removing another user's lock.")] = "",
 ) -> None:
     """Remove your locks; nothing moves. An object is in service when nobody's lock is left."""
     order = {**_places(heliostats, targets, receivers, tower), "owner": owner, "reason": reason}
@@ -1256,7 +1271,7 @@ def _utc(at: float) -> str:
 
 def _names(heliostats: list[str] | None, everybody: bool) -> list[str]:
     if bool(heliostats) == everybody:
-        raise InputError("ctl: name heliostats, or give --all for the whole field")
+        raise InputError("ctl: name heliostats, or use --all for the whole field")
     return heliostats or []
 
 

@@ -30,4 +30,4 @@ def missing(error: ModuleNotFoundError, command: str) -> InputError | None:
         return None
     extra = extra if extra == "postgresql" else _WHOLE.get(command, extra)
     where = f"{command}: " if command else ""
-    return InputError(f"{where}{package} is not installed; say pip install 'heliotrope[{extra}]'")
+    return InputError(f"{where}{package} is not installed; run pip install 'heliotrope[{extra}]'")

@@ -23,7 +23,9 @@ def layout(
     pivot: Annotated[
         float | None,
         typer.Option(
-            min=0.01, max=50, help="Height of the pivots, m; default: half a mirror plus 0.7."
+            min=0.01,
+            max=50,
+            help="Height of the pivots, m; default: half the mirror height plus 0.7.",
         ),
     ] = None,
     clearance: Annotated[
@@ -67,7 +69,7 @@ def layout(
 
     kinds = ("png", "svg", "pdf")
     if picture is not None and picture.suffix.removeprefix(".").lower() not in kinds:
-        raise InputError(f"picture {picture}: give a file that ends in .png, .svg or .pdf")
+        raise InputError(f"picture {picture}: the file name must end in .png, .svg or .pdf")
     mirror = HeliostatSize(
         width, height, 0.5 * height + 0.7 if pivot is None else pivot, clearance=clearance
     )
@@ -101,12 +103,12 @@ def _report(plant: "Plant", mirror: "HeliostatSize", out: Path, as_json: bool) -
     if as_json:
         print_json(facts)
         return
-    gap = f"; mirrors keep {facts['nearest_gap_m']:.2f} m apart in any pose"
+    gap = f"; mirrors stay at least {facts['nearest_gap_m']:.2f} m apart in any pose"
     apart = gap if len(plant) > 1 else ""
     print(
-        f"{out}: {facts['heliostats']:,} heliostats of {area:g} m² in "
-        f"{facts['clusters']:,} clusters, receiver at {facts['receiver_height_m']:.0f} m, the "
-        f"farthest {facts['farthest_m']:.0f} m away{apart}"
+        f"{out}: {facts['heliostats']:,} heliostats of {area:g} m² in {facts['clusters']:,} "
+        f"clusters, receiver at {facts['receiver_height_m']:.0f} m, the farthest heliostat "
+        f"{facts['farthest_m']:.0f} m away{apart}"
     )
 
 
@@ -117,7 +119,7 @@ def _table(name: str) -> Literal["csv", "parquet"]:
         return "csv"
     if name == "parquet":
         return "parquet"
-    raise InputError(f"table {name!r}: give csv or parquet")
+    raise InputError(f"table {name!r}: use csv or parquet")
 
 
 def _draw(plant: "Plant", place: Path) -> None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from heliotrope.links.keys import KeyFile
 
 app = typer.Typer(
-    help="Create and replace the keys of the links between plant and clusters.",
+    help="Create and replace the keys for the links between plant and clusters.",
     no_args_is_help=True,
 )
 
@@ -20,9 +20,7 @@ PlantFile = Annotated[Path, typer.Argument(help="Key file of the plant.")]
 Clusters = Annotated[list[str], typer.Argument(help="Names of clusters.")]
 FolderOption = Annotated[
     Path,
-    typer.Option(
-        "--to", help="Folder for the files in which the new keys are carried to the clusters."
-    ),
+    typer.Option("--to", help="Folder for the files that carry the new keys to the clusters."),
 ]
 
 
@@ -46,7 +44,7 @@ def _open(path: Path) -> "KeyFile":
         from heliotrope.links.keys import KeyFile
     except ImportError as error:
         raise InputError(
-            f"keys: {error.name} is not installed; say pip install 'heliotrope[control]'"
+            f"keys: {error.name} is not installed; run pip install 'heliotrope[control]'"
         ) from None
     return KeyFile(path)
 
@@ -84,10 +82,10 @@ def take(
 
     links = _open(carried).links
     if list(links) != ["plant"] or len(links["plant"]) != 1:
-        raise InputError(f"{carried}: it carries no key of a cluster; make one with keys rotate")
+        raise InputError(f"{carried}: this file holds no cluster key; create one with keys rotate")
     (key,) = links["plant"]
     _open(file).take(key)
-    print(f"{file}: key {fingerprint(key)} taken; delete {carried}")
+    print(f"{file}: key {fingerprint(key)} installed; delete {carried}")
 
 
 @app.command()
@@ -112,7 +110,7 @@ def list_(
     from heliotrope.links.keys import fingerprint
 
     if not file.exists():
-        raise InputError(f"{file}: there is no such file; heliotrope keys new makes it")
+        raise InputError(f"{file}: no such file; create it with heliotrope keys new")
     links = _open(file).links
     shown = {name: [fingerprint(key) for key in keys] for name, keys in links.items()}
     if as_json:
@@ -131,7 +129,10 @@ def tls(
         int, typer.Option(min=1, max=825, help="Validity of the certificate, days.")
     ] = 825,
     request: Annotated[
-        bool, typer.Option("--request", help="Create a request to another authority instead.")
+        bool,
+        typer.Option(
+            "--request", help="Create a certificate request for another authority instead."
+        ),
     ] = False,
 ) -> None:
     """Create or renew the console's certificate, under a private authority that is created once."""
@@ -142,18 +143,18 @@ def tls(
         from heliotrope.links import certificates
     except ImportError as error:
         raise InputError(
-            f"keys: {error.name} is not installed; say pip install 'heliotrope[control]'"
+            f"keys: {error.name} is not installed; run pip install 'heliotrope[control]'"
         ) from None
     if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder; make it, for its owner alone")
+        raise InputError(f"{folder}: no such folder; create it with access for its owner only")
     if request:
         made = certificates.request(folder, name)
         print(f"{made.certificate}: have it signed; the key {made.key} stays here")
         return
     made = certificates.certify(folder, name, parse_time("now"), days=days)
-    print(f"{made.certificate}, {made.key}: give them to heliotrope run as --certificate and --key")
+    print(f"{made.certificate}, {made.key}: pass them to heliotrope run as --certificate and --key")
     print(
-        f"{made.authority}: put it into the browsers of your people; keep the authority's key, "
+        f"{made.authority}: install it in your users' browsers; keep the authority's key, "
         f"{certificates.AUTHORITY}.key, off this machine between renewals"
     )
 
@@ -165,7 +166,7 @@ def _bus(path: Path) -> "BusKeyFile":
         from heliotrope.links.bus_key_file import BusKeyFile
     except ImportError as error:
         raise InputError(
-            f"keys: {error.name} is not installed; say pip install 'heliotrope[control]'"
+            f"keys: {error.name} is not installed; run pip install 'heliotrope[control]'"
         ) from None
     return BusKeyFile(path)
 
@@ -199,7 +200,7 @@ def bus_off(file: BusFile) -> None:
     """Remove all keys; the cluster removes them from local controllers that are at rest."""
     keys = _bus(file)
     keys.off()
-    print(f"{file}: no key; local controllers lose theirs while their mirrors stand")
+    print(f"{file}: no key left; each local controller drops its key once its mirrors are at rest")
 
 
 @bus_app.command(name="list")
@@ -208,7 +209,7 @@ def bus_list(file: BusFile) -> None:
     from heliotrope.errors import InputError
 
     if not file.exists():
-        raise InputError(f"{file}: there is no such file; heliotrope keys bus new makes it")
+        raise InputError(f"{file}: no such file; create it with heliotrope keys bus new")
     _show(_bus(file))
 
 
@@ -224,4 +225,4 @@ def _carry(folder: Path, keys: dict[str, bytes]) -> None:
     from heliotrope.links.keys import carry
 
     for path in carry(folder, keys):
-        print(f"{path}: carry it to its cluster, say heliotrope keys take there, and delete it")
+        print(f"{path}: carry it to its cluster, run heliotrope keys take there, then delete it")

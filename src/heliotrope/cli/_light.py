@@ -55,7 +55,7 @@ Reflectivity = Annotated[
     ),
 ]
 Clean = Annotated[
-    float, typer.Option(min=0, max=1, help="Fraction of the reflectivity that soiling leaves.")
+    float, typer.Option(min=0, max=1, help="Fraction of the reflectivity left after soiling.")
 ]
 Focus = Annotated[
     str,
@@ -127,7 +127,7 @@ def _focus(text: str) -> Literal["plant", "slant", "flat"] | float:
 def _facets(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", text, re.ASCII)
     if match is None:
-        raise InputError(f"--facets {shown(text)}: give columns and rows such as 5x7")
+        raise InputError(f"--facets {shown(text)}: write COLUMNSxROWS, such as 5x7")
     return int(match[1]), int(match[2])
 
 
@@ -138,7 +138,7 @@ def canting_of(text: str, plant: "Plant") -> Any:
     if text == "slant":
         return text
     if re.fullmatch(r"[\d.]+", text, re.ASCII):
-        refusal = f"--canting {shown(text)}: give slant, 0.1 to 1e5 m, or a time"
+        refusal = f"--canting {shown(text)}: use slant, a focal length from 0.1 to 1e5 m, or a time"
         return parse_numbers(text, refusal, least=0.1, most=1e5)[0]
     return vector(parse_time(text), plant.site)
 
@@ -150,7 +150,7 @@ def _cells(text: str | None) -> tuple[int, int] | None:
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not (min(size) >= 1 and size[0] * size[1] <= 1_000_000):
         raise InputError(
-            f"--cells {shown(text)}: give rows and columns such as 20x56, at most a million cells"
+            f"--cells {shown(text)}: write ROWSxCOLUMNS, such as 20x56, at most a million cells"
         )
     return size
 
@@ -158,7 +158,7 @@ def _cells(text: str | None) -> tuple[int, int] | None:
 def _tower(text: str) -> "Tower":
     from heliotrope.field.tower import Tower
 
-    refusal = f"--tower {shown(text)}: give four numbers in m, east,north,radius,top"
+    refusal = f"--tower {shown(text)}: write four numbers in m as east,north,radius,top"
     east, north, radius, top = parse_numbers(text, refusal, count=4)
     # Its foot lies below the ground of any field.
     return Tower(east, north, radius, min(top - 1.0, -1e4), top)

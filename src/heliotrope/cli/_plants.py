@@ -21,7 +21,8 @@ def one_plant(command: str, field: Path | None, heliostats: int | None, *, proto
         )
     if field is not None and heliostats is not None:
         raise InputError(
-            f"{command}: --heliostats is for the default plant; leave it out with a field"
+            f"{command}: --heliostats applies only to the default plant; leave it out when you "
+            "specify a field"
         )
 
 
@@ -60,5 +61,5 @@ def start_of(command: str, text: str, design: "Plant") -> "datetime":
     else:
         start, shift = datetime.combine(day, hour(12), UTC), design.site.longitude_deg / 15.0 + 3.0
     if not 1981 <= start.year < 2100:
-        raise TimeError(f"{command}: --start {text}: give a time in the years 1981 to 2099")
+        raise TimeError(f"{command}: --start {text}: the time must be in the years 1981 to 2099")
     return start.astimezone(UTC) - timedelta(hours=shift)

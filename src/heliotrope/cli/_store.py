@@ -9,7 +9,7 @@ from heliotrope.cli._common import parse_time, print_json, print_table
 from heliotrope.cli._noted import note_use, this_person
 
 app = typer.Typer(
-    help="Inspect, back up, restore and export the store of a plant.", no_args_is_help=True
+    help="Inspect, back up, restore and export a plant's store.", no_args_is_help=True
 )
 
 #: Suffix of an audit file, as the library's `JsonLines` writes it.
@@ -18,7 +18,7 @@ Place = Annotated[
     str, typer.Argument(help="Data folder of a plant, or postgresql://user@host/name.")
 ]
 TelemetryOption = Annotated[
-    Path | None, typer.Option(help="Folder of the telemetry; by default that in the data folder.")
+    Path | None, typer.Option(help="Telemetry folder; default: the one in the data folder.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
@@ -89,7 +89,7 @@ def restore(
     unsigned: Annotated[
         bool,
         typer.Option(
-            "--unsigned", help="Restore it whoever made it, without checking a signature."
+            "--unsigned", help="Restore the backup without checking its signature, whoever made it."
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -102,7 +102,7 @@ def restore(
 
     if (key is None) != unsigned:
         raise InputError(
-            "store restore: give --key FILE.pub, or --unsigned to restore what nobody has signed"
+            "store restore: use --key FILE.pub, or --unsigned to restore an unsigned backup"
         )
     signed_by = None if key is None else PublicKey(key)
     file = Database(place).file
@@ -119,7 +119,9 @@ def key(
     """Create the key pair for backups: the private key signs, the public key checks."""
     from heliotrope.store.signing import make_key
 
-    print(f"{file}: private key; {make_key(file)}: give it to those who restore")
+    print(
+        f"{file}: private key; {make_key(file)}: the public key, for everyone who restores backups"
+    )
 
 
 @app.command()
@@ -150,24 +152,24 @@ def migrate(place: Place) -> None:
     if before == HEAD:
         print(f"{place}: up to date (revision {HEAD})")
         return
-    kept = "" if copy is None else f"; what was before is in {copy}"
+    kept = "" if copy is None else f"; the previous version is kept in {copy}"
     print(f"{place}: migrated from revision {before} to {HEAD}{kept}")
 
 
 @app.command()
 def purge(
-    folder: Annotated[Path, typer.Argument(help="Data folder of a plant that is stopped.")],
+    folder: Annotated[Path, typer.Argument(help="Data folder of a stopped plant.")],
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
 ) -> None:
     """Overwrite and remove all data of a plant, before its computer is decommissioned."""
     from heliotrope.store.purge import purge as remove
 
     if not yes:
-        typer.confirm(f"{folder}: remove all records, accounts and keys for good?", abort=True)
+        typer.confirm(f"{folder}: permanently remove all records, accounts and keys?", abort=True)
     count, left = remove(folder)
     print(f"{folder}: {count} files overwritten and removed")
     if left:
-        print(f"left, since no plant made it: {', '.join(path.name for path in left)}")
+        print(f"left in place, not created by a plant: {', '.join(path.name for path in left)}")
 
 
 @app.command()
@@ -211,7 +213,7 @@ def verify(
         from heliotrope.plant.orders import audit
 
         last = audit.verify(place, [*known, *exported])
-        print(f"{place}: every record fits; {last}")
+        print(f"{place}: all records verified; {last}")
         return
     with Database(place) as database:
         database.require()
@@ -219,9 +221,11 @@ def verify(
             result = chain.verify(connection, [*known, *exported])
     if head:
         all_of = len(result.fitting) + len(result.old)
-        old = ", those of earlier events could not be checked" if result.old else ""
-        print(f"{len(result.fitting)} of {all_of} heads fit; {chain.kept_since(result.since)}{old}")
-    print(f"{place}: every record fits; {' '.join(map(str, result.heads))}")
+        old = ", heads of earlier events could not be checked" if result.old else ""
+        print(
+            f"{len(result.fitting)} of {all_of} heads match; {chain.kept_since(result.since)}{old}"
+        )
+    print(f"{place}: all records verified; {' '.join(map(str, result.heads))}")
 
 
 @app.command()

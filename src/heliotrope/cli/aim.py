@@ -52,24 +52,30 @@ NAMED = 5
 def aim(
     field: Field,
     limit: Annotated[
-        str, typer.Option(help="Allowable flux: kW/m², or a file of the cells' (CSV, W/m²).")
+        str,
+        typer.Option(
+            help="Allowable flux: one value in kW/m², or a CSV file with a value in W/m² per cell."
+        ),
     ],
     panels: Annotated[
         Path | None,
         typer.Option(help="Panels with the fluid's state (CSV); --limit is then a table (CSV)."),
     ] = None,
     margin: Annotated[
-        float, typer.Option(min=0, max=0.5, help="Share of it kept for the model's own error.")
+        float, typer.Option(min=0, max=0.5, help="Fraction of the limit reserved for model error.")
     ] = 0.01,
     probability: Annotated[
-        float, typer.Option(min=0.5, max=0.9999, help="That the limit holds in all cells.")
+        float,
+        typer.Option(min=0.5, max=0.9999, help="Probability that the limit holds in all cells."),
     ] = 0.99,
     strategy: Annotated[
         Literal["optimal", "middle", "spread", "image-size", "all"],
-        typer.Option(help="The others are for comparison, and take no heed of the limit."),
+        typer.Option(
+            help="The strategies other than optimal are for comparison and ignore the limit."
+        ),
     ] = "optimal",
     keep_all: Annotated[
-        bool, typer.Option("--keep-all", help="Defocus no heliostat, or refuse.")
+        bool, typer.Option("--keep-all", help="Fail rather than defocus a heliostat.")
     ] = False,
     wanted: Annotated[
         str, typer.Option(help="Wanted flux: uniform, or a file of the cells' (CSV). Default: any.")
@@ -82,17 +88,21 @@ def aim(
         typer.Option(min=0.001, max=64000, help="Start-up: greatest rise of flux, kW/m² a minute."),
     ] = None,
     drift_mrad: Annotated[
-        float, typer.Option(min=0, max=50, help="Turn that all normals share, mrad per axis.")
+        float,
+        typer.Option(min=0, max=50, help="Rotation common to all mirror normals, mrad per axis."),
     ] = 0.0,
     cluster_mrad: Annotated[
-        float, typer.Option(min=0, max=50, help="The same of each cluster, mrad per axis.")
+        float,
+        typer.Option(
+            min=0, max=50, help="Rotation common to a cluster's mirror normals, mrad per axis."
+        ),
     ] = 0.0,
     clock_s: Annotated[
-        float, typer.Option(min=0, max=600, help="Error of the field's clock, s.")
+        float, typer.Option(min=0, max=600, help="Error of the field clock, s.")
     ] = 0.0,
     time: Time = None,
     sun: Sun = None,
-    receiver: Annotated[str, typer.Option(help="Name. Default: the first.")] = "",
+    receiver: Annotated[str, typer.Option(help="Receiver; default: the first.")] = "",
     site: SiteOption = None,
     dni: Dni = 900.0,
     shape: Shape = "limb",
@@ -107,7 +117,9 @@ def aim(
     cells: CellOption = None,
     tower: Towers = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the aims.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Choose aims of most power that keep the flux under a limit with a chosen probability."""
@@ -119,7 +131,7 @@ def aim(
     _check(field, csv, picture)
     allowed = _limit(limit, margin, panels)
     if time is not None and sun is not None:
-        raise InputError("give --time or --sun, not both")
+        raise InputError("use --time or --sun, not both")
     plant = open_plant(field, None if site is None else parse_site(site))
     light = replace(light, canting=canting_of(canting, plant))
     when = None if sun is not None else noon(plant) if time is None else parse_time(time)
@@ -176,7 +188,7 @@ def _limit(text: str, margin: float, panels: Path | None) -> "FluxLimit":
         return read_table_limit(text, panels, margin)
     if Path(text).suffix.lower() == ".csv":
         return read_limit(text, margin)
-    refusal = f"--limit {shown(text)}: give kW/m² from 0.001 to 64000, or a file .csv in W/m²"
+    refusal = f"--limit {shown(text)}: use 0.001 to 64000 kW/m², or a .csv file in W/m²"
     return FluxLimit(1e3 * parse_numbers(text, refusal, least=1e-3, most=6.4e4)[0], margin)
 
 
@@ -256,10 +268,10 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
         header, rows, title=f"{chosen.light.plant}: aims on {chosen.light.maps[0].receiver}"
     )
     binding = int(chosen.scene.binding.sum())
-    print(f"{binding:,} of {chosen.limit.size:,} cells bind")
+    print(f"{binding:,} of {chosen.limit.size:,} cells at the limit")
     best = np.argsort(-chosen.gain)[:NAMED]
     words = [
         f"{chosen.names[k]} {1e-3 * chosen.gain[k]:.3g} kW" for k in best if chosen.gain[k] > 0
     ]
     if words:
-        print(f"calibration gains most at {', '.join(words)}")
+        print(f"calibration would gain most at {', '.join(words)}")

@@ -22,7 +22,10 @@ def calibrate(
     prior: shared.PriorOption = None,
     split: shared.SplitOption = "random",
     fraction: Annotated[
-        float, typer.Option(min=0.01, max=1, help="Fraction to learn from in the test; 1: no test.")
+        float,
+        typer.Option(
+            min=0.01, max=1, help="Fraction of the sightings to learn from in the test; 1: no test."
+        ),
     ] = 0.7,
     seed: shared.SeedOption = 0,
     scheduler: shared.SchedulerOption = None,

@@ -100,8 +100,8 @@ def _show_lens(lens: "Lens", camera: "Camera", place: Path, as_json: bool, forgo
     notes = list(lens.notes)
     if forgotten:
         notes.append(
-            "the camera's pose belonged to the old lens and is dropped; find it again by "
-            "heliotrope camera calibrate without --chessboard, or by teach"
+            "the camera's pose was found with the old lens and is dropped; find it again with "
+            "heliotrope camera calibrate without --chessboard, or with teach"
         )
     if as_json:
         boards = [
@@ -173,7 +173,7 @@ def _from_marks(
     sizes = {frame.size for frame in frames} | ({old.size} if old else set())
     if len(sizes) > 1:
         listed = ", ".join(f"{w} × {h}" for w, h in sorted(sizes))
-        raise InputError(f"camera {name}: frames of {listed} px; give pictures of one size")
+        raise InputError(f"camera {name}: frames of {listed} px; use pictures of one size")
     marks = teaching.see_marks(plant, places[0].parent, frames, old)
     fit = teaching.fit_marks(frames[0].size, marks, old, name, anew)
     camera = replace(
@@ -407,8 +407,8 @@ def receiver(
     loaded = open_plant(plant)
     if len(loaded.receivers) != 1:
         raise InputError(
-            f"{plant}: {len(loaded.receivers)} receivers; a camera measures the flux where the "
-            "plant has one"
+            f"{plant}: {len(loaded.receivers)} receivers; the flux camera needs a plant with "
+            "exactly one"
         )
     eye, surface = loaded.camera(camera), loaded.receivers[0]
     corners = _outline(outline or [], eye, surface)
@@ -436,8 +436,8 @@ def receiver(
         )
         return
     print(
-        f"receiver {surface.name} in camera {eye.name}: nominal flux fills "
-        f"{100 * reference.rise:.0f} % of the scale; daylight on it counts as "
+        f"receiver {surface.name} in camera {eye.name}: nominal flux uses "
+        f"{100 * reference.rise:.0f} % of the scale; daylight on the receiver reads as "
         f"{100 * reference.daylight:.1f} % of nominal and is subtracted"
     )
     print(f"reference written to {out}")
@@ -452,7 +452,7 @@ def _outline(texts: Sequence[str], camera: "Camera", receiver: "Receiver") -> An
     if camera.position is None or receiver.kind != "planar":
         raise InputError(
             f"camera {camera.name}: receiver {receiver.name} is not planar, or the camera's "
-            "position is not known; give --outline X,Y for three corners or more"
+            "position is unknown; specify --outline X,Y for three corners or more"
         )
     return project(camera, receiver.face.corners)
 
@@ -478,7 +478,7 @@ def show(
 
     loaded = open_plant(plant)
     if not loaded.cameras and not as_json:
-        print(f"{plant}: no cameras; heliotrope camera teach adds one")
+        print(f"{plant}: no cameras; add one with heliotrope camera teach")
         return
     views = {camera.name: sights(camera, loaded.targets) for camera in loaded.cameras}
     if as_json:
@@ -511,8 +511,8 @@ def show(
     for camera in loaded.cameras:
         if camera.position is None:
             print(
-                f"camera {camera.name}: its position is not known; heliotrope camera "
-                "calibrate (or teach) finds it"
+                f"camera {camera.name}: its position is unknown; find it with heliotrope camera "
+                "calibrate (or teach)"
             )
 
 
@@ -557,14 +557,14 @@ def _place_to_write(plant: Path, out: Path | None) -> Path:
     if plant.suffix.lower() == ".json":
         raise FormatError(
             plant,
-            "a tower file alone is not a plant; give the folder that also has heliostat "
+            "a tower file alone is not a plant; specify the folder that also has heliostat "
             "properties (properties/ID.json), and --out plant.toml",
         )
     place = plant if out is None else out
     if place.suffix.lower() != ".toml":
-        raise InputError(f"{place}: only plant files (TOML) are written; add --out plant.toml")
+        raise InputError(f"{place}: only plant files (TOML) can be written; add --out plant.toml")
     if not place.parent.is_dir():
-        raise InputError(f"{place}: folder {place.parent} does not exist; make it first")
+        raise InputError(f"{place}: folder {place.parent} does not exist; create it first")
     return place
 
 
@@ -628,7 +628,7 @@ def _print_fit(fit: "CameraFit", count: int, what: str) -> None:
     place = ", ".join(f"{v:.2f} ± {fit.sigma(name):.2f}" for v, name in names)
     rms = float(np.sqrt(np.mean(np.sum(fit.residuals**2, axis=1))))
     print(
-        f"{count} {what}, residuals {rms:.2f} px; pixels on their plane good to "
+        f"{count} {what}, residuals {rms:.2f} px; pixels on their plane accurate to "
         f"{1e3 * fit.plane_sigma:.1f} mm"
     )
     print(f"camera at ({place}) m; focal length {fit.camera.matrix[0, 0]:.1f} px")

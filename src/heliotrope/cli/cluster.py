@@ -33,7 +33,7 @@ def cluster(
         from heliotrope.links.papers import Papers
     except ImportError as error:
         raise InputError(
-            f"cluster: {error.name} is not installed; say pip install 'heliotrope[control]'"
+            f"cluster: {error.name} is not installed; run pip install 'heliotrope[control]'"
         ) from None
     installation = read_cluster(config)
     if check:
@@ -98,7 +98,7 @@ async def _run(installation: "Installation", every: float) -> None:
     async with running(bus, link, time), running(cluster), papers.watched(tell, note):
         await _log(cluster, ending, every)
     kept.close()
-    print(f"{installation.config.name}: ended, DEFOCUS sent", flush=True)
+    print(f"{installation.config.name}: stopped, DEFOCUS sent", flush=True)
 
 
 async def _log(cluster: "Cluster", ending: "asyncio.Event", every: float) -> None:

@@ -101,7 +101,9 @@ def commission(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the visits.")] = None,
     page: Annotated[Path | None, typer.Option(help="HTML file for the report.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")
+    ] = None,
 ) -> None:
     """Plan the days that bring a new field to its goal: which mirrors, when, and where."""
     from heliotrope.calibration.plan.commission import CommissionTerms
@@ -147,7 +149,7 @@ def _joint(
     if together == 1 or (plant.joint_visits is None and together is None):
         if first:
             raise InputError(
-                f"--first {first}: there are no joint visits; give --together 2 or more"
+                f"--first {first}: joint visits are switched off; set --together to 2 or more"
             )
         return None
     settings = plant.joint_visits or JointSettings()
@@ -225,7 +227,9 @@ def _flown(
         )
     kinds = {fleet.names for fleet in fleets}
     if len(kinds) != 1:
-        raise InputError("--drone: kinds of heliostats with different models; give one --model")
+        raise InputError(
+            "--drone: the heliostat types use different models; choose one with --model"
+        )
     (names,) = kinds
     gained: dict[str, Any] = {}
     for k, look in enumerate(flown.points):
@@ -302,7 +306,7 @@ def _tell(
     if flight is not None:
         print(
             f"before the first day: {flight['sorties']:,} flights of {flight['drones']} drones, "
-            f"{flight['hours']:.0f} h, {flight['calibration_points']} poses of each mirror"
+            f"{flight['hours']:.0f} h, {flight['calibration_points']} poses of each heliostat"
         )
     print(told.sentence(plan))
     for what, path in (("visits", csv), ("report", page), ("picture", picture)):
@@ -327,5 +331,5 @@ def _print_hours(rows: list[dict[str, Any]], plan: "CommissionPlan") -> None:
             ]
             for r in rows
         ],
-        title=f"beam errors in mrad; the field's before: median {middle:.2f}, 90 % {high:.2f}",
+        title=f"beam errors in mrad; field before: median {middle:.2f}, 90 % {high:.2f}",
     )

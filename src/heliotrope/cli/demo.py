@@ -70,8 +70,8 @@ def demo(
         print_json({**figures, "plant": str(into / "plant.toml"), "report": str(page)})
         return
     print(
-        "beam error, median: {before_mrad:.2f} mrad as installed, {held_out_mrad:.3f} mrad "
-        "calibrated, on measurements held out".format(**figures)
+        "median beam error: {before_mrad:.2f} mrad as installed, {held_out_mrad:.3f} mrad "
+        "calibrated, on held-out measurements".format(**figures)
     )
     print(
         "tracked {date}, {positions} positions of {heliostats} heliostats: beam error against "

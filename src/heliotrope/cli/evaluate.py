@@ -136,8 +136,8 @@ def _print_left_out(document: dict[str, Any]) -> None:
         print(line)
     if document["unusable_sightings"]:
         print(
-            f"left out: {', '.join(document['unusable_sightings'])}: counts beyond the reach of "
-            "the drives; check them against the log of the measurements"
+            f"left out: {', '.join(document['unusable_sightings'])}: counts outside the range of "
+            "the drives; check them against the measurement log"
         )
 
 
@@ -187,5 +187,5 @@ def _print(document: dict[str, Any]) -> None:
     if document["blunders_held_out"]:
         print(
             f"{document['blunders_held_out']} held-out sightings lie more than 5.3 standard "
-            "deviations away; they are in every figure"
+            "deviations away; every figure includes them"
         )

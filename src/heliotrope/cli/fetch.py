@@ -14,7 +14,7 @@ def fetch(
     heliostats: Annotated[list[str], typer.Argument(help="Names, for example AA39.")],
     into: Annotated[Path, typer.Option(help="Folder for the files.")],
     base_url: Annotated[
-        str | None, typer.Option(help="Address of a mirror of the catalogue.")
+        str | None, typer.Option(help="Address of a mirror server for the catalogue.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

@@ -36,7 +36,9 @@ def check(
         unsafe = BeamCheck(design, design.names).at_stow()
         if unsafe:
             name, text = next(iter(unsafe.items()))
-            text = f"{len(unsafe)} heliostats cannot be stowed where the file says: {name}: {text}"
+            text = (
+                f"{len(unsafe)} heliostats cannot be stowed at the pose in the file: {name}: {text}"
+            )
             findings.append(plant_file.Finding("warning", text))
     if as_json:
         print_json({"file": str(file), "ok": not invalid, "findings": [vars(f) for f in findings]})
@@ -117,7 +119,9 @@ def defocus(
 
     design = plant_file.read_plant(file)
     if not design.receivers or not len(design):
-        raise InputError(f"{file}: no receiver or no heliostats; nothing to defocus from")
+        raise InputError(
+            f"{file}: no receiver or no heliostats, so there is nothing to defocus from"
+        )
     check = BeamCheck(design, design.names)
     defaults = default_aims(design, design.names, check.armature.origin_1, None)
     aims, center = np.stack(list(defaults.values())), design.receivers[0].center
@@ -152,8 +156,8 @@ def defocus(
 Plant = Annotated[Path, typer.Argument(help="Plant file (TOML).")]
 Note = Annotated[str, typer.Option(help="Reason, stored with the version.")]
 _RUNNING = (
-    "a running plant reads its file at the start: stow the field, end the plant, "
-    "`heliotrope run --check`, start it"
+    "a running plant reads its file only at start-up: stow the field, stop the plant, run "
+    "`heliotrope run --check`, then start it"
 )
 
 
@@ -185,7 +189,7 @@ def change(
     for text in values or ():
         name, sign, value = text.partition("=")
         if not sign or name in changes:
-            raise InputError(f"{text!r}: give each value once, as NAME=VALUE")
+            raise InputError(f"{text!r}: specify each value once, as NAME=VALUE")
         changes[name] = value
     if not changes:
         parameters = plant_edit.values(file, who)
@@ -205,7 +209,7 @@ def change(
     if dry:
         print("nothing was written")
     else:
-        print(f"stored the file as it was: version {edited.version}\n{_RUNNING}")
+        print(f"stored the previous file as version {edited.version}\n{_RUNNING}")
 
 
 @app.command()
@@ -236,4 +240,4 @@ def restore(
     from heliotrope.field.formats import plant_edit
 
     kept = plant_edit.restore(file, version, note=note)
-    print(f"brought back {version}; stored the file as it was: version {kept}\n{_RUNNING}")
+    print(f"restored {version}; stored the previous file as version {kept}\n{_RUNNING}")

@@ -167,7 +167,7 @@ class _Order:
         for name in barred:
             if name in self.files:
                 needs = "--year" if name in ("sam", "solartherm") else "one time"
-                raise InputError(f"--{name}: it is written of {needs} only; leave it out")
+                raise InputError(f"--{name}: this file is written only for {needs}; leave it out")
 
     @property
     def options(self) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def _refuse(what: str, any_of: dict[str, str | None], rays: float) -> None:
         if value is not None:
             raise InputError(f"{name}: {what} takes no {name}; leave it out")
     if rays:
-        raise InputError(f"--rays: {what} is not traced; give one time")
+        raise InputError(f"--rays: {what} cannot be traced; specify one time")
 
 
 def _moment(
@@ -200,7 +200,7 @@ def _moment(
     from heliotrope.plot import flux_figure
 
     if time is not None and sun is not None:
-        raise InputError("give --time or --sun, not both")
+        raise InputError("use --time or --sun, not both")
     when = None if sun is not None else noon(plant) if time is None else parse_time(time)
     options = {**order.options, "sun": None if sun is None else parse_point(sun, "sun")}
     with progress("casting beams", order.as_json) as step:

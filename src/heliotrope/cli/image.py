@@ -62,7 +62,7 @@ def image(
         Path | None, typer.Option(help="CSV log: file or id, heliostat, motor positions, time.")
     ] = None,
     heliostat: Annotated[
-        str, typer.Option(help="Heliostat that sends the beam, if there is no log.")
+        str, typer.Option(help="Heliostat whose beam is shown, if there is no log.")
     ] = "",
     processes: Annotated[
         int, typer.Option(min=0, max=1024, help="Processes on this computer; 0: one per core.")
@@ -142,7 +142,9 @@ def _follow(
     from heliotrope.imaging.sources import open_source
 
     if len(paths) != 1:
-        raise InputError(f"--live follows one source, but {len(paths)} were given; give one")
+        raise InputError(
+            f"--live follows one source, but {len(paths)} were specified; name only one"
+        )
     # A plant camera may be specified by its name.
     named = next((c for c in place.cameras if c.name == paths[0]), None)
     text = named.source if named is not None else paths[0]
@@ -209,7 +211,7 @@ def _files(paths: Sequence[Path]) -> tuple[list[Path], set[Path]]:
         if path.is_dir():
             images = find_images(path, suffixes=IMAGE_SUFFIXES + OTHER_SUFFIXES)
             if not images:
-                raise FormatError(path, "no image in this folder; give PNG, JPEG or TIFF")
+                raise FormatError(path, "no image in this folder; use PNG, JPEG or TIFF")
             files += images
             others |= {item for item in images if item.suffix.lower() in OTHER_SUFFIXES}
         else:
@@ -249,8 +251,8 @@ def _job(
     known_empty = Memory() if memory is None else Memory.load(memory)
     if memory is not None and not known_empty:
         raise InputError(
-            f"{memory}: no model of an empty target (*.npz) in this folder; --live with --memory "
-            "learns one"
+            f"{memory}: no model of an empty target (*.npz) in this folder; learn one with --live "
+            "and --memory"
         )
     return Job(
         targets=place.targets,
@@ -312,7 +314,7 @@ def _show(
         noun = "sighting" if count == 1 else "sightings"
         print(f"{count} {noun} of {len(outcomes)} photographs: {table}")
     elif table is not None:
-        print(f"no sighting in {len(outcomes)} photographs: {table} is not written")
+        print(f"no sighting in {len(outcomes)} photographs: {table} was not written")
     for line in left_out[:12]:
         print(f"left out: {line}")
     if len(left_out) > 12:

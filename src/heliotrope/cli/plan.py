@@ -180,24 +180,24 @@ def check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path
             read.add((field.parent / table).resolve())
     for file in (path for path in outputs if path is not None):
         if not file.parent.is_dir():
-            raise InputError(f"{file}: there is no folder {file.parent}; make it first")
+            raise InputError(f"{file}: there is no folder {file.parent}; create it first")
         inside = field.is_dir() and field.resolve() in file.resolve().parents and file.exists()
         if file.resolve() in read or inside:
-            raise InputError(f"{file}: this file is an input; give another name to write to")
+            raise InputError(f"{file}: this file is an input; choose another name for the output")
 
 
 def span_of(begin: str, end: str | None, days: float | None) -> tuple[datetime, datetime]:
     """Return the start and end of a plan; by default it lasts a week."""
     start = parse_time(begin)
     if end is not None and days is not None:
-        raise InputError("give --to or --days, not both")
+        raise InputError("use --to or --days, not both")
     if end is not None:
         stop = parse_time(end)
     else:
         try:
             stop = start + timedelta(days=7.0 if days is None else days)
         except OverflowError:
-            raise TimeError(f"--from {begin}: the span runs beyond the year 9999") from None
+            raise TimeError(f"--from {begin}: the period extends beyond the year 9999") from None
     if stop <= start:
         raise TimeError(f"--to {stop.isoformat()} is not after --from {start.isoformat()}")
     return start, stop
@@ -207,7 +207,7 @@ def targets_of(plant: "Plant", names: list[str] | None) -> "tuple[Target, ...]":
     """Return the targets with given names, or all targets."""
     targets = tuple(plant.target(name) for name in dict.fromkeys(names or ())) or plant.targets
     if not targets:
-        raise InputError("this plant has no target; a measurement with a camera needs one")
+        raise InputError("this plant has no target; camera measurements need one")
     return targets
 
 

@@ -42,9 +42,12 @@ TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of thi
 
 #: Largest distance of an aim from a target that it is on, m.
 _ON = 0.01
-_TAKE = "the one to take; shading and blocking by other mirrors are not considered"
+_TAKE = "recommended pose; shading and blocking by other mirrors are not considered"
 _NEAREST = "the nearest pose: the beam does not reach its aim"
-_LINE = "one axis: sun and aim are taken in the plane across it; along it the light goes on"
+_LINE = (
+    "single axis: sun and aim are projected onto the plane perpendicular to it; the component of "
+    "the light along the axis is unchanged"
+)
 
 
 def track(
@@ -71,7 +74,7 @@ def track(
         typer.Option(help="With --every: go over the top wherever that saves slews or motion."),
     ] = False,
     calibration: Annotated[
-        Path | None, typer.Option(help="calibration.json of heliotrope calibrate to apply first.")
+        Path | None, typer.Option(help="calibration.json from heliotrope calibrate, applied first.")
     ] = None,
     law: Annotated[
         Literal["armature", "guo"],
@@ -164,14 +167,16 @@ def _opened(field: Path, place: str, calibration: Path | None) -> "Plant":
 def _check(every: str | None, law: str, local: bool, trace: bool, target: str | None) -> None:
     """Refuse options that do not fit together."""
     if local and target is not None:
-        raise InputError("--target is not fixed to a mirror; give --aim, or leave out --local")
+        raise InputError("--target is not fixed to a mirror; use --aim, or leave out --local")
     if law == "guo" and (every is not None or local or trace):
         raise InputError(
-            "--law guo prints one moment of global aiming; leave out --every, --local and --trace, "
-            "or track by the armature"
+            "--law guo prints a single time and aims in ENU only; leave out --every, --local and "
+            "--trace, or use --law armature"
         )
     if trace and (every is not None or local):
-        raise InputError("--trace prints one moment of global aiming; leave out --every, --local")
+        raise InputError(
+            "--trace prints a single time and aims in ENU only; leave out --every, --local"
+        )
 
 
 def _check_sun(heliostat: str, vector: "np.ndarray", time: str) -> None:
@@ -179,7 +184,7 @@ def _check_sun(heliostat: str, vector: "np.ndarray", time: str) -> None:
     if vector[2] <= 0.0:
         below = f"the sun is {math.degrees(abs(math.asin(vector[2]))):.2f}° below the horizon"
         when = f" at {time}" if time else ""
-        raise InputError(f"heliostat {heliostat}: {below}{when}; choose a time of daylight")
+        raise InputError(f"heliostat {heliostat}: {below}{when}; choose a time in daylight")
 
 
 def _check_pose(heliostat: str, status: "TrackingStatus") -> None:
@@ -211,7 +216,7 @@ def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) 
     if own is not None:
         return own
     if not plant.targets:
-        raise InputError("this plant has no target; give --aim east,north,up in metres")
+        raise InputError("this plant has no target; specify --aim east,north,up in metres")
     return plant.targets[0].center
 
 
@@ -222,9 +227,8 @@ def _local_aim(plant: "Plant", heliostat: str, aim: str | None) -> Any:
     own = plant[heliostat].aim
     if own is None:
         raise InputError(
-            f"heliostat {heliostat}: it has no aim point of its own; give --aim x,y,z in metres, "
-            f"in its "
-            "frame at zero angles"
+            f"heliostat {heliostat}: it has no aim point of its own; specify --aim x,y,z in "
+            "metres, in its frame at zero angles"
         )
     return own
 
@@ -284,7 +288,7 @@ def _trace(heliostat: str, steps: "tuple[TraceStep, ...]", as_json: bool) -> Non
             ]
             for step in steps
         ],
-        title=f"{heliostat}: Grigoriev's iteration, stops left aside",
+        title=f"{heliostat}: Grigoriev's iteration, ignoring end stops",
     )
 
 

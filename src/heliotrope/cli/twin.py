@@ -54,7 +54,10 @@ def twin(
         bool,
         typer.Option(
             "--boards",
-            help="Simulate each heliostat by a board with the real firmware; for small plants.",
+            help=(
+                "Simulate each heliostat with a board that runs the real firmware; for small "
+                "plants."
+            ),
         ),
     ] = False,
     pty: Annotated[
@@ -91,12 +94,16 @@ def twin(
 
     one_plant("twin", field, heliostats, prototype=prototype)
     if start == "now" and (speed != 1.0 or up):
-        raise InputError("twin: --speed and --up need a --start: else it keeps this machine's time")
+        raise InputError(
+            "twin: --speed and --up need --start: without it the twin follows this computer's clock"
+        )
     if pty and not (boards or prototype):
-        raise InputError("twin: --pty: only boards have a bus of bytes; give --boards too")
+        raise InputError("twin: --pty needs --boards, because only boards have a serial bus")
     if field is None and (folder / LINKS).exists():
         if start != "now":
-            raise InputError(f"twin: {folder}: it ran before, and runs again with --start now only")
+            raise InputError(
+                f"twin: {folder}: this twin has run before; restart it with --start now"
+            )
         design, files = open_plant(folder / PLANT), read_folder(folder)
         begins = None
     else:
@@ -115,7 +122,7 @@ def twin(
         print(READY, flush=True)
     else:
         print(f"{design.name}: {len(design):,} simulated heliostats in {folder}")
-        print(f"now start: heliotrope run {folder / PLANT} --clusters {folder / LINKS}", flush=True)
+        print(f"now run: heliotrope run {folder / PLANT} --clusters {folder / LINKS}", flush=True)
     _run(program, child=child)
 
 
@@ -168,7 +175,7 @@ def _address(text: str, option: str) -> tuple[str, int]:
     except ValueError:
         host = port = None
     if not host or port is None:
-        raise InputError(f"twin: {option} {text}: give host:port, as 127.0.0.1:4840")
+        raise InputError(f"twin: {option} {text}: write host:port, such as 127.0.0.1:4840")
     return host, port
 
 

@@ -42,7 +42,7 @@ def view(
 
     kind = out.suffix.lower()
     if kind not in (".html", ".glb"):
-        raise InputError(f"view: {out.name}; give a file that ends in .html or .glb")
+        raise InputError(f"view: {out.name}: the file name must end in .html or .glb")
     plant = open_plant(field)
     mirror = plant[heliostat]
     mechanism, width, height = mirror.calibrated, mirror.width, mirror.height
@@ -53,7 +53,9 @@ def view(
     good = solution.reachable
     check_front(plant, heliostat, goal, solution.chosen(solution.vertex)[good])
     if not good.any():
-        raise InputError(f"heliostat {heliostat}: the beam reaches the aim at no time of this day")
+        raise InputError(
+            f"heliostat {heliostat}: the beam does not reach the aim at any time of this day"
+        )
     angles = np.unwrap(solution.best_angles[good], axis=0)
     chosen = [at for at, reached in zip(times, good, strict=True) if reached]
     seconds = np.array([(at - chosen[0]).total_seconds() for at in chosen]) / _PACE

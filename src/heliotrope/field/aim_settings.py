@@ -67,7 +67,7 @@ class AimSettings:
     def __post_init__(self) -> None:
         if self.strategy not in AIM_STRATEGIES:
             raise InputError(
-                f"aims: strategy {self.strategy!r}; give one of {', '.join(AIM_STRATEGIES)}"
+                f"aims: strategy {self.strategy!r}; use one of {', '.join(AIM_STRATEGIES)}"
             )
         if self.strategy == "limit" and self.limit is None:
             raise InputError('aims: strategy "limit" needs limit_kw_m2, limit_map or limit_table')

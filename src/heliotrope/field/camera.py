@@ -84,7 +84,7 @@ class Camera:
         name = f"camera {self.name}"
         size, matrix, distortion = checked_pinhole(name, self)
         if (self.position is None) != (self.R_enu_camera is None):
-            raise InputError(f"{name}: give position and rotation together, or neither")
+            raise InputError(f"{name}: specify position and rotation together, or neither")
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", distortion)
@@ -104,7 +104,7 @@ class Camera:
         """
         if self.position is None or self.R_enu_camera is None:
             raise InputError(
-                f"camera {self.name}: its position is not known; find its targets in a frame "
+                f"camera {self.name}: its position is unknown; locate its targets in a frame "
                 "first (heliotrope camera calibrate)"
             )
         return self.position, self.R_enu_camera
@@ -124,7 +124,7 @@ def checked_pinhole(
     width, height = (int(n) for n in camera.size)
     if not (smallest <= width <= 100_000 and smallest <= height <= 100_000):
         raise InputError(
-            f"{name}: frames of {width} × {height} px; give {smallest} to 100000 px each way"
+            f"{name}: frames of {width} × {height} px; must be {smallest} to 100000 px each way"
         )
     matrix = as_float(camera.matrix)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():

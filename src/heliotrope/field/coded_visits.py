@@ -75,14 +75,25 @@ class CodedSettings:
     most: int
     least: int
     known: float = _number(
-        4.0, "largest expected beam error of one that takes part, RMS", 0, unit="mrad", above=True
+        4.0,
+        "largest expected beam error of a participating heliostat, RMS",
+        0,
+        unit="mrad",
+        above=True,
     )
     visit: float = _number(
-        0.5, "part of it that is drawn anew at each visit, each axis", 0, unit="mrad"
+        0.5,
+        "part of this error that changes at random from visit to visit, each axis",
+        0,
+        unit="mrad",
     )
     movement: float
     settle: float = _number(
-        1.0, "from the moment that all stand at their aims until the photograph", 0, 60, "s"
+        1.0,
+        "from the moment all heliostats have reached their aims until the photograph",
+        0,
+        60,
+        "s",
     )
     again: float
 
@@ -91,8 +102,8 @@ class CodedSettings:
             setting.check(self.kind, name, getattr(self, name))
         if not self.least <= self.most:
             raise InputError(
-                f"{self.kind}: least {self.least} is above most {self.most}; give the smaller "
-                "number as least"
+                f"{self.kind}: least {self.least} is above most {self.most}; least must be the "
+                "smaller number"
             )
 
     @classmethod
@@ -119,18 +130,18 @@ class JointSettings(CodedSettings):
     movement: float = _number(
         0.5, "coded movement of a beam, either way along each axis", 0, 5, "mrad", above=True
     )
-    again: float = _number(2.5, "photographs at most, over those that a visit needs", 1)
+    again: float = _number(2.5, "photographs at most, beyond the number that a visit needs", 1)
     brightest: float = _number(10.0, "most light on a target", 0, unit="suns", above=True)
-    first: int = _number(15, "heliostats without a calibration at once; 0: each goes alone", 0, 127)
+    first: int = _number(15, "heliostats without a calibration at once; 0: each on its own", 0, 127)
     first_movement: float = _number(
-        2.0, "coded movement of their beams, either way to the right", 0, 5, "mrad", above=True
+        2.0, "coded movement of their beams, to the right and to the left", 0, 5, "mrad", above=True
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if 0 < self.first < self.least:
             raise InputError(
-                f"{self.kind}: {self.first} heliostats without a calibration; give 0, or "
+                f"{self.kind}: {self.first} heliostats without a calibration; must be 0, or "
                 f"{self.least} to 127"
             )
 
@@ -154,20 +165,28 @@ class ReceiverSettings(CodedSettings):
     most: int = _number(50, "heliostats at once", 1, 127)
     least: int = _number(8, "heliostats that a visit of automatic control needs", 1, 127)
     known: float = _number(
-        4.0, "largest expected beam error of one that takes part, RMS", 0, 20, "mrad", above=True
+        4.0,
+        "largest expected beam error of a participating heliostat, RMS",
+        0,
+        20,
+        "mrad",
+        above=True,
     )
     movement: float = _number(
         1.0, "coded movement of a beam, either way along each axis", 0, 2, "mrad", above=True
     )
-    again: float = _number(1.5, "photographs at most, over those that a visit needs", 1, 10)
+    again: float = _number(1.5, "photographs at most, beyond the number that a visit needs", 1, 10)
     exposures: int = _number(1, "frames that are averaged for a photograph", 1, 100)
     power: float = _number(
-        0.005, "largest share of the power that the movements cost", 0, 0.01, above=True
+        0.005, "largest fraction of the power that the movements cost", 0, 0.01, above=True
     )
     steady: float = _number(
         0.05, "largest change of the light between photographs, as a share", 0, 0.5, above=True
     )
     worth: float = _number(
-        0.3, "least change of a beam for which its mirror leaves the receiver", 0, unit="mrad"
+        0.3,
+        "smallest change of a beam for which its heliostat is moved off the receiver",
+        0,
+        unit="mrad",
     )
     every: float = _number(7200.0, "least time between two visits of a heliostat", 0, unit="s")

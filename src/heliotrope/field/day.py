@@ -114,8 +114,8 @@ def track_day(
     place = site or (heliostat.site if isinstance(heliostat, Heliostat | Plant) else None)
     if place is None:
         raise InputError(
-            "track_day: mechanisms alone stand nowhere; give plant[name], or site=Site(latitude, "
-            "longitude, height)"
+            "track_day: mechanisms alone have no location; pass plant[name], or "
+            "site=Site(latitude, longitude, height)"
         )
     times = solar.daylight(day, place, every=every, min_elevation=min_elevation)
     if not len(times):
@@ -134,11 +134,11 @@ def _aim(heliostat: Steered, aim: str | Target | Receiver | npt.ArrayLike | None
     if aim is not None:
         return point_of(aim, targets)
     if not targets and not isinstance(heliostat, Heliostat):
-        raise InputError("aim: there is no target; give a point, east, north and up in m")
+        raise InputError("aim: there is no target; pass a point (east, north, up) in m")
     first = targets[0].center if targets else None
     own = _own_aims(heliostat)
     if first is None and not all(point is not None for point in own):
-        raise InputError("aim: there is no target; give a point, east, north and up in m")
+        raise InputError("aim: there is no target; pass a point (east, north, up) in m")
     if all(point is None for point in own):
         return np.asarray(first)
     aims = np.array([first if point is None else point for point in own])

@@ -35,7 +35,8 @@ class FluxLimit:
         flux = as_float(self.flux)
         if flux.ndim not in (0, 2) or flux.size == 0:
             raise InputError(
-                f"flux limit: a map of shape {flux.shape}; give a number, or rows and columns"
+                f"flux limit: a map of shape {flux.shape}; pass one number, or an array with rows "
+                "and columns"
             )
         wrong = ~((flux > 0.0) & (flux <= _MOST))
         if wrong.any():
@@ -109,7 +110,7 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
             ) from None  # fmt: skip
         if len(rows[-1]) != len(rows[0]):
             raise FormatError(
-                path, f"{len(cells)} numbers, but {len(rows[0])} before; make them equal",
+                path, f"{len(cells)} numbers, but {len(rows[0])} in earlier rows; make them equal",
                 where=f"line {number}",
             )  # fmt: skip
     return FluxLimit(np.array(rows[::-1]), margin)

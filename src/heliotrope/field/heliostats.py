@@ -162,7 +162,7 @@ class Heliostats(Value, Framed):
             if not np.isfinite(values).all():
                 i = int(np.flatnonzero(~np.isfinite(values))[0])
                 raise InputError(
-                    f"heliostat {self.names[i]}: parameter {name} is {values[i]}; give a number"
+                    f"heliostat {self.names[i]}: parameter {name} is {values[i]}; must be a number"
                 )
             clean[name] = values
         object.__setattr__(self, "parameters", clean)

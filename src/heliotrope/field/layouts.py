@@ -87,8 +87,9 @@ class HeliostatSize:
                 raise InputError(f"mirror: {name} {value} m must be 0 or more and below 10 m")
         if self.pivot_height < 0.5 * self.height:
             raise InputError(
-                f"mirror: pivot {self.pivot_height} m above ground but {self.height} m high; "
-                "upright it would touch the ground: raise the pivot to half the height"
+                f"mirror: pivot {self.pivot_height} m above ground, and the mirror is "
+                f"{self.height} m high, so it would touch the ground when upright; raise the "
+                "pivot to half the height"
             )
 
     @property
@@ -353,7 +354,7 @@ def _central(along: FloatArray, room: int) -> FloatArray:
 
 def _check_count(count: int) -> None:
     if not 1 <= count <= MOST:
-        raise InputError(f"layout: {count} heliostats; give 1 to {MOST}")
+        raise InputError(f"layout: {count} heliostats; must be 1 to {MOST}")
 
 
 def _places(names: Sequence[str], parts: Sequence[FloatArray]) -> Places:
@@ -562,7 +563,7 @@ def lay_out(
     size = mirror or HeliostatSize()
     tall = _tower_height(heliostats, size) if tower_height is None else tower_height
     if not 20.0 <= tall <= 500.0:
-        raise InputError(f"layout: tower height {tall} m; give 20 to 500 m")
+        raise InputError(f"layout: tower height {tall} m; must be 20 to 500 m")
     facing = np.pi if site.latitude_deg < 0.0 else 0.0
     targets, cameras, receiver = _middle(tall, size.pivot_height, facing, kind in TWO_SIDED)
     masts = [t.center for t in targets] + [c.position for c in cameras if c.position is not None]

@@ -146,8 +146,8 @@ class Plant(Value, Framed):
             first, other = (self.names[i] for i in sorted(order[k : k + 2].tolist()))
             east, north, up = self.position[order[k]]
             raise InputError(
-                f"heliostats {first} and {other} stand at one place: {east:.2f} m east, "
-                f"{north:.2f} m north, {up:.2f} m up; correct one, or leave it out"
+                f"heliostats {first} and {other} have the same position: {east:.2f} m east, "
+                f"{north:.2f} m north, {up:.2f} m up; correct one or remove it"
             )
 
     def _card(self) -> Card:
@@ -336,7 +336,7 @@ class Plant(Value, Framed):
         tables = [g.calibrated.drives.table for g in self.groups.values()]
         if len({table.shape[-2] for table in tables}) > 1:
             raise InputError(
-                "a plant of heliostats with one drive and with two: take its groups one by one "
+                "a plant of heliostats with one drive and with two: use its groups one at a time "
                 "(plant.groups)"
             )
         return Drive(np.concatenate(tables or [np.empty((0, 2, 19))]))

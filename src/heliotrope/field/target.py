@@ -259,8 +259,8 @@ class Receiver(Value):
         for word, value, most in (("right", right, half), ("up", up, 0.5 * self.height)):
             if not abs(value) <= most + 1e-9:
                 raise InputError(
-                    f"receiver {self.name}: a point {value:g} m {word} of its middle is not on it; "
-                    f"give at most {most:.4g} m"
+                    f"receiver {self.name}: a point {value:g} m {word} of its centre is outside "
+                    f"its surface; use at most {most:.4g} m"
                 )
         if not turn:
             return self.aperture.point((right, up))

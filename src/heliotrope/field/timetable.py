@@ -63,23 +63,29 @@ class TimetableEntry:
     def __post_init__(self) -> None:
         who = f"timetable entry {self.name!r}"
         if not self.name or not self.heliostats:
-            raise InputError(f"{who}: give it a name and at least one heliostat")
+            raise InputError(f"{who}: needs a name and at least one heliostat")
         if len(set(self.heliostats)) < len(self.heliostats):
             twice = next(n for n in self.heliostats if self.heliostats.count(n) > 1)
-            raise InputError(f"{who}: heliostat {twice} stands in it twice; name it once")
+            raise InputError(f"{who}: heliostat {twice} is listed twice; list it once")
         if self.rule:
             if self.rule not in RULES:
-                raise InputError(f"{who}: rule {self.rule!r}; give {' or '.join(RULES)}")
+                raise InputError(f"{who}: rule {self.rule!r}; use {' or '.join(RULES)}")
             if self.at or self.every is not None or self.target:
-                raise InputError(f"{who}: {self.rule!r} is always so; leave times and target out")
+                raise InputError(
+                    f"{who}: {self.rule!r} applies at all times; remove times and target"
+                )
             return
         if not self.at and self.every is None:
-            raise InputError(f"{who}: no time; give times of day (at) or an interval (every_s)")
+            raise InputError(
+                f"{who}: no time is set; specify times of day (at) or an interval (every_s)"
+            )
         if len(self.at) > MOST_TIMES:
-            raise InputError(f"{who}: {len(self.at)} times of day; give at most {MOST_TIMES}")
+            raise InputError(
+                f"{who}: {len(self.at)} times of day; at most {MOST_TIMES} are allowed"
+            )
         if self.every is not None and not LEAST_INTERVAL <= self.every <= DAY:
             raise InputError(
-                f"{who}: an interval of {self.every:g} s; give {LEAST_INTERVAL:g} to {DAY:g} s"
+                f"{who}: interval is {self.every:g} s; must be {LEAST_INTERVAL:g} to {DAY:g} s"
             )
         for text in self.at:
             _second_of_day(who, text)
@@ -138,7 +144,7 @@ def check_timetable(
     """
     listed = tuple(entries)
     if len(listed) > MOST:
-        raise InputError(f"timetable: {len(listed)} entries; give at most {MOST}")
+        raise InputError(f"timetable: {len(listed)} entries; at most {MOST} are allowed")
     check_names("timetable entry", (entry.name for entry in listed))
     known, surfaces = set(heliostats), tuple(targets)
     for entry in listed:
@@ -155,9 +161,11 @@ def _second_of_day(who: str, text: str) -> float:
         parsed = time.fromisoformat(text)
     except (ValueError, TypeError):
         raise InputError(
-            f"{who}: {text!r} is no time of day; write 08:30Z or 10:30+02:00"
+            f"{who}: {text!r} is not a time of day; write 08:30Z or 10:30+02:00"
         ) from None
     if parsed.tzinfo is None:
-        raise InputError(f"{who}: {text!r} has no zone; write {text}Z for UTC, or {text}+02:00")
+        raise InputError(
+            f"{who}: {text!r} has no time zone; write {text}Z for UTC, or {text}+02:00"
+        )
     utc = datetime.combine(date(2000, 1, 2), parsed).astimezone(UTC)
     return 3600.0 * utc.hour + 60.0 * utc.minute + utc.second

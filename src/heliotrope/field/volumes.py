@@ -74,7 +74,9 @@ class Cylinder:
     def __post_init__(self) -> None:
         axis = _point(self.name, "end", self.end) - _point(self.name, "start", self.start)
         if not np.linalg.norm(axis) > 0.0:
-            raise InputError(f"volume {self.name}: its two ends coincide; give two points")
+            raise InputError(
+                f"volume {self.name}: its two ends coincide; specify two different points"
+            )
         _positive(self.name, "radius", self.radius)
 
 
@@ -101,8 +103,8 @@ class Prism:
         corners = as_float(self.corners)
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
             raise InputError(
-                f"volume {self.name}: corners of shape {corners.shape}; give at least 3 points "
-                "of 2 numbers, (K, 2)"
+                f"volume {self.name}: corners of shape {corners.shape}; must be at least 3 "
+                "points, (K, 2)"
             )
         if not (np.isfinite(corners).all() and np.isfinite([self.bottom, self.top]).all()):
             raise InputError(f"volume {self.name}: a corner or height is not finite")
@@ -180,7 +182,7 @@ def _shadow(start: FloatArray, end: FloatArray, circle: FloatArray) -> FloatArra
 def _point(name: str, what: str, value: npt.ArrayLike) -> FloatArray:
     point = as_vectors(value, f"volume {name}: {what}")
     if point.shape != (3,):
-        raise InputError(f"volume {name}: {what} of shape {point.shape}; give 3 numbers")
+        raise InputError(f"volume {name}: {what} of shape {point.shape}; must be 3 numbers")
     return point
 
 

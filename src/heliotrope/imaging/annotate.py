@@ -1,4 +1,4 @@
-"""Draws the evaluation of a photograph into the picture."""
+"""Annotates a photograph with its evaluation."""
 
 import numpy as np
 
@@ -62,12 +62,12 @@ class _Sheet:
         self.faces = photograph.faces
 
     def at(self, pixels: FloatArray) -> Image:
-        """Return sheet pixels in sixteenths, for OpenCV's ``shift=4``, of frame pixels."""
+        """Convert frame pixels to sixteenths of sheet pixels, for OpenCV's ``shift=4``."""
         place = (np.asarray(pixels) + 0.5) * self.factor - 0.5
         return np.round(16.0 * np.clip(place, -1e5, 1e5)).astype(np.int32)
 
     def frame_pixels(self, face: LookedAt, plane: FloatArray) -> FloatArray:
-        """Return frame pixels of positions in a face's plane; a crop has no view."""
+        """Return the frame pixels of positions in a face's plane; a crop has no view."""
         picture = face.picture
         if picture.view is not None:
             return picture.view.to_pixels(plane)
@@ -177,7 +177,7 @@ def _said(reading: TargetReading) -> list[str]:
 
 
 def _ellipse(centre: FloatArray, covariance: FloatArray, radius: float = 1.0) -> FloatArray:
-    """Return points (64, 2) of the ellipse of a covariance."""
+    """Return 64 points (64, 2) on the ellipse of a covariance."""
     values, vectors = np.linalg.eigh(covariance)
     angle = np.arange(64) * (2.0 * np.pi / 64)
     circle = np.stack([np.cos(angle), np.sin(angle)])

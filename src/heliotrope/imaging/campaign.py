@@ -44,7 +44,7 @@ Origin = tuple[float, float, float]
 
 #: With fewer photographs, a further process costs more than it gains.
 FEWEST_FOR_PROCESSES = 8
-#: Greatest angular speed of the sun, rad/s.
+#: Maximum angular speed of the sun, rad/s.
 _SUN_RATE = 7.292e-5
 #: Standard deviation of a beam caused by atmosphere and heliostat, rad. A single photograph cannot
 #: show it, but repeated sightings do.
@@ -86,7 +86,7 @@ class Job:
 
     @property
     def trust(self) -> str:
-        """What no frame can reveal, in one line: whether it is rotated or mirrored; else empty."""
+        """Warn, in one line, if frames cannot show whether they are mirrored; else empty."""
         if self.crop:
             cause = "a crop shows one target without its surroundings"
         elif self.camera is not None and self.camera.position is not None:
@@ -97,8 +97,8 @@ class Job:
         else:
             return ""
         return (
-            f"the orientation of the frames is taken on trust: {cause}; a mark that is unlike the "
-            "others, or the camera's pose in the plant file, would show a mirrored frame"
+            f"the orientation of the frames cannot be checked: {cause}; a mark that differs from "
+            "the others, or the camera's pose in the plant file, would reveal a mirrored frame"
         )
 
 
@@ -195,8 +195,8 @@ def look(
     recorded = "" if entry is None else entry.target
     if recorded and job.target and recorded != job.target:
         raise InputError(
-            f"{path}: its record names target {recorded}, and --target {job.target}; give the true "
-            "one alone"
+            f"{path}: its record names target {recorded}, and --target {job.target}; specify only "
+            "the correct one"
         )
     name = recorded or job.target
     if job.crop:
@@ -261,7 +261,10 @@ def meant(photograph: Photograph, target: str) -> tuple[TargetReading | None, st
     with_spots = [r for r in photograph.readings if r.spots]
     if len(with_spots) > 1:
         names = ", ".join(r.found.target.name for r in with_spots)
-        return None, f"several targets have spots ({names}) and none is named as the intended one"
+        return (
+            None,
+            f"several targets have spots ({names}) and none is specified as the intended one",
+        )
     if with_spots:
         return with_spots[0], _why(with_spots[0])
     present = [r for r in photograph.readings if r.found.found]
@@ -533,12 +536,12 @@ def sighting_of(
     name = frame.name or "photograph"
     reading, refusal = meant(photograph, target)
     if reading is None or not reading.good:
-        raise InputError(f"{name}: {refusal}; a sighting needs a spot that can be trusted")
+        raise InputError(f"{name}: {refusal}; a sighting needs a reliable spot")
     moment = frame.time if time is None else time
     spread = 0.0
     if sun is None:
         if moment is None:
-            raise InputError(f"{name}: its time is unknown; give time=, or the sun's direction")
+            raise InputError(f"{name}: its time is unknown; pass time=, or the sun's direction")
         if time is None and np.isfinite(frame.time_deviation):
             spread = (_SUN_RATE * frame.time_deviation) ** 2
         sun = vector(moment, site)
@@ -559,11 +562,11 @@ def _unusable(outcome: Outcome, entry: Entry | None, index: Mapping[str, int]) -
     if outcome.problem:
         return outcome.problem.removeprefix(f"{outcome.path}: ")
     if entry is None:
-        return "nothing is known about it: no row in the log, no file beside it"
+        return "no metadata: there is no row in the log and no file beside it"
     if outcome.point is None:
         return outcome.refusal
     if not entry.heliostat:
-        return "its heliostat is unknown; give --heliostat or a log"
+        return "its heliostat is unknown; specify --heliostat or a log"
     if entry.heliostat not in index:
         return f"the plant has no heliostat {entry.heliostat}"
     if entry.counts is None:
@@ -578,7 +581,7 @@ def _sun(outcome: Outcome, entry: Entry, site: Site) -> tuple[FloatArray | None,
     if entry.sun is not None:
         return entry.sun, seconds, 0.0, ""
     if time is None:
-        return None, seconds, 0.0, "neither its time nor the angles of the sun are known"
+        return None, seconds, 0.0, "neither its time nor the sun angles are known"
     with suppress(HeliotropeError):
         deviation = outcome.time_deviation if entry.time is None else 0.0
         spread = (_SUN_RATE * deviation) ** 2 if np.isfinite(deviation) else 0.0

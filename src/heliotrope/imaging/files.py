@@ -91,7 +91,7 @@ _ROUNDING = 1.0 / math.sqrt(12.0)  # standard deviation of a value rounded to wh
 
 @dataclass(frozen=True)
 class _Container:
-    """A file that Pillow opened; ``texts`` and ``changed`` are those of a PNG."""
+    """A file opened by Pillow; ``texts`` and ``changed`` are text and time chunks of a PNG."""
 
     kind: str
     image: ImageFile.ImageFile
@@ -184,7 +184,7 @@ def find_images(
     place = Path(folder)
     try:
         if not stat.S_ISDIR(place.stat().st_mode):
-            raise InputError(f"{place}: not a folder; give one with images")
+            raise InputError(f"{place}: not a folder; use a folder with images")
         images = [
             item
             for item in check_entries(place, place.rglob("*") if recursive else place.iterdir())
@@ -194,7 +194,7 @@ def find_images(
         ]
     except OSError as error:
         raise InputError(
-            f"{place}: cannot be read ({error.strerror}); give a folder with images"
+            f"{place}: cannot be read ({error.strerror}); use a folder with images"
         ) from None
     return sorted(images, key=_natural)
 
@@ -205,14 +205,14 @@ def _natural(path: Path) -> tuple[list[tuple[int, str, int]], str]:
 
 
 def _content(file: Path, limit: int) -> tuple[bytes, float]:
-    """Return the bytes of a file of plausible size, and its modification time."""
+    """Return the bytes of a file, if its size is plausible, and its modification time."""
     most = 8 * limit + 2**24  # four channels of 16 bit, and room for metadata
     try:
         state = file.stat()
         if stat.S_ISDIR(state.st_mode):
-            raise FormatError(file, f"this is a folder; give an image file ({_KINDS})")
+            raise FormatError(file, f"this is a folder; specify an image file ({_KINDS})")
         if not stat.S_ISREG(state.st_mode):
-            raise FormatError(file, "this is a device or a pipe; give an image file")
+            raise FormatError(file, "this is a device or a pipe; specify an image file")
         if state.st_size > most:
             raise FormatError(
                 file,
@@ -222,13 +222,13 @@ def _content(file: Path, limit: int) -> tuple[bytes, float]:
         data = read_bytes(file, most)
     except FileNotFoundError:
         if file.is_symlink():
-            text = f"a link to {file.readlink()}, which does not exist; give an image file"
+            text = f"a link to {file.readlink()}, which does not exist; specify an image file"
             raise FormatError(file, text) from None
-        raise FormatError(file, "there is no such file; give an image file") from None
+        raise FormatError(file, "no such file; specify an image file") from None
     except OSError as error:
-        raise FormatError(file, f"cannot be read ({error.strerror}); give an image") from None
+        raise FormatError(file, f"cannot be read ({error.strerror}); use another image") from None
     if not data:
-        raise FormatError(file, f"the file is empty; give an image ({_KINDS})")
+        raise FormatError(file, f"the file is empty; use an image ({_KINDS})")
     return data, state.st_mtime
 
 
@@ -260,19 +260,19 @@ def _opener(file: Path, data: bytes) -> tuple[str, Callable[[io.BytesIO], ImageF
     for start, (kind, opener) in _OPENERS.items():
         if data.startswith(start):
             if kind == "WebP" and data[8:12] != b"WEBP":
-                raise FormatError(file, f"this is a RIFF file but not WebP; give a {_KINDS}")
+                raise FormatError(file, f"this is a RIFF file but not WebP; use a {_KINDS}")
             return kind, opener
     if data[4:8] == b"ftyp":
         what = "an AVIF, a HEIC or a video"
     else:
         what = next((w for start, w in _OTHERS.items() if data.startswith(start)), "")
     if not what:
-        raise FormatError(file, f"not an image of a known kind; give a {_KINDS}")
+        raise FormatError(file, f"not a supported image format; use a {_KINDS}")
     raise FormatError(file, f"this is {what} file; convert it to a {_KINDS}")
 
 
 def _damaged(file: Path, kind: str, size: int, error: Exception) -> FormatError:
-    """Return the refusal of a file that Pillow cannot read."""
+    """Return the error for a file that Pillow cannot read."""
     if isinstance(error, FormatError):
         return error
     reason = " ".join(str(error).split()) or type(error).__name__
@@ -287,7 +287,9 @@ def _damaged(file: Path, kind: str, size: int, error: Exception) -> FormatError:
 
 def _check_size(file: Path, width: int, height: int, limit: int) -> None:
     if width < SMALLEST or height < SMALLEST:
-        text = f"{width} × {height} px; an image needs {SMALLEST} × {SMALLEST} px or more"
+        text = (
+            f"{width} × {height} px; an image must have at least {SMALLEST} × {SMALLEST} px or more"
+        )
         raise FormatError(file, text)
     if width * height > limit:
         text = f"{width} × {height} px are {width * height / 1e6:.3g} million, above the limit of "
@@ -295,7 +297,7 @@ def _check_size(file: Path, width: int, height: int, limit: int) -> None:
 
 
 def _png(image: ImageFile.ImageFile, data: bytes) -> _Container:
-    """Check all checksums; keep the chunks that say when and how the image was taken."""
+    """Verify all checksums, and keep the chunks that say when and how the image was taken."""
     image.verify()
     exif: Mapping[int, Any] = {}
     texts: dict[str, str] = {}
@@ -316,7 +318,7 @@ def _png(image: ImageFile.ImageFile, data: bytes) -> _Container:
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
-    """Yield type, content and whole of each chunk of a PNG."""
+    """Yield each chunk of a PNG: its type, its content, and all of its bytes."""
     position = 8
     while position + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)
@@ -341,7 +343,9 @@ def _check_tiff(file: Path, image: TiffImagePlugin.TiffImageFile, data: bytes) -
         raise FormatError(file, f"{channels} channels of kind {photometric}; convert it to RGB")
     starts, lengths = (tags.get(a, tags.get(b, ())) for a, b in ((273, 324), (279, 325)))
     if len(starts) != len(lengths):
-        raise FormatError(file, "its directory names no strips: damaged, copy it again")
+        raise FormatError(
+            file, "its TIFF directory lists no strips, so the file is damaged; copy it again"
+        )
     if any(not kind & 1 for kind in _further_pages(data)):
         raise FormatError(file, "this TIFF has several pages; save each as a file of its own")
 
@@ -365,7 +369,7 @@ def _decode(file: Path, container: _Container) -> Pixels:
     kind, image, data = container.kind, container.image, container.data
     size = image.size
     if _is_transparent(image):
-        text = "every pixel is transparent: it shows nothing; save it without alpha"
+        text = "every pixel is transparent, so the image is blank; save it without alpha"
         raise FormatError(file, text)
     orientation = image.tag_v2.get(274, 1) if kind == "TIFF" else 1  # type: ignore[attr-defined]
     try:
@@ -408,7 +412,7 @@ def _is_deep_colour(container: _Container) -> bool:
 
 
 def _eight_bit(image: ImageFile.ImageFile) -> Pixels:
-    """Return the pixels that Pillow decodes: 8 bits, or grey of 16."""
+    """Return the pixels decoded by Pillow: 8 bits, or 16-bit grey."""
     import cv2
 
     image.load()
@@ -424,7 +428,7 @@ def _eight_bit(image: ImageFile.ImageFile) -> Pixels:
 
 
 def _deep_colour(file: Path, container: _Container) -> Pixels:
-    """Return colour of 16 bits, blue-green-red, by OpenCV."""
+    """Decode 16-bit colour with OpenCV, as blue-green-red."""
     import cv2
 
     data = container.data
@@ -440,7 +444,7 @@ def _deep_colour(file: Path, container: _Container) -> Pixels:
 
 
 def _turned_back(pixels: Pixels, orientation: int) -> Pixels:
-    """Return the rows and columns of the sensor, of pixels turned by an EXIF orientation."""
+    """Undo an EXIF orientation: return pixels in the rows and columns of the sensor."""
     back: dict[int, Callable[[Any], Any]] = {
         2: lambda p: p[:, ::-1],
         3: lambda p: p[::-1, ::-1],
@@ -456,10 +460,10 @@ def _turned_back(pixels: Pixels, orientation: int) -> Pixels:
 def _is_torn(pixels: Pixels, data: bytes) -> bool:
     """Return whether the scan of a JPEG ends before its picture does.
 
-    libjpeg then fills the rest with one value, and its warning does not reach Pillow's callers.
-    If a scene truly has only one value, as at night, every block is coded in the same bits, so the
-    scan ends in repeating bits. This does not hold with restart markers (DRI) or progressive scans
-    (SOF2), which are not judged.
+    libjpeg then fills the rest with one value, and its warning does not reach Pillow's callers. A
+    scene that really has one value throughout, as at night, codes every block with the same bits,
+    so its scan ends in repeating bits. With restart markers (DRI) or progressive scans (SOF2) this
+    does not hold, so they are not checked.
     """
     last = pixels[-8:, -128:]
     header = data[: data.find(b"\xff\xda")]
@@ -491,7 +495,7 @@ def _time(file: Path, container: _Container, zone: tzinfo | None) -> tuple[datet
 
 
 def _exif(get: Callable[[], Image.Exif]) -> Mapping[int, Any]:
-    """Return EXIF's tags together with those of the image; none if they are damaged."""
+    """Return the EXIF tags together with those of the image; none if they are damaged."""
     try:
         exif = get()
         return dict(exif) | exif.get_ifd(0x8769)
@@ -529,7 +533,7 @@ def _name_time(name: str, zone: tzinfo | None) -> tuple[datetime | None, float]:
 def _stated(
     numbers: tuple[str, ...], fraction: str, offset: str, zone: tzinfo | None
 ) -> tuple[datetime | None, float]:
-    """Return a time and the unit of its last digit, s; None without a zone."""
+    """Return a time and the unit of its last digit, s; None if there is no time zone."""
     match = re.fullmatch(r"([+-])(\d\d)[:-]?(\d\d)", offset)
     if match:
         minutes = 60 * int(match[2]) + int(match[3])
@@ -549,7 +553,7 @@ def _stated(
 
 
 def _text_time(text: str) -> tuple[datetime | None, float]:
-    """Read PNG's recommended form (RFC 1123), or ISO 8601."""
+    """Read a time in the form that PNG recommends (RFC 1123), or in ISO 8601."""
     time = None
     with suppress(ValueError, TypeError):
         time = datetime.fromisoformat(text)
@@ -626,12 +630,12 @@ def encode_image(
 
     frame = image if isinstance(image, Frame) else Frame(image, name)
     if suffix not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
-        raise InputError(f"{name}: images are written as .png, .jpg or .tif, not as {suffix!r}")
+        raise InputError(f"{name}: images can be written as .png, .jpg or .tif, not as {suffix!r}")
     jpeg = suffix in (".jpg", ".jpeg")
     if jpeg and frame.pixels.dtype != np.uint8:
         raise InputError(f"{name}: a JPEG holds 8 bits, the frame has 16; write a PNG or a TIFF")
     if not 1 <= quality <= 100:
-        raise InputError(f"{name}: quality {quality}; give 1 to 100")
+        raise InputError(f"{name}: quality {quality}; must be 1 to 100")
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if jpeg else []
     done, encoded = cv2.imencode(suffix, frame.pixels, options)
     if not done:
@@ -641,7 +645,7 @@ def encode_image(
 
 
 def _with_texts(data: bytes, frame: Frame) -> bytes:
-    """Return a PNG with the facts about a frame in text chunks after its header."""
+    """Return a PNG with the frame's metadata in text chunks after the header."""
     texts = {}
     if frame.time is not None:
         texts["Creation Time"] = frame.time.isoformat()

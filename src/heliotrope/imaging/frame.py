@@ -20,10 +20,10 @@ CLIPPED = 0.985
 #: Weights of blue, green and red in the brightness (Rec. 601), in 255ths.
 _SHARES = (29, 150, 76)
 _SQUARED = np.round(np.arange(256) ** 2 / 255.0).astype(np.uint8)
-#: A plateau below the full scale: it has this many times more pixels between CLIPPED and 1 of the
-#: highest value than an equal band below has; so many pixels may be higher (hot pixels); and so
-#: many values occur between _NEAR and 1, without which nothing is known of the bands. A beam's
-#: smooth top gives 1.
+#: Criteria for a plateau below full scale: this many times more pixels between CLIPPED and 1 of the
+#: highest value than in an equal band below; the number of pixels that may be brighter (hot
+#: pixels); and the minimum number of values between _NEAR and 1, below which the bands say nothing.
+#: The smooth top of a beam has a ratio of 1.
 _PLATEAU, _HOT, _VALUES, _NEAR = 8.0, 16, 4, 0.94
 
 
@@ -63,7 +63,7 @@ class Frame:
             raise InputError(f"{self.name or 'frame'}: pixels {shape} must be (H, W) or (H, W, 3)")
         if self.pixels.dtype not in (np.uint8, np.uint16):
             raise InputError(
-                f"{self.name or 'frame'}: pixels of {self.pixels.dtype}; give uint8 or uint16"
+                f"{self.name or 'frame'}: pixels of {self.pixels.dtype}; use uint8 or uint16"
             )
         if self.time is not None and self.time.tzinfo is None:
             raise InputError(f"{self.name or 'frame'}: time {self.time} has no zone; add one")
@@ -129,7 +129,7 @@ class Frame:
 
 
 def _white(channel: Image, full_scale: float) -> float:
-    """Return the value at which a channel (H, W) clips: its own plateau, or the full scale."""
+    """Return the value at which a channel (H, W) clips: its plateau if any, or full scale."""
     import cv2
 
     levels = int(full_scale) + 1

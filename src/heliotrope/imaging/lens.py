@@ -23,7 +23,7 @@ MODELS: dict[str, tuple[int, ...]] = {
 }  # fmt: skip
 #: Boards whose normals differ by less than this count as one tilt, rad.
 SAME_TILT = np.radians(3.0)
-#: Greatest relative uncertainty of a focal length.
+#: Maximum relative uncertainty of a focal length.
 FOCAL_LIMIT = 0.1
 
 
@@ -114,7 +114,7 @@ def _eight_bit(grey: npt.ArrayLike) -> npt.NDArray[np.uint8]:
     picture = np.asarray(grey)
     if picture.ndim != 2 or picture.dtype not in (np.uint8, np.uint16):
         what = f"picture {picture.shape} of {picture.dtype}"
-        raise InputError(f"{what}; give grey (H, W), uint8 or uint16")
+        raise InputError(f"{what}; pass a grey image (H, W), uint8 or uint16")
     if picture.dtype == np.uint8:
         return np.ascontiguousarray(picture)
     # Sensors of 10 or 12 bit leave the upper bits empty.
@@ -151,17 +151,17 @@ def calibrate_chessboard(
     columns, rows = (int(n) for n in pattern)
     if min(columns, rows) < 3 or max(columns, rows) > 200:
         what = f"chessboard of {columns} × {rows} inner corners"
-        raise InputError(f"{what}; give 3 to 200 each, counted between the squares")
+        raise InputError(f"{what}; use 3 to 200 each, counted between the squares")
     pictures = [_eight_bit(image) for image in images]
     called = list(names) or [f"picture {k + 1}" for k in range(len(pictures))]
     if len(pictures) < 3:
-        raise InputError(f"{len(pictures)} pictures of a chessboard; give three or more")
+        raise InputError(f"{len(pictures)} pictures of a chessboard; pass three or more")
     height, width = pictures[0].shape
     for name, picture in zip(called, pictures, strict=True):
         if picture.shape != (height, width):
             raise InputError(
-                f"{name}: {picture.shape[1]} × {picture.shape[0]} px, but {called[0]} has "
-                f"{width} × {height} px; give pictures of one camera at one setting"
+                f"{name}: {picture.shape[1]} × {picture.shape[0]} px, but {called[0]} has {width} "
+                f"× {height} px; use pictures from one camera with one setting"
             )
     corners = [find_chessboard(picture, (columns, rows)) for picture in pictures]
     return calibrate_corners((width, height), corners, (columns, rows), square, called)
@@ -180,7 +180,7 @@ def calibrate_corners(
     model is the one with the least Bayesian information criterion.
     """
     if not (np.isfinite(square) and square > 0.0):
-        raise InputError(f"squares of {square} m; give their side in metres, above 0")
+        raise InputError(f"squares of {square} m; specify their side in metres, above 0")
     columns, rows = pattern
     plane = np.indices((rows, columns))[::-1].reshape(2, -1).T * square
     points = np.pad(plane, ((0, 0), (0, 1)))
@@ -192,8 +192,9 @@ def calibrate_corners(
     if sum(board.used for board in boards) < 3:
         have = ", ".join(board.name for board in boards if board.used) or "none"
         raise InputError(
-            f"{what} is found in {have} of {len(boards)} pictures; three or more are needed: are "
-            "the numbers right, and is the whole board in the frame, sharp and not overexposed?"
+            f"{what} is found in {have} of {len(boards)} pictures; three or more are needed: "
+            "check the corner counts, and that the whole board is in the frame, sharp and not "
+            "overexposed"
         )
     boards = _without_outliers(size, points, boards)
     solved = [_solve(size, points, boards, model) for model in MODELS]
@@ -276,7 +277,7 @@ def _without_outliers(
 
 
 def _check_lens(lens: Lens, normals: FloatArray) -> None:
-    """Reject a lens that the boards do not determine."""
+    """Raise an error if the boards do not determine the lens."""
     f, sigma = lens.matrix[0, 0], lens.sigma[0]
     if sigma > FOCAL_LIMIT * f or sigma == 0.0:
         raise InputError(_FRONTAL.format(f"the focal length of {f:.0f} px ± {sigma:.0f} px"))
@@ -291,7 +292,7 @@ def _check_lens(lens: Lens, normals: FloatArray) -> None:
 
 
 def _coverage(size: tuple[int, int], outlines: Sequence[FloatArray]) -> float:
-    """Return the share of the frame that quadrilaterals (4, 2) cover."""
+    """Return the fraction of the frame covered by quadrilaterals (4, 2)."""
     scale = 256.0 / max(size)
     rows, columns = (int(np.ceil(n * scale)) for n in reversed(size))
     return float(coverage([outline * scale for outline in outlines], (rows, columns)).mean())
@@ -307,8 +308,8 @@ def _lens_notes(lens: Lens) -> tuple[str, ...]:
         ),
         (
             share < 50.0,
-            f"boards cover {share:.0f} % of the frame; beyond, distortion is a guess",
+            f"boards cover {share:.0f} % of the frame; outside them, distortion is extrapolated",
         ),
-        (used < 6, f"{used} pictures were used; ten or more give a lens that can be trusted"),
+        (used < 6, f"{used} pictures were used; use ten or more for a reliable lens"),
     )
     return tuple(text for said, text in notes if said)

@@ -1,4 +1,4 @@
-"""Facts about a photograph other than its pixels: heliostat, motors, target, time or sun vector."""
+"""Metadata of photographs: heliostat, motor counts, target, time or sun vector."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _MOTORS, _ANGLES = COLUMNS[5:7], COLUMNS[7:9]
 
 @dataclass(frozen=True)
 class Entry:
-    """Facts about one photograph.
+    """Metadata of one photograph.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Log:
 
 
 def _short(path: Path) -> tuple[str, str]:
-    """Return the shorter names under which a log may list a photograph."""
+    """Return the shortened names under which a log may list a photograph."""
     return path.stem, _number(path)
 
 
@@ -111,9 +111,11 @@ def read_log(path: str | Path) -> Log:
     for i, key in enumerate(file or number for file, number in zip(files, ids, strict=True)):
         first = places.setdefault(key, i)
         if not key:
-            rows.refuse(i, "file", "neither file nor id is given; give one")
+            rows.refuse(i, "file", "neither file nor id is filled in; enter one")
         elif first != i:
-            rows.refuse(i, "file", f"{key} has the row {rows.places[first]} too; keep the true one")
+            rows.refuse(
+                i, "file", f"{key} also appears in {rows.places[first]}; keep the correct row"
+            )
         counts = np.array([numbers[0][i], numbers[1][i]])
         entries[key] = Entry(
             heliostat=heliostats[i],
@@ -126,8 +128,11 @@ def read_log(path: str | Path) -> Log:
     for key, i in places.items():
         for other in {*_short(Path(key))} - {key}:
             if other in places:
-                text = f"{key} and {other} of {rows.places[places[other]]} name one photograph"
-                rows.refuse(i, "file", f"{text}; keep the true row")
+                text = (
+                    f"{key} and {other} of {rows.places[places[other]]} refer to the same "
+                    "photograph"
+                )
+                rows.refuse(i, "file", f"{text}; keep the correct row")
     rows.refuse_bad()
     return Log(entries)
 

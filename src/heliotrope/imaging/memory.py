@@ -67,7 +67,7 @@ class Memory:
         """
         place = Path(folder)
         if place.exists() and not place.is_dir():
-            raise InputError(f"{place}: not a folder; give one for models of empty targets")
+            raise InputError(f"{place}: not a folder; specify a folder for models of empty targets")
         return cls(EmptyTarget.load(file) for file in sorted(place.glob("*.npz")))
 
     def save(self, folder: str | Path) -> None:
@@ -82,12 +82,12 @@ class Memory:
         try:
             place.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{place}: {error.strerror}; give a folder to write to") from None
+            raise InputError(f"{place}: {error.strerror}; specify a writable folder") from None
         for name, model in self._models.items():
             model.save(place / f"{name}.npz")
 
 
-#: Least beam-free share of a face's paint for learning.
+#: Minimum beam-free share of a face's paint for learning.
 _LEAST_FREE = 0.3
 
 

@@ -137,7 +137,7 @@ DEFAULT = MotionSettings()
 
 @dataclass(frozen=True)
 class _View:
-    """A frame prepared for comparison: grey, of full scale 1, reduced by ``factor``."""
+    """A frame prepared for comparison: grey, with full scale 1, reduced by ``factor``."""
 
     image: _Image
     cells: _Image  # float64, means of cells of it
@@ -194,7 +194,9 @@ def _view(picture: Frame | Pixels) -> _View:
     frame = picture if isinstance(picture, Frame) else Frame(picture)
     width, height = frame.size
     if min(width, height) < 16:
-        raise InputError(f"a frame of {width} × {height} px; motion needs 16 × 16 px or more")
+        raise InputError(
+            f"a frame of {width} × {height} px; motion detection needs 16 × 16 px or more"
+        )
     factor = max(1, math.ceil(width / _WIDTH), math.ceil(height / _HEIGHT))
     grey = frame.grey
     if factor > 1:
@@ -213,9 +215,11 @@ def _mask(mask: npt.ArrayLike | None, view: _View) -> _Image | None:
         return None
     counting = np.asarray(mask) != 0
     if counting.shape != (view.size[1], view.size[0]):
-        raise InputError(f"a mask of {counting.shape} does not fit frames of {view.size[::-1]} px")
+        raise InputError(
+            f"a mask of {counting.shape} does not match frames of {view.size[::-1]} px"
+        )
     if not counting.any():
-        raise InputError("the mask excludes the whole frame; clear a part of it")
+        raise InputError("the mask excludes the whole frame; unmask a part of it")
     size = view.image.shape[1::-1]
     share = cv2.resize(counting.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.asarray(share > 0.0, dtype=np.uint8)
@@ -241,7 +245,7 @@ def _expected(first: _View, second: _View) -> tuple[_Image, float]:
     if first.size != second.size:
         raise InputError(
             f"frames of {first.size[0]} × {first.size[1]} and {second.size[0]} × {second.size[1]} "
-            "px cannot be compared; give two of the same camera"
+            "px cannot be compared; use two frames from the same camera"
         )
     a, b = first.cells, second.cells
     y, x = np.mgrid[-1.0 : 1.0 : a.shape[0] * 1j, -1.0 : 1.0 : a.shape[1] * 1j]
@@ -264,7 +268,7 @@ def _expected(first: _View, second: _View) -> tuple[_Image, float]:
 
 
 def _fitted(design: _Image, b: _Image, start: float, step: float) -> tuple[_Image, float]:
-    """Return the parameters of a robust fit, and the deviation of its residuals."""
+    """Return the parameters of a robust fit, and the standard deviation of its residuals."""
     p = np.zeros(design.shape[1])
     p[0] = start
     scale = step
@@ -319,7 +323,7 @@ def _refine(a: _Image, b: _Image, start: _Pair) -> tuple[int, _Pair] | None:
 
 
 def _moved(image: _Image, x: float, y: float) -> _Image:
-    """Return the image x pixels further right and y further down."""
+    """Return the image shifted by x pixels to the right and y pixels down."""
     import cv2
 
     if x == 0.0 and y == 0.0:
@@ -342,7 +346,7 @@ def _moved(image: _Image, x: float, y: float) -> _Image:
 
 
 def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
-    """Return how many tiles agree on a small shift, and the shift, pixels."""
+    """Return the number of tiles that agree on a small shift, and the shift, pixels."""
     import cv2
 
     # The noise of the gradient of the mean is independent of that of the difference.
@@ -411,7 +415,7 @@ def _compare(
     regions.sort(key=lambda pair: -pair[0].significance)
     area = sum(region.area_px for region, _ in regions)
     if area > 0.5 * places * first.factor**2:
-        problem = "more than half of the frame changed: another scene, or another light"
+        problem = "more than half of the frame changed: a different scene or different lighting"
     return FrameMotion(
         moved=bool(regions) and not problem,
         significance=float(max(high.max(), -low.min())),
@@ -438,7 +442,7 @@ def _exposed(view: _View, which: str) -> str:
 def _difference(
     first: _View, second: _View, expected: _Image, shift: _Pair, ratio: float
 ) -> list[_Image]:
-    """Return the difference, the lesser brightness and gradient, and 1 where they are valid."""
+    """Return the difference, the smaller brightness and gradient, and the valid pixels."""
     import cv2
 
     bright = np.maximum(first.image, expected)
@@ -496,7 +500,7 @@ def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
 
 
 def _median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the medians of rows; np.median spends more time on checks."""
+    """Return the median of each row; np.median is slower because of its checks."""
     half = values.shape[-1] // 2
     return np.asarray(np.partition(values, half, axis=-1)[..., half])
 
@@ -504,7 +508,7 @@ def _median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def _significance(
     parts: list[_Image], counts: _Image, step: float, edge: float
 ) -> tuple[_Image, _Image, _Image]:
-    """Return greatest and least significance over all scales, and the difference, halved."""
+    """Return the largest and smallest significance over all scales, and half the difference."""
     import cv2
 
     area = cv2.INTER_AREA
@@ -531,7 +535,7 @@ def _significance(
 
 
 def _threshold(places: float, settings: MotionSettings) -> float:
-    """Return the significance, of either sign, that noise exceeds at the accepted rate."""
+    """Return the two-sided significance that noise exceeds at the accepted false-alarm rate."""
     from scipy.special import ndtri
 
     # Smoothing leaves about one independent position per four pixels of a scale.

@@ -177,7 +177,7 @@ def read_photograph(
 
 @lru_cache(maxsize=1)
 def _one_thread() -> "ThreadpoolController":
-    """Return the controller of BLAS threads; matrices here are too small for threads to pay."""
+    """Return the BLAS thread controller; the matrices here are too small for threads."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -250,13 +250,13 @@ def _by_view(results: Sequence[FoundTarget]) -> list[tuple[FaceView, list[FoundT
 def _empty_picture(
     without: Frame, view: FaceView, camera: Camera | None, chosen: PhotographSettings, rim: int
 ) -> Rectified:
-    """Return the face in the frame without the beam, searched again: the camera may move."""
+    """Locate the face again in the frame without the beam, because the camera may have moved."""
     again = find_targets(without, list(view.face.targets), camera, [view], chosen.pictures)
     known = next((f.view for f in again if f.view is not None), None)
     if known is None:
         raise InputError(
-            f"{without.name or 'the frame without the beam'}: {again[0].reason}; give an empty "
-            "frame of the same camera"
+            f"{without.name or 'the frame without the beam'}: {again[0].reason}; use an empty "
+            "frame from the same camera"
         )
     return rectify(without, known, rim=rim)
 
@@ -264,7 +264,7 @@ def _empty_picture(
 def _read_face(
     picture: Rectified, chosen: PhotographSettings, empty: Rectified | None, gathered: float
 ) -> tuple[LookedAt, list[PlacedSpot]]:
-    """Read one face; ``gathered`` is exposure times gain, s."""
+    """Evaluate one face; ``gathered`` is exposure times gain, s."""
     background = backgrounds.of_face(picture, chosen.background, chosen.empty.values(), empty)
     spots = [place(picture, spot, gathered) for spot in find_spots(picture, background)]
     odd = backgrounds.unexplained(picture, background, [s.spot.region for s in spots])

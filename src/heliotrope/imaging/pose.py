@@ -160,7 +160,7 @@ class _Problem:
     free: bool
 
     def camera(self, x: FloatArray) -> Camera:
-        """Return the camera of unknowns."""
+        """Return the camera for a vector of unknowns."""
         matrix, distortion = self.lens(x)
         position = self.origin - self.turn(x).T @ self.shift(x)
         return replace(
@@ -178,7 +178,7 @@ class _Problem:
         return as_float(cv2.Rodrigues(x[:3])[0])
 
     def lens(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return matrix and distortion of unknowns."""
+        """Return lens matrix and distortion for a vector of unknowns."""
         if not self.free:
             return self.base.matrix, self.base.distortion
         f = float(np.exp(np.clip(x[6], -20.0, 20.0)))
@@ -219,7 +219,7 @@ class _Problem:
         return np.concatenate([white, (x[6:] - mean) / sigma]) if self.free else white
 
     def slopes(self, x: FloatArray) -> FloatArray:
-        """Return the derivatives of `residuals`."""
+        """Return the derivatives of `residuals` with respect to the unknowns."""
         white = np.einsum("nij,njp->nip", self.whitener, self.predict(x, self.local)[1])
         prior = np.eye(10)[6:] / self.prior[1][:, None]
         return np.concatenate([white.reshape(-1, len(x))] + [prior] * self.free)
@@ -232,15 +232,15 @@ def _observed(
     where, observed, noise = as_vectors(points, "points"), as_float(pixels), as_float(sigma)
     if where.ndim != 2 or observed.shape != (len(where), 2):
         raise InputError(
-            f"points {where.shape} and pixels {observed.shape}; give (N, 3) and (N, 2)"
+            f"points {where.shape} and pixels {observed.shape}; expected (N, 3) and (N, 2)"
         )
     if not np.isfinite(observed).all():
         row = int(np.argwhere(~np.isfinite(observed))[0, 0])
-        raise InputError(f"pixels[{row}]: {observed[row]} is not finite; leave such points out")
+        raise InputError(f"pixels[{row}]: {observed[row]} is not finite; omit such points")
     if noise.shape in ((), (len(where),)):
         noise = np.eye(2) * np.broadcast_to(np.sign(noise) * noise**2, len(where))[:, None, None]
     if noise.shape != (len(where), 2, 2):
-        raise InputError(f"sigma {noise.shape}; give one number, (N,) or (N, 2, 2)")
+        raise InputError(f"sigma {noise.shape}; pass one number, (N,) or (N, 2, 2)")
     if not (np.isfinite(noise).all() and (np.linalg.eigvalsh(noise) > 0.0).all()):
         raise InputError("sigma of the pixels: a variance is not finite and above 0")
     return where, observed, np.linalg.inv(np.linalg.cholesky(noise))
@@ -254,7 +254,7 @@ def _problem(
     origin = where.mean(axis=0)
     spread = np.linalg.svd(where - origin, compute_uv=False)
     if spread[1] <= 1e-3 * spread[0]:
-        raise InputError(f"the {len(where)} points lie on one line; take some that span an area")
+        raise InputError(f"the {len(where)} points lie on one line; use points that span an area")
     return _Problem(origin, where - origin, observed, white, base, free)
 
 
@@ -287,7 +287,7 @@ def _starts(problem: _Problem, lens: Camera) -> list[tuple[FloatArray, FloatArra
 
 
 def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
-    """Refine all starts; return the best, with the next if it is hardly worse."""
+    """Refine all starts; return the best result, and the second if it is hardly worse."""
     from scipy.optimize import least_squares
     from scipy.special import chdtri
 
@@ -307,7 +307,7 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
             solved.append((2.0 * float(solution.cost), solution.x))
     name = f"camera {problem.base.name}"
     if not solved:
-        raise InputError(f"{name}: no pose explains the points; are their names right?")
+        raise InputError(f"{name}: no pose explains the points; check their names")
     solved.sort(key=lambda pair: pair[0])
     chi2, x = solved[0]
     camera = problem.camera(x)
@@ -322,7 +322,7 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
     other = problem.camera(differ[0]) if differ else None
     size = np.linalg.norm(slopes, axis=0)
     if not (size.min() > 0.0 and np.linalg.cond(slopes / size) < 1e8):
-        raise InputError(f"{name}: the points do not determine its position; take more")
+        raise InputError(f"{name}: the points do not determine its position; use more points")
     raw = np.linalg.inv((slopes / size).T @ (slopes / size)) / size / size[:, None]
     residuals = problem.pixels - problem.predict(x, problem.local)[0]
     if problem.free:
@@ -340,7 +340,7 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
 
 
 def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
-    """Return the derivative of the camera's turns and position by the unknowns."""
+    """Return the derivative of the camera's rotation and position with respect to the unknowns."""
     k, shift = cross_matrix(x[:3]), problem.shift(x)
     angle = max(float(np.linalg.norm(x[:3])), 1e-4)
     # Left Jacobian of SO(3).
@@ -358,7 +358,7 @@ def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
 
 
 def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
-    """Return the standard deviation from pixel to plane, at the points and half-way between."""
+    """Return the standard deviation of pixels' positions on the plane, at and between points."""
     axes = np.linalg.svd(problem.local)[2][:2]
     few = problem.local[:: len(problem.local) // 40 + 1]
     points = (0.5 * (few + few[:, None])).reshape(-1, 3)
@@ -370,7 +370,7 @@ def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
         ],
         axis=-1,
     ) / (2.0 * step)
-    # With the pixel fixed, the place on the plane moves against the prediction.
+    # For a fixed pixel, the position on the plane moves opposite to the prediction.
     moved = np.linalg.solve(across, problem.predict(x, points)[1])
     return float(np.sqrt(0.5 * np.einsum("nip,pq,niq->n", moved, raw, moved).mean()))
 

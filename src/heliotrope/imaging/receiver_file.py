@@ -16,16 +16,16 @@ from heliotrope.imaging.receiver_light import ReceiverReference, ReceiverSight
 
 
 class ReceiverLightDocument(BaseModel):
-    """The whole file; levels are linear, as shares of the full scale."""
+    """The contents of the file; levels are linear, as fractions of full scale."""
 
     model_config = ConfigDict(extra="forbid")
 
     format: Literal["heliotrope-receiver-light"]
     version: Literal[1]
-    camera: str = Field(min_length=1, description="Camera of the plant file.")
-    receiver: str = Field(min_length=1, description="Receiver of the plant file.")
-    size_px: tuple[int, int] = Field(description="Width and height of its frames.")
-    bits: Literal[8, 16] = Field(description="Of a value in its frames.")
+    camera: str = Field(min_length=1, description="Camera, as named in the plant file.")
+    receiver: str = Field(min_length=1, description="Receiver, as named in the plant file.")
+    size_px: tuple[int, int] = Field(description="Width and height of the camera's frames.")
+    bits: Literal[8, 16] = Field(description="Bits of a value in the camera's frames.")
     gamma: float = Field(description="Exponent of the camera's response; 1 is linear.")
     outline_px: list[tuple[float, float]] = Field(
         description="Corners of the receiver in the frame, in order around it."
@@ -36,17 +36,19 @@ class ReceiverLightDocument(BaseModel):
         description="Levels of the surroundings right, below, left, above; nan: not in the frame."
     )
     rise: float = Field(description="Rise of the receiver's level at nominal flux.")
-    exposure_s: float | None = Field(None, description="Exposure times gain, if frames state it.")
+    exposure_s: float | None = Field(
+        None, description="Exposure times gain, if the frames record it."
+    )
     surroundings: str = Field(min_length=1, description="PNG of the surroundings, beside the file.")
 
 
 def read_reference(path: str | Path) -> ReceiverReference:
-    """Return the reference of a file.
+    """Read the reference from a file.
 
     Raises
     ------
     FormatError
-        If it, or its PNG, cannot be used.
+        If the file or its PNG cannot be used.
     """
     path = Path(path)
     document = read_document(path, "receiver-light", ReceiverLightDocument, [ReceiverLightDocument])

@@ -36,7 +36,7 @@ Mask = npt.NDArray[np.bool_]
 #: Outline of the measured face, and inner and outer edge of the surroundings, as multiples of the
 #: receiver's outline about its middle.
 FACE, INNER, OUTER = 0.97, 1.15, 1.7
-#: Least pixels of the face, and of a side of the surroundings that counts; least number of sides.
+#: Minimum pixels of the face, and of a side of the surroundings that counts; least number of sides.
 LEAST_FACE, LEAST_SIDE, LEAST_SIDES = 100, 40, 2
 #: Largest share of clipped pixels in the face, and in a side that counts.
 CLIPPED_FACE, CLIPPED_SIDE = 0.0005, 0.01
@@ -45,7 +45,7 @@ CLIPPED_FACE, CLIPPED_SIDE = 0.0005, 0.01
 DIMMEST, BRIGHTEST = 0.1, 4.0
 #: Share below which the receiver is darker than daylight alone would leave it.
 DARKER = -0.05
-#: Least likeness of the surroundings to those of the reference (1: the same), and the largest
+#: Minimum likeness of the surroundings to those of the reference (1: the same), and the largest
 #: movement of the picture, as a share of the outline's diagonal.
 LIKENESS, MOVED = 0.4, 0.02
 #: Largest relative change of exposure times gain, where frames state them.
@@ -58,7 +58,7 @@ _LONGEST, _REACH = 320, 6
 _STEEP, _SMOOTH = 0.08, 1.5
 #: Largest departure of a lit photograph from the common rise, as a share of its own.
 _LINEAR = 0.1
-#: Least and largest daylight of a lit photograph, as a multiple of that of the dark one.
+#: Minimum and largest daylight of a lit photograph, as a multiple of that of the dark one.
 _ALIKE = (0.7, 1.4)
 
 
@@ -71,7 +71,7 @@ class ReceiverSight:
     camera, receiver
         Names.
     size
-        Of a frame, px.
+        Size of a frame, px.
     outline
         Corners of the receiver in the frame, in order around it, px, (N, 2).
     gamma
@@ -80,7 +80,7 @@ class ReceiverSight:
     Raises
     ------
     InputError
-        An outline that leaves the frame, is too small, or leaves no room for the surroundings.
+        If the outline leaves the frame, is too small, or leaves no room for the surroundings.
     """
 
     camera: str
@@ -93,7 +93,7 @@ class ReceiverSight:
         who = f"camera {self.camera}: receiver {self.receiver}"
         outline = as_float(self.outline)
         if outline.ndim != 2 or outline.shape[1:] != (2,) or len(outline) < 3:
-            raise InputError(f"{who}: an outline of {outline.shape}; give 3 corners or more, px")
+            raise InputError(f"{who}: an outline of {outline.shape}; specify 3 corners or more, px")
         object.__setattr__(self, "outline", outline)
         top = np.array(self.size) - 0.5
         if not ((outline >= -0.5) & (outline <= top)).all():
@@ -104,14 +104,14 @@ class ReceiverSight:
         pixels = int(self.face.sum())
         if pixels < LEAST_FACE:
             raise InputError(
-                f"{who}: it has {pixels} px in the frame, the limit is {LEAST_FACE}; use a longer "
-                "lens"
+                f"{who}: it has {pixels} px in the frame, below the minimum of {LEAST_FACE}; use "
+                "a longer lens"
             )
         visible = sum(int(side.sum()) >= LEAST_SIDE for side in self.sides)
         if visible < LEAST_SIDES:
             raise InputError(
-                f"{who}: {visible} of its four sides have room about it in the frame, the limit is "
-                f"{LEAST_SIDES}; use a wider lens"
+                f"{who}: {visible} of its four sides have a margin in the frame, below the "
+                f"minimum of {LEAST_SIDES}; use a wider lens"
             )
 
     @cached_property
@@ -164,26 +164,27 @@ class ReceiverSight:
 class ReceiverReference:
     """A camera's view of a receiver at known flux.
 
-    Levels are linear, as shares of the full scale.
+    Levels are linear, as fractions of full scale.
 
     Attributes
     ----------
     sight
         Where the camera sees it.
     bits
-        Of a value in the camera's frames, 8 or 16.
+        Bits per value in the camera's frames, 8 or 16.
     black
         Level with the lens capped.
     face
         Level of the receiver in daylight without beams, above black.
     sides
-        Levels of its surroundings then, above black, (4,); NaN where the frame does not show them.
+        Levels of its four sides of surroundings in daylight without beams, above black, (4,); NaN
+        where the frame does not show them.
     rise
         Rise of the receiver's level at nominal flux.
     surroundings
-        Receiver and surroundings then, reduced (`reduced`), uint16.
+        Receiver and surroundings in daylight without beams, reduced in size (`reduced`), uint16.
     exposure
-        Exposure times gain of the frames, s; NaN if they do not state it.
+        Exposure times gain of the frames, s; NaN if the frames do not record it.
     """
 
     sight: ReceiverSight
@@ -203,10 +204,12 @@ class ReceiverReference:
         if not (np.isfinite(numbers).all() and 0.0 <= self.black < 1.0 and self.rise > 0.0):
             raise InputError(
                 f"{who}: a reference with levels {self.black:g} and {self.face:g} and a rise of "
-                f"{self.rise:g} is none; take it again"
+                f"{self.rise:g} is invalid; take the reference again"
             )
         if sides.shape != (4,) or int((sides > 0.0).sum()) < LEAST_SIDES:
-            raise InputError(f"{who}: a reference of {sides} shows too few sides; take it again")
+            raise InputError(
+                f"{who}: a reference of {sides} shows too few sides; take the reference again"
+            )
         shape = reduced(np.zeros(self.sight.face.shape, np.float32)).shape
         if self.surroundings.shape != shape:
             raise InputError(
@@ -227,13 +230,13 @@ class ReceiverLight:
     Attributes
     ----------
     share
-        Share of the nominal flux, 0 or more; a lower bound if there is a ``doubt``. NaN if the
+        Fraction of the nominal flux, 0 or more; a lower bound if there is a ``doubt``; NaN if the
         frame cannot be measured at all.
     doubt
-        Why the flux may be higher; empty if it is not.
+        Why the flux may be higher; empty if there is no doubt.
     cells
-        Share of the nominal mean flux in each cell that was asked for, (...); NaN outside the
-        frame; None if none was.
+        Fraction of the nominal mean flux in each requested cell, (...); NaN outside the frame; None
+        if no cells were requested.
     """
 
     share: float
@@ -244,23 +247,23 @@ class ReceiverLight:
 def receiver_light(
     frame: Frame, reference: ReceiverReference, places: FloatArray | None = None
 ) -> ReceiverLight:
-    """Return the flux on a receiver in a frame; see the module's text.
+    """Measure the flux on a receiver in a frame; see the module docstring.
 
     Parameters
     ----------
     frame
-        Of the reference's camera, with the exposure of the reference.
+        Frame from the reference's camera, with the exposure of the reference.
     reference
         See `take_reference`.
     places
-        Middles of cells of which the flux is wanted too, px, (rows, columns, 2). Daylight counts as
-        even over the receiver.
+        Centres of cells whose flux is also requested, px, (rows, columns, 2). Daylight is assumed
+        uniform over the receiver.
     """
     sight = reference.sight
     if frame.size != sight.size or _bits(frame) != reference.bits:
         kind = f"{frame.size[0]} × {frame.size[1]} px of {_bits(frame)} bit"
         first = f"{sight.size[0]} × {sight.size[1]} px of {reference.bits} bit"
-        return ReceiverLight(math.nan, f"its frames have {kind}, those of the reference {first}")
+        return ReceiverLight(math.nan, f"its frames have {kind}, but the reference has {first}")
     levels = _Levels.of(frame, sight)
     brightness = np.asarray((levels.sides - reference.black) / reference.sides)
     counting = np.isfinite(brightness) & (levels.clipped_sides <= CLIPPED_SIDE)
@@ -279,7 +282,7 @@ def receiver_light(
 
 
 def _at(frame: Frame, sight: ReceiverSight, places: FloatArray) -> FloatArray:
-    """Return mean levels in cells about some places, (rows, columns, 2); NaN outside the frame."""
+    """Return mean levels in cells around centres, (rows, columns, 2); NaN outside the frame."""
     import cv2
 
     grey = _linear(frame, sight)
@@ -304,19 +307,19 @@ def _doubt(
     if abs(exposure / reference.exposure - 1.0) > EXPOSED:
         return (
             f"exposure times gain is {exposure:.3g} s, that of the reference "
-            f"{reference.exposure:.3g} s; fix both"
+            f"{reference.exposure:.3g} s; fix exposure and gain"
         )
     if not counting:
         return "the surroundings of the receiver are overexposed; shorten the exposure"
     if daylight < DIMMEST:
         return (
             f"the surroundings of the receiver show {max(daylight, 0.0):.0%} of the reference's "
-            f"daylight, the limit is {DIMMEST:.0%}: night, or something covers the lens"
+            f"daylight, below the minimum of {DIMMEST:.0%}: night, or something covers the lens"
         )
     if daylight > BRIGHTEST:
         return (
             f"the surroundings of the receiver are {daylight:.1f} times as bright as in the "
-            f"reference, the limit is {BRIGHTEST:g}"
+            f"reference; the limit is {BRIGHTEST:g}"
         )
     if levels.clipped_face > CLIPPED_FACE:
         return f"{levels.clipped_face:.1%} of the receiver is overexposed; shorten the exposure"
@@ -333,7 +336,7 @@ def _doubt(
 def _check_photographs(
     sight: ReceiverSight, capped: Frame, dark: Frame, with_beams: Sequence[tuple[Frame, float]]
 ) -> None:
-    """Refuse photographs of another size, shares that cannot be, and none with beams."""
+    """Raise InputError for a wrong size, an impossible fraction, or no photograph with beams."""
     who = f"camera {sight.camera}"
     for frame in (capped, dark, *(frame for frame, _ in with_beams)):
         if frame.size != sight.size:
@@ -347,7 +350,9 @@ def _check_photographs(
                 f"{who}: {frame.name} at a share of {share:g}; give above 0 to 2, 1 is nominal"
             )
     if not with_beams:
-        raise InputError(f"{who}: no photograph with beams; give one with its share of the flux")
+        raise InputError(
+            f"{who}: no photograph with beams; pass one with its fraction of the nominal flux"
+        )
 
 
 def take_reference(
@@ -364,19 +369,20 @@ def take_reference(
     sight
         Where the camera sees the receiver.
     capped
-        With the lens capped.
+        Frame with the lens capped.
     dark
-        In daylight, no beam on the receiver.
+        Frame in daylight, with no beam on the receiver.
     lit
-        Photographs with beams, soon after ``dark``, each with the share of the nominal flux; the
-        receiver must not be overexposed.
+        Photographs with beams, taken soon after ``dark``, each with its fraction of the nominal
+        flux; the receiver must not be overexposed.
     bits
-        Of a value in the camera's frames, where these are averages; None: as in ``dark``.
+        Bits per value in the camera's frames, if the frames passed are averages; None: as in
+        ``dark``.
 
     Raises
     ------
     InputError
-        Photographs that contradict each other, or of which one cannot be used.
+        If photographs contradict each other, or one of them cannot be used.
     """
     who = f"camera {sight.camera}"
     _check_photographs(sight, capped, dark, lit)
@@ -387,8 +393,9 @@ def take_reference(
     if good.sum() < LEAST_SIDES:
         raise InputError(
             f"{who}: {dark.name} shows {int(good.sum())} sides of the receiver's surroundings "
-            f"brighter than a capped lens and not overexposed, the limit is {LEAST_SIDES}; change "
-            "the exposure, or have more of what stands about the receiver in the picture"
+            "brighter than a capped lens and not overexposed, below the minimum of "
+            f"{LEAST_SIDES}; change the exposure, or include more of the receiver's surroundings "
+            "in the picture"
         )
     usual = np.where(good, sides, math.nan)
     rises, shares = [], []
@@ -413,9 +420,9 @@ def take_reference(
     for (frame, share), rise in zip(lit, rises, strict=True):
         if not (slope > 0.0 and abs(rise / (slope * share) - 1.0) <= _LINEAR):
             raise InputError(
-                f"{who}: {frame.name} rises by {rise:.4f} of full scale at a share of {share:g}, "
-                f"the others say {slope * share:.4f}; is a share wrong, or the response not linear "
-                "(gamma)?"
+                f"{who}: {frame.name} rises by {rise:.4f} of full scale at a fraction of "
+                f"{share:g}, the other photographs predict {slope * share:.4f}; check the "
+                "fractions and the linearity of the response (gamma)"
             )
     exposures = {frame.exposure * frame.gain for frame in (capped, dark, *(f for f, _ in lit))}
     stated = [value for value in exposures if math.isfinite(value)]
@@ -438,7 +445,7 @@ def take_reference(
 
 @dataclass(frozen=True)
 class _Levels:
-    """Mean levels in a frame, linear, as shares of the full scale."""
+    """Mean levels in a frame, linear, as fractions of full scale."""
 
     face: float
     sides: FloatArray
@@ -468,7 +475,7 @@ class _Levels:
 
 
 def _linear(frame: Frame, sight: ReceiverSight) -> Image:
-    """Return the levels of the box, linear, as shares of the full scale."""
+    """Return the levels of the box, linear, as fractions of full scale."""
     linear = Frame(frame.pixels[sight.box], frame.name).linear(sight.gamma)
     return np.asarray(linear.grey, dtype=np.float32) / np.float32(linear.full_scale)
 
@@ -499,29 +506,30 @@ def _factor(shape: tuple[int, ...]) -> int:
 def _view_change(sight: ReceiverSight, usual: Image, now: Image) -> str:
     """Return the reason why the surroundings differ from the reference; empty if they agree.
 
-    The directions of slopes are compared, weighted by the reference's slopes, so that neither the
-    strength of the light nor a veil over the picture counts.
+    Gradient directions are compared, weighted by the gradients of the reference, so that neither
+    the brightness nor a veil over the picture matters.
     """
-    # Slopes at the edge of the ring belong to the receiver, and to nothing at the box's edge.
+    # Gradients at the inner edge of the ring belong to the receiver; those at the edge of the box
+    # are artefacts.
     ring = reduced(sight.ring.astype(np.float32)) > 0.999
     inside = np.zeros_like(ring)
     inside[_REACH + 2 : -_REACH - 2, _REACH + 2 : -_REACH - 2] = True
     mine, theirs = _slopes(usual), _slopes(now)
     steep = np.where(ring & inside, np.linalg.norm(mine, axis=0), 0.0)
-    # Elsewhere noise has slopes too.
+    # Elsewhere, noise has gradients too.
     row, column = np.nonzero(steep > np.quantile(steep[ring & inside], 1.0 - _STEEP))
     mine = mine[:, row, column]
     theirs = theirs / (np.linalg.norm(theirs, axis=0) + 1e-9)
     whole = float(np.linalg.norm(mine, axis=0).sum())
     if not whole > 0.0:
-        return "nothing about the receiver shows where the camera looks"
+        return "nothing around the receiver shows where the camera points"
     shifts = [(y, x) for y in range(-_REACH, _REACH + 1) for x in range(-_REACH, _REACH + 1)]
     like = [float((mine * theirs[:, row + y, column + x]).sum()) / whole for y, x in shifts]
     best = int(np.argmax(like))
     if like[best] < LIKENESS:
         return (
-            "the surroundings of the receiver are not those of the reference; the camera was "
-            "moved, or something is in front of it"
+            "the surroundings of the receiver do not match the reference; the camera was moved, "
+            "or something is in front of it"
         )
     pixel = _factor(sight.face.shape)
     away = math.hypot(*shifts[best]) * pixel
@@ -532,7 +540,7 @@ def _view_change(sight: ReceiverSight, usual: Image, now: Image) -> str:
 
 
 def _slopes(values: Image) -> FloatArray:
-    """Return the slopes of a picture to the right and down, (2, H, W)."""
+    """Return the gradients of a picture to the right and down, (2, H, W)."""
     import cv2
 
     smooth = cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH)

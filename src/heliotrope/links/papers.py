@@ -212,7 +212,7 @@ def end_of(path: Path) -> datetime:
         from cryptography import x509
     except ImportError:
         raise InputError(
-            "cryptography is not installed; say pip install 'heliotrope[control]'"
+            "cryptography is not installed; run pip install 'heliotrope[control]'"
         ) from None
     try:
         certificates = x509.load_pem_x509_certificates(path.read_bytes())

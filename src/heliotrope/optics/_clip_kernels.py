@@ -30,7 +30,7 @@ SPECK = 1e-13
 
 @njit(**INNER)
 def cells_of(mirrors, low, step, shape, heads, links, tops):
-    """Put mirrors in a grid of the ground: the first of each cell, the next of each, the top."""
+    """Sort mirrors into a ground grid, as linked lists per cell: heads, links and highest tops."""
     for k in range(len(heads)):
         heads[k] = -1
         tops[k] = -math.inf
@@ -42,7 +42,7 @@ def cells_of(mirrors, low, step, shape, heads, links, tops):
 
 @njit(**OPTIONS)
 def gridded(mirrors, low, step, shape, heads, links, tops):
-    """As `cells_of`, for callers from Python."""
+    """Wrapper of `cells_of` for Python callers."""
     cells_of(mirrors, low, step, shape, heads, links, tops)
 
 
@@ -60,7 +60,7 @@ def _near(i, j, mirrors, ray, reach, slack):
 
 @njit(**INNER)
 def _along(i, mirrors, ray, reach, slack, grid, near, count):
-    """Append the mirrors near the rays from mirror i in a direction; return all, and how many."""
+    """Append the mirrors near the rays from mirror i in a direction; return list and length."""
     low, step, shape, heads, links, tops, top = grid
     x0, y0, z0 = mirrors[i, 0] - low[0], mirrors[i, 1] - low[1], mirrors[i, 2] - mirrors[i, 15]
     wide = mirrors[i, 15] + 0.5 * step + slack
@@ -108,10 +108,10 @@ def _along(i, mirrors, ray, reach, slack, grid, near, count):
 
 @njit(**OPTIONS)
 def candidates(rows, mirrors, sun, rays, reaches, slack, grid, spans):
-    """Mirrors that may shade and block each of ``rows``: one list, and where each part begins.
+    """List the mirrors that may shade and block each of ``rows``, and where each part begins.
 
-    ``spans`` (R + 1, 2) gets the begin of the shading and of the blocking ones; the last row, the
-    end.
+    ``spans`` (R + 1, 2) receives the start indices of the shading and of the blocking mirrors; its
+    last row receives the end.
     """
     near, count = np.empty(8 * len(rows) + 64, dtype=np.int64), plain(0)
     # Shadows are no longer than the field.
@@ -129,7 +129,7 @@ def candidates(rows, mirrors, sun, rays, reaches, slack, grid, spans):
 
 @njit(**INLINED)
 def _cut(corners, m, into, axis_x, axis_y, axis_z, offset):
-    """Keep the part of a polygon in space where axis · p ≤ offset; returns its corners' number."""
+    """Clip a polygon in space to axis · p ≤ offset; return its number of corners."""
     count = 0
     for k in range(m):
         k2 = k + 1 if k + 1 < m else 0
@@ -151,7 +151,7 @@ def _cut(corners, m, into, axis_x, axis_y, axis_z, offset):
 
 @njit(**INNER)
 def _carry(i, mirrors, ray, bend, reach, corners, m, spare, polygon):
-    """Carry a polygon, relative to mirror i in ENU, into its plane; 0 corners if it hides nothing.
+    """Project a polygon, ENU relative to mirror i, into its plane; 0 corners if it hides nothing.
 
     ``bend`` is D in the mirror's axes, (3, 2).
     """
@@ -177,7 +177,7 @@ def _carry(i, mirrors, ray, bend, reach, corners, m, spare, polygon):
             for c in range(3):
                 corners[k, c] = spare[k, c]
     if bend[0, 0] < 0.0 and m >= 3:
-        # Nothing is carried through the point where the rays meet.
+        # Nothing is projected through the point where the rays meet.
         m = _cut(corners, m, spare, 0.0, 0.0, 1.0, -0.999 * dz / bend[0, 0])
         for k in range(m):
             for c in range(3):
@@ -282,7 +282,7 @@ def bend_of(row, sun, bend):
 
 @njit(**INNER)
 def outlines(i, near, mirrors, towers, ray, bend, reach, work):
-    """Polygons that hide a part of mirror i; returns them, their corners and number.
+    """Collect the polygons that hide a part of mirror i; return them, their corners and number.
 
     ``near`` lists the mirrors. ``work`` holds two lists of corners.
     """
@@ -296,8 +296,8 @@ def outlines(i, near, mirrors, towers, ray, bend, reach, work):
         if m:
             sizes[count] = m
             count += 1
-    # A tower may stand close to the aim, beyond one of the two foci of an oblique mirror: there its
-    # rays are taken to meet in one point.
+    # A tower may be close to the aim, beyond one of the two foci of an oblique mirror; its rays are
+    # then assumed to meet in one point.
     pencil = np.zeros((3, 2))
     if bend[0, 0] != 0.0:
         pencil[0, 0] = pencil[1, 1] = -2.0 * mirrors[i, 14]
@@ -315,7 +315,7 @@ def outlines(i, near, mirrors, towers, ray, bend, reach, work):
 
 @njit(**INNER)
 def _split(points, m, ax, ay, bx, by, inside, outside):
-    """Cut a convex polygon along the line from a to b; the left of it is inside."""
+    """Clip a convex polygon along the line from a to b; the left side is inside."""
     nx, ny = ay - by, bx - ax
     p = q = 0
     before = (points[0, 0] - ax) * nx + (points[0, 1] - ay) * ny
@@ -367,7 +367,7 @@ def _apart(points, m, polygon, n):
 
 @njit(**INNER)
 def _subtract(points, begins, pieces, polygon, n, speck, into, starts, one, two):
-    """Subtract a convex polygon from convex pieces; returns the number of the new ones."""
+    """Subtract a convex polygon from convex pieces; return the number of new pieces."""
     total = 0
     for k in range(pieces):
         m = begins[k + 1] - begins[k]
@@ -405,9 +405,10 @@ def _subtract(points, begins, pieces, polygon, n, speck, into, starts, one, two)
 
 @njit(**INNER)
 def left_of(x0, x1, y0, y1, polygons, sizes, count, state):
-    """Subtract polygons from a rectangle; returns the state, whose first two list the pieces.
+    """Subtract polygons from a rectangle; return the state, whose first two arrays list the pieces.
 
-    ``state``: corners and begins of the pieces, their number, and as many to be written.
+    ``state``: corners and start indices of the pieces, their number, and the same as output
+    buffers.
     """
     points, begins, pieces, into, starts, one, two = state
     points[0, 0], points[0, 1], points[1, 0], points[1, 1] = x0, y0, x1, y0
@@ -436,7 +437,7 @@ def left_of(x0, x1, y0, y1, polygons, sizes, count, state):
 
 @njit(**INNER)
 def new_state():
-    """Room for `left_of`; it grows as needed."""
+    """Buffers for `left_of`; they grow as needed."""
     return (
         np.empty((256, 2)), np.empty(64, dtype=np.int64), plain(0),
         np.empty((256, 2)), np.empty(64, dtype=np.int64), np.empty((256, 2)), np.empty((256, 2)),
@@ -445,7 +446,7 @@ def new_state():
 
 @njit(**INNER)
 def moments_of(points, begins, pieces, into):
-    """Write area, centroid (2) and covariance (xx, xy, yy) of the pieces' union."""
+    """Compute area, centroid (2) and covariance (xx, xy, yy) of the union of the pieces."""
     area = mx = my = xx = xy = yy = 0.0
     for k in range(pieces):
         first, last = begins[k], begins[k + 1]
@@ -472,7 +473,7 @@ def moments_of(points, begins, pieces, into):
 
 @njit(**INLINED)
 def whole(x, y, a, b, into):
-    """Write the moments of a rectangle with half sides a and b."""
+    """Compute the moments of a rectangle with half sides a and b."""
     into[0], into[1], into[2] = 4.0 * a * b, x, y
     into[3], into[4], into[5] = a * a / 3.0, 0.0, b * b / 3.0
 
@@ -551,7 +552,7 @@ def clip(first, last, rows, mirrors, towers, sun, rays, reaches, near, spans, pa
 
 @njit(**OPTIONS)
 def pieces_of(i, mirrors, towers, sun, rays, reaches, near, spans):
-    """Convex pieces of the lit part of one mirror: corners and where each begins."""
+    """Return the convex pieces of the lit part of one mirror: corners and start indices."""
     work, straight, bend = (
         (np.empty((CORNERS, 3)), np.empty((CORNERS, 3))), np.zeros((3, 2)), np.zeros((3, 2)),
     )  # fmt: skip
@@ -573,7 +574,7 @@ def pieces_of(i, mirrors, towers, sun, rays, reaches, near, spans):
 
 @njit(**OPTIONS)
 def touched(spans, near, moved, into):
-    """Mark the mirrors that moved, or have one that moved among their candidates."""
+    """Mark the mirrors that moved, or that have a moved mirror among their candidates."""
     for i in range(len(spans)):
         into[i] = moved[i]
         for k in range(spans[i, 0], spans[i, 2]):

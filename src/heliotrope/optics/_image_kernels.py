@@ -36,7 +36,7 @@ _FAST = {**OPTIONS, "fastmath": {"contract", "nsz", "arcp", "nnan"}}
 
 @njit(**INLINED)
 def _exp(x):
-    """e^x for |x| ≤ 40 to 1e-7, without branches, so that loops use vectors."""
+    """e^x for |x| ≤ 40 to 1e-7, without branches, so that loops can be vectorised."""
     y = x * (1.0 / 256.0)
     p = 1.0 + y * (1.0 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y * (1 / 120 + y * (1 / 720))))))
     p = p * p
@@ -51,7 +51,7 @@ def _exp(x):
 
 @njit(**INNER)
 def _ray(row, sun, ray, axes):
-    """Write the central ray, and the axes right and up across it as seen from the mirror."""
+    """Compute the central ray, and the axes right and up across it as seen from the mirror."""
     nx, ny, nz = row[9], row[10], row[11]
     c = 2.0 * (nx * sun[0] + ny * sun[1] + nz * sun[2])
     ray[0], ray[1], ray[2] = c * nx - sun[0], c * ny - sun[1], c * nz - sun[2]
@@ -73,7 +73,7 @@ def _dot(a, b):
 
 @njit(**INLINED)
 def _row(a, table, k):
-    """Scalar product with a row of a table, without a view of it, which would cost more."""
+    """Scalar product with a row of a table, without creating a view, which would be slower."""
     return a[0] * table[k, 0] + a[1] * table[k, 1] + a[2] * table[k, 2]
 
 
@@ -91,7 +91,7 @@ def _axis(axes, e, row, k):
 
 @njit(**INNER)
 def _turn(row, sun, cosine, axes, into):
-    """Write the place of the ray (2) by a tilt of the normal (2), at distance 1."""
+    """Derivative of the ray's position (2) by a tilt of the normal (2), at distance 1."""
     for j in range(2):
         k = 3 + 3 * j
         along = _of(sun, row, k)
@@ -101,7 +101,7 @@ def _turn(row, sun, cosine, axes, into):
 
 @njit(**INNER)
 def _blur(row, sun, cosine, axes, slope, pointing, turn):
-    """Variances (uu, uv, vv) of the beam's direction by slope and belief, rad²."""
+    """Variances (uu, uv, vv) of the beam direction due to slope and calibration errors, rad²."""
     _turn(row, sun, cosine, axes, turn)
     s = slope * slope
     uu = s * (turn[0, 0] ** 2 + turn[0, 1] ** 2) + pointing[0, 0]
@@ -112,7 +112,7 @@ def _blur(row, sun, cosine, axes, slope, pointing, turn):
 
 @njit(**INNER)
 def _spread(turn, axes, row, t, curve, into):
-    """Write A: the place of the ray (2) by the place on the part (2), at distance t."""
+    """Compute A: derivative of the ray's position (2) by that on the part (2), at distance t."""
     for j in range(2):
         for e in range(2):
             into[e, j] = _axis(axes, e, row, 3 + 3 * j) - t * curve * turn[e, j]
@@ -120,7 +120,7 @@ def _spread(turn, axes, row, t, curve, into):
 
 @njit(**INNER)
 def _place(row, sun, ray, axes, t, x, y, tilt_x, tilt_y, into):
-    """Write where the ray from (x, y) with a tilted normal crosses the plane at t; its cosine."""
+    """Compute where the ray from (x, y) with a tilted normal meets the plane at t; its cosine."""
     nx = row[9] + tilt_x * row[3] + tilt_y * row[6]
     ny = row[10] + tilt_x * row[4] + tilt_y * row[7]
     nz = row[11] + tilt_x * row[5] + tilt_y * row[8]
@@ -138,7 +138,7 @@ def _place(row, sun, ray, axes, t, x, y, tilt_x, tilt_y, into):
 
 @njit(**INNER)
 def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work):
-    """Write the images of mirror i, parts merged; returns their number and the light's area."""
+    """Compute the merged images of mirror i's parts; return their number and the area of light."""
     table, kind, split, begin = parts
     turn, spread, place = work
     _turn(row, sun, cosine, axes, turn)
@@ -201,7 +201,7 @@ def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, 
 
 @njit(**INNER)
 def _distance(row, ray, shape):
-    """Distance along the ray to the surface, or to where it passes it; 0 if it never does."""
+    """Distance along the ray to the surface, or to its closest approach; 0 if there is none."""
     kind, middle, axis, normal, radius = shape
     x, y, z = middle[0] - row[0], middle[1] - row[1], middle[2] - row[2]
     if kind == FLAT:
@@ -229,7 +229,7 @@ def _width(axes, e, wides, k):
 
 @njit(**INNER)
 def _columns(row, ray, axes, t, shape, columns, seen):
-    """Write the visible columns: index, place (2), step along it (2), width (2) and weight."""
+    """Find the visible columns: index, position (2), step along it (2), width (2), weight."""
     kind, middle, axis, normal, radius = shape
     bases, wides, means, edges, angles = columns
     ups = (_row(axis, axes, 0), _row(axis, axes, 1))
@@ -282,7 +282,8 @@ def _columns(row, ray, axes, t, shape, columns, seen):
 def _march(z, step, count, rows, local, room):
     """Add the prepared Gaussians from a height z to both ends of the rows that they reach.
 
-    From row to row an exponential of a square needs two products, by its ratio and theirs.
+    From row to row the exponential of a square needs two products: by its ratio, and by the ratio
+    of ratios.
     """
     value, ratio, shrink, up, down, _ = room
     (begin, start, end), most = rows, 0.0
@@ -326,9 +327,10 @@ def _march(z, step, count, rows, local, room):
 
 @njit(**INNER)
 def _comb(variance, place):
-    """Sum of a Gaussian's values at whole numbers, by Poisson's formula; 1 if it is wide.
+    """Sum of a Gaussian's values at integers, by Poisson's formula; 1 if it is wide.
 
-    ``variance`` of the Gaussian, and its place, or that of a whole number relative to it.
+    ``variance`` is that of the Gaussian; the position is that of the Gaussian relative to an
+    integer, or the reverse.
     """
     depth = 2.0 * math.pi * math.pi * variance
     if depth > WIDE:
@@ -350,9 +352,9 @@ def _narrow(uu, uv, vv, visible, count, step):
 
 @njit(**INNER)
 def _conserve(uu, uv, vv, u, v, visible, count, low, step, room):
-    """Divide the amplitudes by what the sum over narrow cells' middles would be off.
+    """Correct the amplitudes for the error of summing at cell centres.
 
-    A Gaussian narrower than the cells, at whose middles it is taken, would lose or gain power.
+    A Gaussian narrower than the cells, sampled at their centres, would lose or gain power.
     """
     _, _, shrink, up, _, peak = room
     box = step * step / 12.0
@@ -587,9 +589,9 @@ def _own(cell, axes, scale):
 
 @njit(**INNER)
 def _passes(aperture, row, x, y, z):
-    """Share of the rays from a mirror to a point (relative to it) that pass the aperture.
+    """Fraction of the rays from a mirror to a point (relative to it) that pass the aperture.
 
-    They come from all of the mirror, so that the aperture's edge is blurred.
+    The rays come from the whole mirror, so the aperture's edge is blurred.
     """
     ax, ay, az = aperture[0] - row[0], aperture[1] - row[1], aperture[2] - row[2]
     nx = aperture[4] * aperture[8] - aperture[5] * aperture[7]

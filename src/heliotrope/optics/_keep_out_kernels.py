@@ -29,7 +29,7 @@ SPHERE, BOX, CYLINDER, PRISM = range(4)
 #: box: half sizes (3), cosine and sine of its turn; cylinder: unit axis (3), half length,
 #: radius; prism: half height, first corner, number of corners.
 SIZE = 10
-#: A beam nearer to a volume than this (m) counts as in it.
+#: A beam closer to a volume than this (m) counts as inside it.
 TOUCH = 1e-3
 #: Steps of one march; where they run out the beam counts as in the volume.
 STEPS = 2000
@@ -65,7 +65,7 @@ def _extruded(flat, along):
 
 @njit(**INNER)
 def _polygon(corners, first, last, x, y):
-    """Signed distance of (x, y) from a polygon; inside where a ray crosses it an odd time."""
+    """Signed distance of (x, y) from a polygon, negative inside (an odd number of crossings)."""
     best, inside = math.inf, False
     for i in range(first, last):
         j = i - 1 if i > first else last - 1
@@ -94,7 +94,7 @@ def _radius(t, radius, near, spread):
 
 @njit(**INLINED)
 def apart(row, o, d, reach, radius, near, spread):
-    """Whether the beam surely misses the sphere around the volume.
+    """Whether the beam certainly misses the sphere around the volume.
 
     At u from its nearest point the ray is √(h² + u²) from the centre and the beam's radius
     has grown by at most k u; √(h² + u²) − k u is at least h √(1 − k²).
@@ -172,7 +172,7 @@ def _pose(a, angle_1, angle_2):
 
 @njit(**INLINED)
 def _levers(a):
-    """Largest ways of the vertex by a radian of each joint, m."""
+    """Largest displacement of the vertex per radian of each joint, m."""
     axis_1, axis_2 = (a[0], a[1], a[2]), (a[6], a[7], a[8])
     o1, o2, m = (a[3], a[4], a[5]), (a[9], a[10], a[11]), (a[12], a[13], a[14])
     elbow, arm = minus(o2, o1), minus(m, o2)
@@ -183,11 +183,11 @@ def _levers(a):
 def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, entry):
     """Where along the path (K, 2) of joint angles a beam first enters the volume.
 
-    Over a span of the path whose joints turn by at most δ₁ and δ₂ from its middle, the normal
-    turns by at most δ₁ + δ₂, the beam by at most twice that, and the vertex moves by at most
-    the levers times δ. A beam that is wider by as much, and clear at the middle, is clear over
-    the span. If it is not, the span is halved, down to a turn of the beam of ``resolution``:
-    what is not proven clear there counts as an entry.
+    Over a span of the path whose joints rotate by at most δ₁ and δ₂ from its middle, the normal
+    rotates by at most δ₁ + δ₂, the beam by at most twice that, and the vertex moves by at most the
+    levers times δ. If a beam widened by these amounts is clear at the middle, the beam is clear
+    over the whole span. Otherwise the span is halved, down to a beam rotation of ``resolution``; a
+    span that cannot be proven clear there counts as an entry.
 
     Writes into ``entry``: index of the path's corner plus share of the leg up to which it is
     clear, distance along the beam, m, origin and direction in the pose just after. Returns the

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: the image of each mirror by itself, at several aims, and its derivative by the beam.
+"""Compiled: each mirror's own image at several aims, and its derivative by the beam.
 
 The Gaussians are those of `_image_kernels`; here they are not summed over the field. An image is a
 rectangle of cells, kept column after column, so that moving it by a row is moving a pointer.
@@ -35,7 +35,7 @@ def _seen_from(facing, count):
 
 @njit(**_FAST)
 def _bounds(local, count, start, begin, end, least, tops, box):
-    """Write the rectangle (first column and columns in order, first row, rows) above ``least``."""
+    """Find the rectangle above ``least``: first column, columns in order, first row, rows."""
     for k in range(count):
         tops[k] = 0.0
     for r in range(begin, end + 1):
@@ -73,7 +73,7 @@ def _edge(local, count, begin, end, low):
 
 @njit(**_FAST)
 def _keep(local, visible, first, box, values, used):
-    """Copy the cells in a rectangle column after column, and clear all."""
+    """Copy the cells of a rectangle column by column, then clear all cells."""
     columns, rows = box[1], box[3]
     for r in range(rows):
         line = local[box[2] + r]
@@ -93,7 +93,7 @@ def _keep(local, visible, first, box, values, used):
 @njit(**OPTIONS)
 def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts, surfaces, moments,
          shape, columns, grid, least, reach, values, boxes, begins):  # fmt: skip
-    """Write the cells of the images ``first`` to ``last``, ``looks`` of each mirror, W/m².
+    """Compute the cells of images ``first`` to ``last``, ``looks`` per mirror, W/m².
 
     ``mirrors`` has one row for each image. ``reach`` (H,): rows below and above the surface that
     count; ``grid`` has the most of them. ``boxes`` (J, 4) gets the first column, columns, first row
@@ -159,7 +159,7 @@ def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts,
 @njit(**OPTIONS)
 def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, surfaces, moments,
            shape, columns, grid, scatter, modes, worth, own, shared, value, slope):  # fmt: skip
-    """Add what errors of the beams of mirrors ``rows[first:last]`` do to each cell.
+    """Add the effect of beam errors of mirrors ``rows[first:last]`` on each cell.
 
     ``scatter`` (H, 3): Cholesky factor (uu, uv, vv) of the covariance of each beam's own error,
     rad. ``modes`` (H, M, 2): displacement of each beam by M shared errors, rad. ``own`` (rows,

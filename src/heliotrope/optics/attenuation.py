@@ -59,7 +59,7 @@ def air_loss(distance: npt.ArrayLike, model: str | float = "clear") -> FloatArra
 
 
 def air_model(model: str | float) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from distances (m) to the shares that the air takes.
+    """Return a function that maps distances (m) to the fraction lost in the atmosphere.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def air_model(model: str | float) -> Callable[[FloatArray], FloatArray]:
     low, high = _VISIBILITY
     if not low <= visibility <= high:
         raise InputError(
-            f"air {model!r}: known models: {', '.join(AIR_MODELS)}; or give the visibility, "
+            f"air {model!r}: known models: {', '.join(AIR_MODELS)}; or specify the visibility, "
             f"{low:g} to {high:g} km"
         )
     return lambda distance: as_float(-np.expm1(-_CONTRAST * 1e-3 * distance / visibility))

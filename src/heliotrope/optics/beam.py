@@ -175,7 +175,9 @@ class MirrorOptics:
     def broadcast(self, count: int) -> "MirrorOptics":
         """Return ``count`` mirrors, by repeating a single mirror."""
         if len(self) not in (1, count):
-            raise InputError(f"mirrors: {len(self)} for {count} beams; give one, or one for each")
+            raise InputError(
+                f"mirrors: got {len(self)} for {count} beams; pass one, or one per beam"
+            )
         return MirrorOptics(
             **{k: np.ascontiguousarray(np.broadcast_to(v, (count,))) for k, v in vars(self).items()}
         )
@@ -234,7 +236,7 @@ def beams(
     to_aim = np.atleast_2d(as_vectors(aim, "aim")) - origin
     origin = np.ascontiguousarray(np.broadcast_to(origin, to_aim.shape))
     if origin.ndim != 2:
-        raise InputError(f"beams: vertices and aims of shape {to_aim.shape}; give (N, 3)")
+        raise InputError(f"beams: vertices and aims have shape {to_aim.shape}; expected (N, 3)")
     return Beams(
         origin,
         normalize(to_aim, "aim - vertex"),
@@ -397,5 +399,5 @@ def reaches(reach: npt.ArrayLike, count: int) -> FloatArray:
         (1,),
         (count,),
     ):
-        raise InputError(f"reach {reach!r} m: give numbers above 0, one or one for each beam")
+        raise InputError(f"reach {reach!r} m: pass one number above 0, or one per beam")
     return np.ascontiguousarray(np.broadcast_to(lengths, (count,)))

@@ -73,15 +73,18 @@ def _off_axis(
 ) -> FloatArray:
     """Return tilts for which the facets send the sun to the aim, (H, F, 2)."""
     if plant is None:
-        raise InputError("canting: off axis it needs the plant, whose mirrors turn to that sun")
+        raise InputError(
+            "canting: off-axis canting needs the plant, because its heliostats must face that sun"
+        )
     light = normalize(as_vectors(sun, "canting: sun"))
     if light.shape != (3,) or light[2] <= 0.0:
-        raise InputError("canting: give one sun above the horizon, (3,)")
+        raise InputError("canting: pass one sun vector above the horizon, (3,)")
     scene = scene_of(plant, light, aim)
     then = scene.mirrors
     if scene.dark is not None and scene.dark.any():
         name = plant.names[int(np.flatnonzero(scene.dark)[0])]
         raise InputError(
-            f"canting: heliostat {name} cannot reach its aim at the sun of canting; choose another"
+            f"canting: heliostat {name} cannot reach its aim at the sun position chosen for "
+            "canting; choose another"
         )
     return off_axis(center, then.center, then.normal, light, then.aim)

@@ -64,13 +64,13 @@ def _cover_row(line, left, right, height, columns):
 
 
 def coverage(polygons: Sequence[FloatArray], shape: tuple[int, ...]) -> FloatArray:
-    """Return the share of each cell that polygons cover, (H, W).
+    """Return the fraction of each cell that polygons cover, (H, W).
 
     Parameters
     ----------
     polygons
-        Each (K, 2), places across and down in cells, in either sense of rotation. Where
-        polygons overlap, their shares add up to at most 1.
+        Polygons, (K, 2) each: positions across and down in cells, in either sense of rotation.
+        Where polygons overlap, their fractions add up to at most 1.
     shape
         Rows and columns.
     """

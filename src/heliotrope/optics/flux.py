@@ -48,5 +48,5 @@ class FluxView(Value, Framed):
             "intercept": Variable((), self.intercept),
             "heliostats": Variable((), self.heliostats),
         }
-        notes = {"receiver": self.receiver, "cells": "centres, m from that of the aperture"}
+        notes = {"receiver": self.receiver, "cells": "centres, m from the centre of the aperture"}
         return Labelled(rows, {"up": self.up, "right": self.right}, variables, notes=notes)

@@ -92,12 +92,12 @@ def write_netcdf(path: str | Path, found: PlantFlux) -> None:
 
 
 class _Kept(io.BytesIO):
-    """A buffer whose content outlives its end."""
+    """A buffer whose content remains available after closing."""
 
     content: bytes = b""
 
     def close(self) -> None:
-        """Keep the content."""
+        """Keep the content on closing."""
         self.content = self.getvalue()
         super().close()
 
@@ -169,10 +169,10 @@ def write_solartherm(path: str | Path, table: FluxTable) -> None:
     Raises
     ------
     InputError
-        If the table is one over times.
+        If the table is over times instead of a year.
     """
     if not np.isfinite(table.declination).all():
-        raise InputError(f"{path}: SolarTherm takes a table over a year; use flux_year")
+        raise InputError(f"{path}: SolarTherm needs a table over a year; use flux_year")
     hours = np.unique(np.round(np.degrees(table.hour), 9))
     step = float(np.diff(hours).min()) if len(hours) > 1 else 15.0
     across = np.round(step * np.arange(-round(180.0 / step), round(180.0 / step) + 1), 9)

@@ -171,7 +171,7 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
     """
     e, w = np.broadcast_arrays(as_float(corneal), as_float(subtended))
     if e.ndim == 0 or not (np.isfinite(e).all() and np.isfinite(w).all()):
-        raise InputError("glare of many: give finite irradiances and angles, (..., N)")
+        raise InputError("glare of many: irradiances and angles must be finite, (..., N)")
     if (e < 0.0).any() or (w < 0.0).any():
         raise InputError("glare of many: irradiances and angles must be 0 or more")
     bright = (e > 0.0) & (w > 0.0)
@@ -322,7 +322,9 @@ def glare_map(
     """
     middle = as_vectors(center, "center")
     if not (math.isfinite(size) and size > 0.0 and cells >= 2):
-        raise InputError(f"map of {size} m and {cells} cells: give a size above 0, 2 cells or more")
+        raise InputError(
+            f"map of {size} m and {cells} cells: the size must be above 0, with 2 cells or more"
+        )
     # Seen against the normal: from above, east is to the right and north is up.
     axes = tangent_axes(-normalize(normal, "normal"))
     line = np.linspace(-0.5 * size, 0.5 * size, cells)
@@ -373,7 +375,7 @@ def safe_distance(
     """
     middle = as_vectors(center, "center")
     if not (0.0 < step < reach and math.isfinite(reach)):
-        raise InputError(f"step {step} m and reach {reach} m: give 0 < step < reach")
+        raise InputError(f"step {step} m and reach {reach} m: must satisfy 0 < step < reach")
     to = np.einsum("nk,nk->n", middle - given.origin, given.direction)
     distances = np.append(np.arange(step, reach, step), reach)
     for away in distances[::-1]:

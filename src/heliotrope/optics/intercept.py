@@ -155,7 +155,7 @@ def intercept_rectangle(
 
 
 def _within(half: FloatArray, sigma: FloatArray, center: FloatArray) -> FloatArray:
-    """Return the share of a normal distribution between −half and half."""
+    """Return the fraction of a normal distribution between −half and half."""
     from scipy import special
 
     # Mirrored to the lower tail, where the two values are small and their difference exact.
@@ -189,5 +189,5 @@ def _chords(
 def _offset(name: str, value: npt.ArrayLike) -> FloatArray:
     offset = as_float(value)
     if np.isinf(offset).any():
-        raise InputError(f"{name}: an offset is infinite; give metres, or NaN for no beam")
+        raise InputError(f"{name}: an offset is infinite; pass metres, or NaN for no beam")
     return offset

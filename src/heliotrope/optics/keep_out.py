@@ -197,11 +197,11 @@ def sweep(
     rows = armatures.table.reshape(-1, 18)
     joints = as_float(path)
     if joints.ndim < 2 or joints.shape[-1] != 2 or not np.isfinite(joints).all():
-        raise InputError(f"path: shape {joints.shape}; give finite joint angles, (N, K, 2)")
+        raise InputError(f"path: shape {joints.shape}; pass finite joint angles, (N, K, 2)")
     joints = joints if joints.ndim == 3 else joints[None]
     count = max(len(rows), len(joints))
     if {len(rows), len(joints)} - {1, count}:
-        raise InputError(f"path: {len(joints)} paths for {len(rows)} heliostats")
+        raise InputError(f"path: got {len(joints)} paths for {len(rows)} heliostats")
     if not (np.isfinite(resolution) and resolution > 0.0):
         raise InputError(f"resolution {resolution} rad must be above 0")
     s = np.broadcast_to(normalize(sun, "sun"), (count, 3))
@@ -346,10 +346,10 @@ def safe_way(
         Distance up to which beams are followed, m.
     """
     if armature.shape:
-        raise InputError(f"safe_way: armature of shape {armature.shape}; give one heliostat")
+        raise InputError(f"safe_way: armature of shape {armature.shape}; pass one heliostat")
     begin, foot_ = as_float(stow), as_vectors(foot, "foot")
     if begin.shape != (2,) or not np.isfinite(begin).all():
-        raise InputError(f"stow: {stow!r}; give the 2 joint angles in rad")
+        raise InputError(f"stow: {stow!r}; pass the 2 joint angles in rad")
     if not (np.isfinite(first_distance) and first_distance > 0.0):
         raise InputError(f"first_distance {first_distance} m must be above 0")
     vertex = armature.pose(begin)[1]
@@ -383,14 +383,14 @@ def _verified(
     motion = sweep(armature, path, sun, mirrors, volumes, reach=reach)
     blocked = np.flatnonzero(motion.entered[0])
     lost = np.flatnonzero(status != TrackingStatus.OK)
-    text = "every beam on the way is proven to stay out of every volume"
+    text = "every beam along the path is proven to stay outside every volume"
     if blocked.size:
         v = blocked[np.argmin(motion.at[0, blocked])]
         k = int(motion.at[0, v])
         leg = ("turning the azimuth", "turning the elevation")[k] if k < 2 else f"at aim {k - 1}"
         text = (
             f"the beam enters {motion.volumes[v]} {motion.distance[0, v]:.0f} m from the mirror "
-            f"while {leg}; choose another foot, standby point or time"
+            f"while {leg}; choose another foot point, standby point or time"
         )
     if lost.size:
         k = int(lost[0])

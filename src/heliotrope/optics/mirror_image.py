@@ -27,7 +27,7 @@ from heliotrope.optics.sun_shape import AUREOLE_RADIUS, PROFILES, sun_profile
 
 #: A Gaussian is drawn to this many σ; 4e-6 of a two-dimensional Gaussian lies beyond.
 _REACH = 5.0
-#: Greatest number of samples along a side of a grid.
+#: Maximum number of samples along a side of a grid.
 _LARGEST = 4096
 #: Samples of several beams must coincide on one grid to within this share of a step.
 _ALIGNED = 1e-6
@@ -56,11 +56,11 @@ class Beam:
     def __post_init__(self) -> None:
         flux, origin = as_float(self.flux), as_float(self.origin)
         if flux.ndim != 2 or flux.size == 0:
-            raise InputError(f"beam: flux of shape {flux.shape}; give (rows, columns)")
+            raise InputError(f"beam: flux of shape {flux.shape}; expected (rows, columns)")
         if not (np.isfinite(flux).all() and flux.min() >= 0.0):
             raise InputError("beam: flux must be finite and nowhere below 0 W/m²")
         if flux.max() <= 0.0:
-            raise InputError("beam: flux is 0 W/m² everywhere; give a beam with light")
+            raise InputError("beam: flux is 0 W/m² everywhere; pass a beam with light")
         _above_zero("beam: step", self.step, "m")
         if origin.shape != (2,) or not np.isfinite(origin).all():
             raise InputError(f"beam: origin {origin} must be two finite numbers, m")
@@ -90,7 +90,7 @@ class Beam:
         """
         flux = as_float(image)
         if flux.ndim != 2:
-            raise InputError(f"beam: picture of shape {flux.shape}; give (rows, columns)")
+            raise InputError(f"beam: picture of shape {flux.shape}; expected (rows, columns)")
         middle = 0.5 * metres_per_pixel * (np.array(flux.shape[::-1]) - 1.0)
         beam = cls(flux[::-1].copy(), metres_per_pixel, as_float(centre) - middle)
         return beam if power is None else beam.of_power(power)
@@ -111,7 +111,7 @@ class Beam:
         columns, rows = np.round(places - first).astype(int).T
         off = np.abs(places - first - np.stack([columns, rows], axis=-1)).max()
         if any(beam.step != step for beam in beams) or off > _ALIGNED:
-            raise InputError("beams: their samples do not fall on one grid; give them one step")
+            raise InputError("beams: the samples are not on a common grid; use one step for all")
         height = max(y + beam.flux.shape[0] for y, beam in zip(rows, beams, strict=True))
         width = max(x + beam.flux.shape[1] for x, beam in zip(columns, beams, strict=True))
         flux = np.zeros((height, width))
@@ -395,7 +395,7 @@ def reflected_beam(
     if isinstance(facets, Facets):
         if len(facets.center) != 1:
             raise InputError(
-                f"reflected beam: facets of {len(facets.center)} heliostats; take those of one"
+                f"reflected beam: facets of {len(facets.center)} heliostats; pass the facets of one"
             )
         shape = facets
     else:
@@ -486,7 +486,7 @@ def _gather(
     if needed.max() > _LARGEST:
         raise InputError(
             f"reflected beam: {needed[0]} × {needed[1]} samples of {step} m; at most {_LARGEST} "
-            "each way, take a larger step"
+            "each way are allowed, use a larger step"
         )
     columns, rows = (next_fast_len(int(n), real=True) for n in needed)
     cloud = deposit((plane - low) / step, power, (rows, columns))
@@ -568,8 +568,8 @@ def _axes(reach: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
     count = np.ceil(reach / step).astype(int)
     if count.max() > _LARGEST // 2:
         raise InputError(
-            f"beam: {2 * count.max() + 1} samples of {step} m; at most {_LARGEST} each way, take "
-            "a larger step"
+            f"beam: {2 * count.max() + 1} samples of {step} m; at most {_LARGEST} each way are "
+            "allowed, use a larger step"
         )
     x, y = (np.arange(-n, n + 1) * step for n in count)
     return x, y
@@ -608,4 +608,4 @@ def _reflection_guards(
     _above_zero(f"{name}: dni", dni, "W/m²")
     _above_zero(f"{name}: step", step, "m")
     if elements < 1:
-        raise InputError(f"{name}: {elements} elements; give 1 or more")
+        raise InputError(f"{name}: {elements} elements; must be 1 or more")

@@ -31,7 +31,7 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
             raise InputError(f"mirror: {name} {side} m must be above 0 and finite")
     columns, rows = count
     if min(columns, rows) < 1:
-        raise InputError(f"mirror: {columns} × {rows} facets; give 1 or more each way")
+        raise InputError(f"mirror: {columns} × {rows} facets; must be 1 or more each way")
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * width
     y = ((np.arange(rows) + 0.5) / rows - 0.5) * height
     x, y = (a.ravel() for a in np.meshgrid(x, y))
@@ -44,7 +44,7 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
 
 
 def elements_of(facets: Facets, focal: float, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return places and normals (E, 3) and areas (E,) of the elements, in the mirror's frame.
+    """Return positions and normals (E, 3) and areas (E,) of the elements, in the mirror's frame.
 
     Parameters
     ----------

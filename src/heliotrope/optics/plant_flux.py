@@ -387,13 +387,13 @@ def one_sun(plant: Plant, time: Times | None, sun: npt.ArrayLike | None) -> Floa
     elif time is not None and sun is None:
         light = vector(time, plant.site)
     else:
-        raise InputError("flux: give either a time or the sun")
+        raise InputError("flux: pass either a time or a sun vector")
     if light.shape != (3,):
-        raise InputError(f"flux: times of shape {light.shape[:-1]}; give one time")
+        raise InputError(f"flux: times of shape {light.shape[:-1]}; pass one time")
     if light[2] <= 0.0:
         elevation = np.degrees(np.arcsin(np.clip(light[2], -1.0, 1.0)))
         raise InputError(
-            f"flux: the sun stands {elevation:.1f}° above the horizon; choose a time by day"
+            f"flux: the sun stands {elevation:.1f}° above the horizon; choose a time in daylight"
         )
     return light
 
@@ -616,8 +616,8 @@ def flux_year(
     """
     if not (2 <= declinations <= 100 and 0.1 <= hours <= 4.0):
         raise InputError(
-            f"flux: {declinations} declinations and steps of {hours} h; give 2 to 100, and 0.1 to "
-            "4 h"
+            f"flux: {declinations} declinations and steps of {hours} h; must be 2 to 100 "
+            "declinations and 0.1 to 4 h"
         )
     optics = (light or FieldOptics()).changed(changes)
     longitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, declinations)

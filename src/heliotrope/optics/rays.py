@@ -316,7 +316,7 @@ def _embree(triangles: list[FloatArray], origin: FloatArray) -> Any:
         from embreex.rtcore_scene import EmbreeScene
     except ImportError:
         raise InputError(
-            "rays: embreex is not installed; say pip install 'heliotrope[rays]'"
+            "rays: embreex is not installed; run pip install 'heliotrope[rays]'"
         ) from None
     scene = EmbreeScene()
     TriangleMesh(scene, _single(np.concatenate(triangles) - origin))

@@ -173,8 +173,8 @@ class FieldFlux:
         for surface, power in zip(self.scene.surfaces, self._power, strict=True):
             if power[:, 0].any() and not power[:, 1].any():
                 raise InputError(
-                    f"receiver {surface.name}: no mirror sends light to it; turn it to the field, "
-                    "or correct the aims"
+                    f"receiver {surface.name}: no mirror sends light to it; turn the receiver "
+                    "towards the field, or correct the aims"
                 )
 
     def _cast(self, rows: IntArray, sign: float) -> None:
@@ -302,8 +302,8 @@ class FieldFlux:
         plan = self._plans[0]
         if not isinstance(plan, _Grid):
             raise InputError(
-                f"receiver {self.scene.surfaces[0].name}: single images are computed on plates and "
-                "cylinders, not in cavities"
+                f"receiver {self.scene.surfaces[0].name}: single images can be computed on flat "
+                "and cylindrical receivers, not in cavities"
             )
         return plan
 

@@ -62,7 +62,7 @@ class FacetTable:
         ):
             raise InputError(
                 f"facets: centre {self.center.shape}, tilt {self.tilt.shape}, half "
-                f"{self.half.shape} and focal {self.focal.shape}; give (K, F, 2) and (K, F)"
+                f"{self.half.shape} and focal {self.focal.shape}; expected (K, F, 2) and (K, F)"
             )
 
 
@@ -221,17 +221,19 @@ class Mirrors:
         rows, count = len(facets.center), len(self)
         if kind is None:
             if rows not in (1, count):
-                raise InputError(f"facets: {rows} kinds for {count} mirrors; say which has which")
+                raise InputError(
+                    f"facets: {rows} kinds for {count} mirrors; specify the kind of each mirror"
+                )
             kind = np.arange(count) if rows == count else np.zeros(count, dtype=np.int64)
         if len(kind) != count or not ((kind >= 0) & (kind < rows)).all():
-            raise InputError(f"facets: give each of {count} mirrors a row from 0 to {rows - 1}")
+            raise InputError(f"facets: assign each of {count} mirrors a row from 0 to {rows - 1}")
         reach = (np.abs(facets.center) + facets.half).max(axis=1)[kind]
         half = 0.5 * np.stack([self.width, self.height], axis=-1)
         outside = (reach > half * 1.001 + 1e-3).any(axis=-1)
         if outside.any():
             k = int(np.flatnonzero(outside)[0])
             raise InputError(
-                f"mirror {k}: a facet reaches {reach[k].max():.3f} m from the middle, but the "
+                f"mirror {k}: a facet reaches {reach[k].max():.3f} m from the centre, but the "
                 f"mirror is {self.width[k]:.3f} × {self.height[k]:.3f} m; correct either"
             )
         return replace(self, facets=facets, kind=np.asarray(kind, dtype=np.int64))
@@ -291,7 +293,7 @@ class Scene:
 
 def _vectors(value: FloatArray, count: int, name: str) -> FloatArray:
     if value.shape not in ((3,), (1, 3), (count, 3)):
-        raise InputError(f"mirrors: {name} of shape {value.shape}; give (3,) or ({count}, 3)")
+        raise InputError(f"mirrors: {name} of shape {value.shape}; expected (3,) or ({count}, 3)")
     return np.ascontiguousarray(np.broadcast_to(value, (count, 3)))
 
 
@@ -311,7 +313,7 @@ def _numbers(name: str, value: npt.ArrayLike, count: int) -> FloatArray:
         raise InputError(f"mirrors: unknown {name!r}; known: {', '.join(_LIMITS)}, pointing")
     numbers = as_float(value)
     if numbers.shape not in ((), (1,), (count,)):
-        raise InputError(f"mirrors: {name} of shape {numbers.shape}; give 1 or {count} numbers")
+        raise InputError(f"mirrors: {name} of shape {numbers.shape}; pass 1 or {count} numbers")
     low, excluded, high, unit = _LIMITS[name]
     wrong = ~((numbers > low if excluded else numbers >= low) & (numbers <= high))
     if wrong.any():

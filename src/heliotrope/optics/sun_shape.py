@@ -106,7 +106,7 @@ class SunShape:
         if not sign or name not in SUN_SHAPES:
             return cls(name)
         if field is None:
-            raise InputError(f"sun shape {shape!r}: {name} takes no number; write {name}")
+            raise InputError(f"sun shape {shape!r}: {name} takes no number; write just {name}")
         try:
             value = float(number)
         except ValueError:
@@ -193,7 +193,7 @@ class SunShape:
         remaining difference.
         """
         if not 1 <= count <= 4:
-            raise InputError(f"sun shape: {count} Gaussians; give 1 to 4")
+            raise InputError(f"sun shape: {count} Gaussians; must be 1 to 4")
         if self.name == "gaussian" or count == 1:
             return Gaussians(np.ones(1), np.array([self.variance]))
         return _fitted(self, count, round(float(np.clip(blur, *_BLURS)), 4))

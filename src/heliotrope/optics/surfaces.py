@@ -178,7 +178,7 @@ class Mesh:
         vertices, faces = as_vectors(self.vertices, f"mesh {self.name}"), np.asarray(self.faces)
         if vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
             raise InputError(
-                f"mesh {self.name}: vertices {vertices.shape} and faces {faces.shape}; give "
+                f"mesh {self.name}: vertices {vertices.shape} and faces {faces.shape}; expected "
                 "(V, 3) and (C, 3)"
             )
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -286,4 +286,4 @@ def _check(name: str, shape: tuple[int, int], **sizes: float) -> None:
         if not (np.isfinite(size) and size > 0.0):
             raise InputError(f"receiver {name}: {what} {size} m must be above 0 and finite")
     if min(shape) < 1:
-        raise InputError(f"receiver {name}: {shape} cells; give at least 1 row and 1 column")
+        raise InputError(f"receiver {name}: {shape} cells; must have at least 1 row and 1 column")

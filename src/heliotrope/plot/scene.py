@@ -59,7 +59,7 @@ def mechanism_3d(
         import plotly.graph_objects as go
     except ImportError:
         raise InputError(
-            "mechanism_3d: plotly is not installed; say pip install 'heliotrope[notebook]'"
+            "mechanism_3d: plotly is not installed; run pip install 'heliotrope[notebook]'"
         ) from None
 
     scene = moving(mechanism, angles, width, height)

@@ -142,6 +142,6 @@ def _ed25519() -> Any:
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError:
         raise InputError(
-            "cryptography is not installed; say pip install 'heliotrope[store]'"
+            "cryptography is not installed; run pip install 'heliotrope[store]'"
         ) from None
     return ed25519

@@ -102,7 +102,7 @@ class Budget:
 def lever(
     point: npt.ArrayLike, camera: npt.ArrayLike, led: npt.ArrayLike, axes: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how measured normals turn when lamp and camera move together, and when the lamp moves.
+    """Return how normals rotate when lamp and camera move together, and when only the lamp moves.
 
     Parameters
     ----------
@@ -113,8 +113,8 @@ def lever(
 
     Returns
     -------
-    Derivatives along the axes by ENU metres, (N, 2, 3) each. Moving the mirror equals moving both
-    the other way.
+    Derivatives along the axes with respect to ENU metres, (N, 2, 3) each. Moving the mirror is
+    equivalent to moving both the opposite way.
     """
     m, across = as_vectors(point, "point"), as_float(axes)
     parts, total = [], np.zeros_like(m)

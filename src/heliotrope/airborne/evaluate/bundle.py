@@ -57,7 +57,7 @@ _OF_MIRROR = 8
 
 @dataclass(frozen=True)
 class Corners:
-    """Corners of mirrors seen in photographs: K rows.
+    """K corners of mirrors seen in photographs.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class State:
     error
         t of each position, m, (P, 3).
     offset
-        b, recorded less true, m, (3,).
+        b, recorded minus true, m, (3,).
     stand
         Poses of the mirrors.
     survey
@@ -195,7 +195,7 @@ class Adjusted:
         Covariance of each mirror's position relative to the mean position of the photographs that
         show it, m², (N, 3, 3): shared by all its reflections.
     common_covariance
-        Part of it that all mirrors share, that of the mean of their positions, m², (3, 3).
+        Part of ``place_covariance`` common to all mirrors, that of their mean position, m², (3, 3).
     residual
         Residuals of the corners, in standard deviations, (K, 2).
     deviation
@@ -223,12 +223,12 @@ class Adjusted:
 def residuals(
     state: State, corners: Corners, *, derivative: bool = True
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Return seen less expected coordinates (K, 2), and the derivatives of the expected ones.
+    """Return observed minus expected coordinates (K, 2), and derivatives of the latter.
 
     Returns
     -------
-    Residuals, and ∂place/∂φ, ∂t, ∂b, ∂δ, ∂ψ, (K, 2, 3) each, and ∂g, (K, 2, 2); no derivatives
-    unless asked for.
+    Residuals, and ∂place/∂φ, ∂t, ∂b, ∂δ, ∂ψ, (K, 2, 3) each, and ∂g, (K, 2, 2); derivatives only on
+    request.
     """
     R = state.rotation[corners.photo]
     M = state.stand.rotation[corners.mirror]
@@ -267,7 +267,7 @@ def adjust(
     recorded, sigma
         Recorded positions and their standard deviations without the common part, ENU m, (P, 3).
     rotations
-        Starting attitudes, right to a few mrad, (P, 3, 3).
+        Initial attitudes, accurate to a few mrad, (P, 3, 3).
     stand
         Mirrors as surveyed and commanded, once for each pose.
     corners
@@ -344,9 +344,9 @@ def _result(
 def _place_covariances(
     layout: _Layout, corners: Corners, solver: "SuperLU"
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of d + δ + b less the mean t of a mirror's photographs, (N, 3, 3).
+    """Return the covariance of d + δ + b minus the mean t of a mirror's photographs, (N, 3, 3).
 
-    The second is that of the mean over all mirrors that were seen, (3, 3).
+    The second result is the covariance of its mean over all mirrors that were seen, (3, 3).
     """
     unit = np.eye(3)
     covariances = np.empty((layout.mirrors, 3, 3))
@@ -470,7 +470,7 @@ def _turns(small: FloatArray) -> FloatArray:
 def _covariance(
     solver: "SuperLU", size: int, parts: Sequence[tuple[int, FloatArray]]
 ) -> FloatArray:
-    """Return the covariance of a sum of three-vectors of unknowns times matrices, (3, 3)."""
+    """Return the covariance of a sum of matrices times three-vectors of unknowns, (3, 3)."""
     unit = np.zeros((size, 3))
     for at, factor in parts:
         unit[at : at + 3] += factor.T

@@ -59,7 +59,7 @@ class Campaign:
             f"{axis} {1e3 * o:+.1f} ± {1e3 * s:.1f}"
             for axis, o, s in zip("ENU", self.offset, self.offset_sigma, strict=True)
         ]
-        return f"common offset of RTK, recorded less true: {', '.join(parts)} mm"
+        return f"common RTK offset, recorded minus true: {', '.join(parts)} mm"
 
     def warnings(self, prior: float) -> list[str]:
         """Return a warning if the offset is far larger than its prior standard deviation, m."""
@@ -67,9 +67,9 @@ class Campaign:
         if size <= 3.0 * prior:
             return []
         line = (
-            f"RTK's common offset is {1e3 * size:.0f} mm, its standard deviation was given as "
-            f"{1e3 * prior:.0f} mm; check the position of the base station, or give a larger "
-            "standard deviation (--rtk-mm)"
+            f"the common RTK offset is {1e3 * size:.0f} mm, but its specified standard deviation "
+            f"is {1e3 * prior:.0f} mm; check the position of the base station, or specify a "
+            "larger standard deviation (--rtk-mm)"
         )
         return [line]
 
@@ -113,13 +113,13 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
         if not flights:
             raise InputError("there is no flight to evaluate")
         first = f"{flights[0].name}: {_cause(problems[0])}".removeprefix(": ")
-        raise InputError(f"no flight of {len(flights)} gives a reflection; the first: {first}")
+        raise InputError(f"none of {len(flights)} flights shows a reflection; the first: {first}")
     offset, covariance = common_offset(done, (priors or Priors()).offset)
     return Campaign(tuple(evaluations), tuple(problems), offset, covariance, len(done))
 
 
 def _cause(lines: Sequence[str]) -> str:
-    """Return the cause of a failed flight: the reason of most of its lines, with an example."""
+    """Return why a flight failed: the most frequent reason among its messages, with an example."""
     reasons = [line for line in lines if line.strip(" :")]
     if not reasons:
         return "its photographs show no reflection of the lamp"
@@ -152,7 +152,7 @@ def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[
             group += near
         group.sort()
         parts = -(-sum(flights[k].corners for k in group) // MOST_CORNERS)
-        # Deal the flights out in turn, so that each part looks from several sides.
+        # Distribute the flights in turn, so that each group has views from several sides.
         groups += [group[i::parts] for i in range(min(parts, len(group)))]
     return groups
 
@@ -190,7 +190,7 @@ def _together(flights: Sequence[FlightData], priors: Priors | None) -> FlightEva
 
 
 def _parts(flights: Sequence[FlightData], joint: FlightEvaluation) -> list[FlightEvaluation]:
-    """Return the flights of a joint evaluation, each with its own rows and photographs."""
+    """Split a joint evaluation into its flights, each with its own mirrors and photographs."""
     if len(flights) == 1:
         return [joint]
     parts, row, photo = [], 0, 0

@@ -33,7 +33,7 @@ class SeenTargets:
     sigma
         Standard deviation of a corner in each direction, px, (T,).
     problem
-        Why there are none; empty if there are.
+        Why there are no targets; empty if there are some.
     """
 
     number: npt.NDArray[np.intp]
@@ -54,7 +54,7 @@ def find_targets(picture: Picture) -> SeenTargets:
         return _none("there is no coded target in it")
     corners = as_float(np.stack(squares)).reshape(-1, 4, 2)
     number = np.asarray(numbers, dtype=np.intp).reshape(-1)
-    # A number that is read twice belongs to a false target, and nobody knows to which.
+    # If a number is read twice, one of the targets is false, and there is no telling which.
     once = np.bincount(number, minlength=NUMBERS)[number] == 1
     large = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min(axis=1) >= SMALLEST
     number, corners = number[once & large], corners[once & large]
@@ -86,8 +86,8 @@ def _read(photo: Photo, camera: LedCamera) -> SeenTargets:
     height, width = picture.shape[:2]
     if (width, height) != camera.size:
         return _none(
-            f"{width} × {height} px, but the camera file says {camera.size[0]} × "
-            f"{camera.size[1]} px; give the file of this camera"
+            f"{width} × {height} px, but the camera file says {camera.size[0]} × {camera.size[1]} "
+            "px; use the file of this camera"
         )
     return find_targets(picture)
 

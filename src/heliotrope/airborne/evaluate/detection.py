@@ -101,7 +101,7 @@ class Overlap:
     own: Rows
 
     def clear(self, places: FloatArray, steps: FloatArray) -> Mask:
-        """Return the mask of profiles across edges, (M, 4, P), from their mirror to the ground.
+        """Return the mask of edge profiles, (M, 4, P), that run from their mirror to the ground.
 
         ``places`` are pixels, (M, 4, P, S, 2); ``steps`` the S distances from the edge, px.
         """
@@ -157,15 +157,17 @@ def decode(path: str | Path) -> Picture:
     try:
         data = read_bytes(file)
     except OSError as error:
-        raise FormatError(file, f"cannot be read ({error.strerror}); give a photograph") from None
+        raise FormatError(
+            file, f"cannot be read ({error.strerror}); specify another photograph"
+        ) from None
     if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]:
-        raise FormatError(file, f"it breaks off after {len(data)} bytes; copy it again")
+        raise FormatError(file, f"the file ends after {len(data)} bytes; copy it again")
     # Its header says how much memory decoding takes.
     read_metadata(file)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if picture is None:
-        raise FormatError(file, "this is no readable image; copy it again")
+        raise FormatError(file, "not a readable image; copy it again")
     return np.asarray(picture, np.uint8)
 
 
@@ -180,7 +182,7 @@ def _linear() -> npt.NDArray[np.float32]:
 
 
 def brightness(picture: Picture, scale: float) -> tuple[Light, Light]:
-    """Return the light of a picture reduced by ``scale``, and the share of blue in it."""
+    """Return the light of a picture reduced by ``scale``, and its fraction of blue."""
     import cv2
 
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -193,10 +195,11 @@ def brightness(picture: Picture, scale: float) -> tuple[Light, Light]:
 def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
     """Return patches of about ``expected`` px² that differ from their surroundings.
 
-    Mirrors show the sky: they are brighter than the ground, or at least bluer. What share of the
-    frame they fill is unknown, so there are several answers, the most likely first: brighter
-    patches for mirrors that fill more than 0.5 %, 0.05 % and 3 %, then bluer ones. Darker patches
-    are shadows, which are arranged like the mirrors, and so are not searched for.
+    Mirrors show the sky, so they are brighter than the ground, or at least bluer. The fraction of
+    the frame that they fill is unknown, so several sets are returned, the most likely first:
+    brighter patches for mirrors that fill more than 0.5 %, 0.05 % and 3 %, then bluer patches.
+    Darker patches are not searched for, because they are shadows, which are arranged like the
+    mirrors.
     """
     import cv2
 
@@ -213,7 +216,7 @@ def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
             )
             closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
             patches = _whole_patches(np.asarray(closed, np.uint8), expected * scale**2)
-            # The centre of a reduced pixel is the middle of the pixels it stands for.
+            # The centre of a reduced pixel is the centre of the pixels that it represents.
             center = (patches.center + 0.5) / scale - 0.5
             answers.append(Patches(center, patches.area / scale**2))
     return tuple(answers)
@@ -263,10 +266,10 @@ def find_outlines(
 ) -> Outlines:
     """Return the outlines of mirrors near the expected ones.
 
-    Profiles across each edge are projected on the colour in which both sides differ most and
-    averaged in eight groups, each of which gives a place of the edge
-    (`heliotrope.airborne.evaluate.edges`). A straight line through them is fitted with weights that
-    reject what is off it, such as a neighbour or a shadow.
+    Profiles across each edge are projected onto the colour in which both sides differ most and
+    averaged in eight groups, each of which yields a position on the edge
+    (`heliotrope.airborne.evaluate.edges`). A straight line is fitted through these positions with
+    weights that reject outliers, such as a neighbour or a shadow.
 
     Parameters
     ----------
@@ -277,11 +280,11 @@ def find_outlines(
     reach
         Largest distance of an edge from the expected one, px.
     profiles
-        Across each edge, a multiple of eight; fewer are quicker.
+        Number of profiles across each edge, a multiple of eight; fewer are faster.
     shown
-        What each pixel shows, if mirrors overlap: only edges against the ground are measured.
+        What each pixel shows, if mirrors overlap; only edges against the ground are then measured.
     printed
-        Whether these are squares on paper, which have no shadow beside them.
+        Whether the outlines are squares printed on paper, which have no shadow beside them.
     """
     count = len(expected)
     if count == 0:
@@ -325,7 +328,7 @@ def find_outlines(
 def _lines(
     points: FloatArray, known: Mask, outward: FloatArray
 ) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return lines a x + b y = c, (M, 4, 3), their error, and which have enough points."""
+    """Return lines a x + b y = c, (M, 4, 3), their errors, and which have enough points."""
     weight = known.astype(np.float64)
     enough = weight.sum(axis=-1) >= 4
     weight = np.where(enough[..., None], weight, 1.0)
@@ -367,7 +370,7 @@ def _crossings(lines: FloatArray) -> FloatArray:
 def find_spots(
     picture: Picture, corners: FloatArray, most: int = 12, shown: Overlap | None = None
 ) -> tuple[Spots, tuple[str, ...]]:
-    """Return the lamp's spots on mirrors, and for each mirror the reason why it gives none, or "".
+    """Return the lamp's spots on mirrors, and why each mirror shows none ("" if it does).
 
     Parameters
     ----------
@@ -376,9 +379,10 @@ def find_spots(
     corners
         Corners of the mirrors, px, (M, 4, 2).
     most
-        A mirror with more spots than this is left out as "cluttered": they are not the lamp's.
+        A mirror with more spots than this is skipped as "cluttered", because the spots are not the
+        lamp's.
     shown
-        What each pixel shows, if mirrors overlap: hidden parts are not searched.
+        What each pixel shows, if mirrors overlap; hidden parts are not searched.
     """
     spots: list[tuple[int, FloatArray, float, float, int]] = []
     reasons = []
@@ -400,7 +404,7 @@ def find_spots(
 def _spots_of(
     picture: Picture, outline: FloatArray, shown: Overlap | None, k: int
 ) -> tuple[list[tuple[FloatArray, float, float, int]], str]:
-    """Return centre, sigma, flux and clipped pixels of a mirror's spots, or why there are none."""
+    """Return centre, sigma, flux and clipped pixels of a mirror's spots, or why it has none."""
     import cv2
 
     tall, width = picture.shape[:2]
@@ -460,13 +464,12 @@ def _own_peaks(
     inside: npt.NDArray[np.uint8],
     whole: npt.NDArray[np.uint8],
 ) -> list[tuple[int, int, float, npt.NDArray[np.uint8]]]:
-    """Return row, column, height and mask of the peaks that are a mirror's own.
+    """Return row, column, height and mask of the peaks that belong to a mirror.
 
-    Where a brighter mirror adjoins, its blurred edge raises the corner of this one, most of all
-    between dark ground; and half of a spot on the mirror behind is seen over the edge of this one.
-    A true spot is the brightest place around it in the whole picture, whatever is shown there, and
-    that place is on the mirror: on the part that is searched, ``inside``, or in ``whole`` beside
-    the ground.
+    The blurred edge of a brighter neighbour brightens this mirror's corner, most of all beside dark
+    ground, and half of a spot on the mirror behind is visible over this mirror's edge. A true spot
+    is the brightest point of its surroundings in the whole picture, and that point is on this
+    mirror: in the searched part, ``inside``, or beside the ground in ``whole``.
     """
     import cv2
 
@@ -481,7 +484,7 @@ def _own_peaks(
         a, b = np.unravel_index(int(np.argmax(part)), part.shape)
         top = first[0] + int(a), first[1] + int(b)
         if whole[top] and smooth[top] >= around[top]:
-            # Only a peak beside the part that is searched needs more of the mirror.
+            # Only a peak beside the searched part needs more of the mirror.
             tops.setdefault(top, (float(raised[i, j]), inside if inside[top] else whole))
     return [(*place, *peak) for place, peak in tops.items()]
 
@@ -489,7 +492,7 @@ def _own_peaks(
 def _without(
     held: npt.NDArray[np.uint8], place: tuple[int, int], others: list[tuple[int, int]]
 ) -> npt.NDArray[np.uint8]:
-    """Return a mask without the light of other spots near the one at ``place``."""
+    """Remove the light of other spots near ``place`` from a mask."""
     rows, columns = np.arange(held.shape[0])[:, None], np.arange(held.shape[1])
     mine = (rows - place[0]) ** 2 + (columns - place[1]) ** 2
     for a, b in others:

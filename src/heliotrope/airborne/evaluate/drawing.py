@@ -1,4 +1,4 @@
-"""Small SVG drawings, each made in a few milliseconds; a flight report contains hundreds.
+"""Small SVG drawings, each produced in a few milliseconds; a flight report contains hundreds.
 
 Matplotlib needs 0.4 s for one such picture, most of it for text. Here the browser sets the text,
 and every point can have a tooltip.
@@ -34,7 +34,7 @@ class Panel:
     Attributes
     ----------
     left, top, width, height
-        Place and size of the frame, px.
+        Position and size of the frame, px.
     x, y
         Lowest and highest value shown.
     title, across, up
@@ -67,7 +67,7 @@ class Panel:
         return self
 
     def place(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Return values as px from the frame's upper left corner, (..., 2)."""
+        """Convert values to pixels from the frame's upper left corner, (..., 2)."""
         across = (as_float(x) - self.x[0]) / (self.x[1] - self.x[0]) * self.width
         down = (self.y[1] - as_float(y)) / (self.y[1] - self.y[0]) * self.height
         return np.stack(np.broadcast_arrays(across, down), axis=-1)
@@ -138,7 +138,7 @@ class Panel:
             self.parts.append(SvgElement("rect", drawn))
 
     def text(self, x: float, y: float, text: str, colour: str = "#666") -> None:
-        """Write beside a point."""
+        """Write text beside a point."""
         a, b = self.place(x, y)
         place = {"x": f"{a + 4:.1f}", "y": f"{b - 4:.1f}", "fill": colour}
         self.parts.append(SvgElement("text", place, text=text))
@@ -169,7 +169,7 @@ class Panel:
 
 
 def drawing(panels: Sequence[Panel], width: float, height: float, title: str) -> str:
-    """Return panels as one SVG drawing, for a page or a file of its own."""
+    """Return panels as one SVG drawing, to embed in a page or store as a file."""
     return render(
         "heliotrope.airborne.evaluate",
         "drawing.svg.j2",
@@ -181,7 +181,7 @@ def drawing(panels: Sequence[Panel], width: float, height: float, title: str) ->
 
 
 def around(values: npt.ArrayLike, share: float = 0.08) -> tuple[float, float]:
-    """Return the range of the finite values (...), widened by a share of it at both ends."""
+    """Return the range of the finite values (...), widened by a fraction at both ends."""
     finite = as_float(values)
     finite = finite[np.isfinite(finite)]
     if not len(finite):

@@ -44,7 +44,7 @@ def cross_edges(
     colour
         Light across each of the four edges of M mirrors in P profiles, (M, 4, P, S, 3).
     steps
-        Places along a profile, outwards from the expected edge, px, (S,).
+        Positions along a profile, outwards from the expected edge, px, (S,).
     reach
         Largest distance of an edge from the expected one, px.
     clear
@@ -52,7 +52,7 @@ def cross_edges(
     groups
         Groups G in which profiles are averaged.
     fitted
-        Whether edges are fitted; otherwise they are where the slope has its middle.
+        Whether edges are fitted; otherwise they are placed at the centre of the slope.
     """
     inner, outer = steps < -reach, steps > reach
     share = clear / np.maximum(clear.sum(axis=-1, keepdims=True), 1)
@@ -100,7 +100,7 @@ def _fit_edges(
     start
         First estimate, (M, 4, G); kept where the fit fails.
     contrast
-        Inner less outer light of each edge, (M, 4).
+        Inner minus outer light of each edge, (M, 4).
     """
     flat = profile.reshape(-1, len(steps))
     first = start.reshape(-1)
@@ -114,7 +114,8 @@ def _fit_edges(
     for side in (0, 1):
         these = good & (pair == side)
         if these.any():
-            # Shadows beside an edge leave more of it unexplained: the blur is that of the others.
+            # Shadows beside an edge increase its residuals, so the blur is taken from the other
+            # edges.
             rest = np.sqrt(np.mean(gap**2, axis=1))
             even = these & (rest <= np.median(rest[these]))
             blur[pair == side] = np.median(alone[even, 3])
@@ -122,14 +123,15 @@ def _fit_edges(
     near, _ = _fit(flat, steps, first, blur, _OUTSIDE, free=False)
     measured = usable.reshape(start.shape)
     uneven = _uneven(gap.reshape(profile.shape), measured)[measured.any(axis=-1)]
-    # All edges of a photograph alike: if some mirrors seemed larger than others, it would turn.
+    # Treat all edges of a photograph alike: if some mirrors appeared larger than others, the
+    # photograph would rotate.
     fits = near if uneven.size >= _ENOUGH and uneven.mean() > _MANY else whole
     kept = usable & _plausible(fits, first, jump)
     return as_float(np.where(kept, fits[:, 2], first)).reshape(start.shape)
 
 
 def _uneven(gap: FloatArray, usable: Mask) -> Mask:
-    """Return the mask of edges (M, 4) that leave more than noise in all groups, (M, 4, G, S)."""
+    """Return the mask of edges (M, 4) whose residuals exceed noise in all groups, (M, 4, G, S)."""
     count = np.maximum(usable.sum(axis=-1), 1)
     kept = np.where(usable[..., None], gap, 0.0)
     mean = kept.sum(axis=2) / count[..., None]
@@ -140,7 +142,7 @@ def _uneven(gap: FloatArray, usable: Mask) -> Mask:
 
 
 def _plausible(fits: FloatArray, first: FloatArray, jump: FloatArray) -> Mask:
-    """Return the mask of fits (K, 4) of an edge near the first estimate, (K,)."""
+    """Return the mask (K,) of fits (K, 4) that put the edge near the first estimate."""
     with np.errstate(invalid="ignore"):
         near = np.abs(fits[:, 2] - first) < _FARTHEST
         strong = fits[:, 1] > _WEAKEST * jump
@@ -157,9 +159,9 @@ def _fit(
     *,
     free: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return L, A, x₀ and s of profiles (K, S), (K, 4), and the residuals relative to A, (K, S).
+    """Fit L, A, x₀ and s to profiles (K, S); return them, (K, 4), and the residuals over A.
 
-    Gauss and Newton; s only where it is free.
+    The fit is a Gauss-Newton iteration; s is fitted only where it is free.
     """
     from scipy.special import ndtr
 

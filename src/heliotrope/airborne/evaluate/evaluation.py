@@ -1,4 +1,4 @@
-"""Evaluates one pose of a field: what photographs show becomes reflections on mirrors.
+"""Evaluates one pose of a field: converts photographs to reflections on mirrors.
 
 All photographs together determine the exterior orientation of each photograph and the common RTK
 offset (`heliotrope.airborne.evaluate.bundle`). Then the ray of each spot is intersected with its
@@ -108,7 +108,7 @@ def evaluate(
             lines = tuple(s.why_unused() for s in seen if s.problem)
             return _evaluate_dark(*own, camera, stand, shape, known, lines)
         first = f"; the first: {problems[0]}" if problems else ""
-        raise InputError(f"no photograph of {len(seen)} can be used{first}")
+        raise InputError(f"none of {len(seen)} photographs can be used{first}")
     recorded, used = [photos[k] for k in good], [seen[k] for k in good]
     corners = corners_of(used)
     adjusted = adjust_photos(recorded, used, camera, stand, known, owner)
@@ -164,7 +164,7 @@ def _evaluate_dark(
         priors.offset**2 * np.eye(3),
         np.full(position.shape, np.nan),
         places,
-        # The turn that all photographs share is nearly all of it.
+        # The rotation common to all photographs dominates.
         places.mean(axis=0),
         np.empty((0, 2)),
         float("nan"),
@@ -216,9 +216,9 @@ def adjust_photos(
     priors: Priors,
     owner: npt.ArrayLike | None = None,
 ) -> Adjusted:
-    """Return the adjustment of photographs that show corners.
+    """Adjust photographs that show corners.
 
-    The priors are widened by what the edges of mirrors may be off. If the corners scatter more or
+    The priors are widened by the possible error of the mirror edges. If the corners scatter more or
     less than stated, the adjustment is repeated with their standard deviations rescaled.
     """
     corners = corners_of(readings)
@@ -245,7 +245,7 @@ def disagrees(adjusted: Adjusted) -> bool:
 def _local_shifts(adjusted: Adjusted, corners: Corners, photos: int, mirrors: int) -> FloatArray:
     """Return the mean residual of each mirror's corners in each photograph, (P, N, 2).
 
-    Errors of the lens model displace a mirror and the spots on it alike.
+    Errors of the lens model displace a mirror and its spots equally.
     """
     kept = ~adjusted.outlier
     gap, _ = residuals(adjusted.state, corners, derivative=False)

@@ -251,17 +251,17 @@ def evaluate_flight(
 
 
 def _turned(flight: FlightData, named: Matches) -> FlightData:
-    """Return a flight with the attitudes that a person's places give."""
+    """Return a flight with the attitudes that follow from positions named by a user."""
     photos, problems = turn_by_hand(flight.photos, flight.camera, flight.stand, named, flight.name)
     return replace(flight, photos=photos, problems=(*flight.problems, *problems))
 
 
 def _missing_photographs(named: Matches, flights: Sequence[FlightData]) -> list[str]:
-    """Return a line for each photograph that is named but not there."""
+    """Return a message for each photograph that is named but does not exist."""
     present = {name for f in flights for p in f.photos for name in (p.name, f"{f.name}/{p.name}")}
     missing = dict.fromkeys(name for name in named.photo if name not in present)
     return [
-        f"{named.path.name}: there is no photograph {name!r}; its places are not used"
+        f"{named.path.name}: there is no photograph {name!r}; its rows are ignored"
         for name in missing
     ]
 
@@ -273,7 +273,7 @@ def read_flight(
     client: "Client | None" = None,
     progress: Progress | None = None,
 ) -> FlightData:
-    """Return a flight with what its photographs show; see `evaluate_flight`."""
+    """Return a flight with the readings of its photographs; see `evaluate_flight`."""
     what = f"reading {flight.name}".strip()
     readings = read_many(
         flight.photos,
@@ -290,7 +290,7 @@ def read_flight(
 def _measure(
     flight: FlightData, evaluation: FlightEvaluation, budget: Budget, axis: Mean
 ) -> FlightResult:
-    """Measure the mirrors of one flight where the photographs showed them to stand."""
+    """Measure the mirrors of one flight at the positions found in the photographs."""
     orientations = measure_field(
         evaluation.reflections,
         flight.stand.names,

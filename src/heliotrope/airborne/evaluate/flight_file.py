@@ -25,14 +25,14 @@ LENS = 1e-4
 
 @dataclass(frozen=True)
 class _Group:
-    """The flights of one bundle adjustment, whose middle the focal length displaces mirrors from.
+    """The flights of one bundle adjustment; focal-length errors shift mirrors radially.
 
     Attributes
     ----------
     adjusted
         The adjustment.
     place
-        First of its shared errors.
+        Index of its first shared error.
     middle
         Mean position of its mirrors, ENU, m, (3,).
     """
@@ -52,8 +52,8 @@ def flight_document(
     result
         The campaign.
     name
-        Unique in the plant that is to take it; "": the time of the first photograph, and the
-        plant's name.
+        Name, unique in the plant that will import it; "": time of the first photograph and name of
+        the plant.
     lens
         Relative standard deviation of the focal length.
     """
@@ -114,7 +114,8 @@ def _row(flight: FlightResult, o: Orientation, group: _Group, count: int, at: fl
     away = across @ (o.vertex - group.middle)
     shift = np.zeros((3, count))
     shift[:, group.place : group.place + 3] = np.eye(3)
-    # A mirror that seems further out is further out as seen from the drone: the drone is back.
+    # A mirror that appears farther out is farther from the drone's axis, so the drone is farther
+    # back.
     shift[:, -1] = -away
     return FlightRow(
         heliostat=flight.measured.found.names[o.heliostat],

@@ -171,7 +171,7 @@ def open_flight(
     folder, plant, camera, commands, cluster, point
         See `open_flights`.
     shape
-        Gives the surface of a heliostat by its name.
+        Function that returns the surface of a heliostat by name.
     """
     site = plant.site
     photos, problems = read_photos(folder, (site.latitude_deg, site.longitude_deg, site.height))
@@ -211,12 +211,12 @@ def natural_key(name: str) -> list[tuple[str, int]]:
 
 
 def designed_shape(plant: Plant, focal: float = np.inf) -> Callable[[str], MirrorShape]:
-    """Return a function that gives the designed surface of a heliostat by its name."""
+    """Return a function that returns the designed surface of a heliostat by name."""
     return lambda name: ideal(*plant.find(name), focal=focal)
 
 
 class _Surfaces:
-    """Surfaces of heliostats by name, each slope map read once; notes maps that are missing."""
+    """Surfaces of heliostats by name; reads each slope map once and records missing maps."""
 
     def __init__(self, plant: Plant, slopes: Path | None, focal: float) -> None:
         self._designed, self._folder = designed_shape(plant, focal), slopes
@@ -240,7 +240,7 @@ class _Surfaces:
 
     @property
     def missing(self) -> list[str]:
-        """A line for each heliostat without a slope map.
+        """A message for each heliostat without a slope map.
 
         Raises
         ------
@@ -252,7 +252,7 @@ class _Surfaces:
                 f"{self._folder}: there is no slope map in it; name the files after heliostats, "
                 f"{self._without[0]}.npz"
             )
-        return [f"{self._folder}: no slope map of {n}; taken as ideal" for n in self._without]
+        return [f"{self._folder}: no slope map of {n}; assumed ideal" for n in self._without]
 
 
 def _has_photos(folder: Path) -> bool:

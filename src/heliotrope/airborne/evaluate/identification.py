@@ -77,9 +77,9 @@ class Identified:
 def expected_size(
     camera: LedCamera, photo: Photo, stand: MirrorPoses, gimbal: float = GIMBAL
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return the sides of mirrors as a photograph shows them, px, and which may be in it, (M,).
+    """Return the apparent sides of mirrors, px, and which of them may be in the frame, (M,).
 
-    The side is the root of the area. A mirror may be in the frame if an error of the gimbal can
+    The side is the square root of the area. A mirror may be in the frame if a gimbal error can
     bring it there.
     """
     local = (stand.corners - photo.position) @ photo.rotation
@@ -132,17 +132,20 @@ def identify(
     patches
         Centres of patches, px, (K, 2).
     far
-        Whether to search attitudes up to `FAR_GIMBAL` away where the mirrors fit badly. One that
-        fits clearly better counts.
+        Whether to search attitudes up to `FAR_GIMBAL` away if the mirrors fit badly; a clearly
+        better fit is accepted.
     """
     none = np.empty(0, dtype=np.intp)
     _, visible = expected_size(camera, photo, stand)
     rows = np.flatnonzero(visible)
     if len(rows) < FEWEST:
-        text = f"wrong_field: {len(rows)} mirrors of the field can be in it; is this the right one?"
+        text = (
+            f"wrong_field: {len(rows)} mirrors of the field can be in view; check that this is "
+            "the right field"
+        )
         return Identified(photo.rotation, none, none, text)
     if len(patches) < FEWEST:
-        text = f"nothing: {len(patches)} patches look like mirrors, {FEWEST} are needed"
+        text = f"nothing: only {len(patches)} patches look like mirrors; {FEWEST} are needed"
         return Identified(photo.rotation, none, none, text)
     tried = _search(camera, photo, stand, rows, patches, (photo.rotation,))
     near, fit = _choose(tried, photo, camera, stand, rows, len(patches))
@@ -159,7 +162,7 @@ def _search(
     patches: FloatArray,
     about: Sequence[FloatArray],
 ) -> "list[_Tried]":
-    """Return the solutions within `GIMBAL` of some attitudes; their mirrors count in ``rows``."""
+    """Return solutions within `GIMBAL` of some attitudes, with mirrors as indices into ``rows``."""
     side, _ = expected_size(camera, photo, stand)
     directions = stand.corners[rows].mean(axis=1) - photo.position
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -182,7 +185,7 @@ def _farther(
     near: Identified,
     fit: "_Fit | None",
 ) -> Identified:
-    """Return an attitude far from the gimbal's if it fits clearly better than the near one."""
+    """Return an attitude far from the gimbal's if it fits clearly better than a near one."""
     none = np.empty(0, dtype=np.intp)
     _, visible = expected_size(camera, photo, stand, FAR_GIMBAL)
     rows = np.flatnonzero(visible)
@@ -209,7 +212,7 @@ def _farther(
         text = (
             f"ambiguous: {len(fit.solution.mirror)} mirrors match badly, {100 * fit.apart:.0f} % "
             f"of a side apart and {100 * fit.matched:.0f} % of all; the gimbal may be more than "
-            f"{np.degrees(GIMBAL):.0f}° off: check its angles"
+            f"{np.degrees(GIMBAL):.0f}° off; check the gimbal angles"
         )
         return Identified(photo.rotation, none, none, text, shifted=True)
     return near
@@ -217,7 +220,7 @@ def _farther(
 
 @dataclass(frozen=True)
 class _Tried:
-    """A solution: how closely it fits, its attitude, and pairs of a mirror and a patch.
+    """A solution: its attitude, its pairs of a mirror and a patch, and how well it fits.
 
     ``apart``: their RMS distance, in mirrors' sides.
     """
@@ -256,7 +259,7 @@ def _starts(
             ranked.append((float(votes[i, j]), total))
             votes[max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3] = 0.0
     ranked.sort(key=lambda f: -f[0])
-    # Neighbouring turns vote for the same solution: keep different ones.
+    # Neighbouring rotations vote for the same solution, so keep only distinct ones.
     apart = max(0.7 * size, 2.2 * GIMBAL / (_TURNS - 1))
     kept: list[FloatArray] = []
     for _, start in ranked:
@@ -295,21 +298,21 @@ def _refine(
 
 @dataclass(frozen=True)
 class _Fit:
-    """A solution with how well it fits.
+    """A solution and its quality of fit.
 
     Attributes
     ----------
     one
         The solution.
     merit, evidence
-        Mirrors that match closely, less those and patches left over; with and without the
-        penalty of an unusual gimbal.
+        Number of closely matching mirrors minus unmatched mirrors and patches, with and without the
+        penalty for an unusual gimbal angle.
     inside
         Mirrors that should be in the frame.
     matched
-        Share of those, and of the patches, that match: the smaller one.
+        Fraction of these mirrors, or of the patches, that match, whichever is smaller.
     left
-        Mirrors without a patch, or patches without a mirror, over the pairs: the fewer ones.
+        Unmatched mirrors or unmatched patches, whichever are fewer, divided by the number of pairs.
     apart
         RMS distance of patches from their mirrors, in mirrors' sides.
     """
@@ -328,7 +331,7 @@ class _Fit:
         return self.apart < _BAD_FIT and self.matched > _GOOD_SHARE
 
     def differs(self, other: "_Fit") -> bool:
-        """Return whether another solution gives most mirrors other names."""
+        """Return whether another solution assigns different names to most mirrors."""
         pairs = [
             set(zip(f.solution.patch.tolist(), f.solution.mirror.tolist(), strict=True))
             for f in (self, other)
@@ -384,8 +387,8 @@ def _choose(
     if best.score < LEAST_SHARE * ranked[0].inside:
         text = (
             f"wrong_field: {len(best.mirror)} patches match the {ranked[0].inside} mirrors of the "
-            "field that should be in it; check the field, the commands that were given, and the "
-            f"angles of the gimbal ({np.degrees(GIMBAL):.0f}° off are found)"
+            "field that should be in it; check the field, the commands, and the gimbal angles "
+            f"({np.degrees(GIMBAL):.0f}° off are found)"
         )
         return Identified(photo.rotation, none, none, text), None
     for other in ranked[1:]:
@@ -409,12 +412,12 @@ def rotation_angle(a: FloatArray, b: FloatArray) -> float:
 
 
 def is_dark(picture: Picture) -> bool:
-    """Return whether nothing but lights can be seen in a picture."""
+    """Return whether only lights are visible in a picture."""
     return bool(np.median(picture[::8, ::8]) < DARK_READING)
 
 
 def expected_feet(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[FloatArray, Rows]:
-    """Return where mirrors in expected poses show the lamp, (K, 3), and their rows, (K,)."""
+    """Return where mirrors in expected poses show the lamp, (K, 3), and their indices, (K,)."""
     between = photo.position + 0.5 * (photo.led_position(camera) - photo.position)
     local = np.einsum("nji,nj->ni", stand.rotation, between - stand.vertex)
     half = 0.5 * np.ptp(stand.outline[..., :2], axis=1)
@@ -438,7 +441,10 @@ def find_lights(
     none = np.empty(0, dtype=np.intp)
     identified = Identified(photo.rotation, none, none)
     if len(spots) < FEWEST:
-        text = f"nothing: it is dark and shows {len(spots)} lights, {FEWEST} are needed"
+        text = (
+            f"nothing: the photograph is dark and shows only {len(spots)} lights; {FEWEST} are "
+            "needed"
+        )
         return replace(identified, reason=text), spots
     if not photo.by_hand:
         identified = identify(
@@ -446,8 +452,8 @@ def find_lights(
         )
     if identified.reason:
         text = (
-            f"ambiguous: it is dark, and its {len(spots)} lights cannot be assigned to mirrors; "
-            "check the field and the commands that were given"
+            f"ambiguous: the photograph is dark, and its {len(spots)} lights cannot be assigned "
+            "to mirrors; check the field and the commands"
         )
         return replace(identified, reason=text), spots
     mirror = _mirrors_of(undistort(camera, spots.pixel), photo, identified.rotation, stand)

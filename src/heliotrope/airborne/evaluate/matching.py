@@ -34,7 +34,7 @@ _OFF = 0.4
 
 @dataclass(frozen=True)
 class Matches:
-    """K places in photographs that a person has named.
+    """K positions in photographs named by a user.
 
     Attributes
     ----------
@@ -45,9 +45,9 @@ class Matches:
     heliostat
         Name of the heliostat, (K,).
     corner
-        What is seen there: one of `CORNERS`, `MIDDLE` or `LIGHT`, (K,).
+        What is visible there: one of `CORNERS`, `MIDDLE` or `LIGHT`, (K,).
     pixel
-        Where, px; the centre of the first pixel is (0, 0), (K, 2).
+        Position, px; the centre of the first pixel is (0, 0), (K, 2).
     """
 
     path: Path
@@ -66,7 +66,7 @@ class Matches:
 
 
 def read_matches(path: str | Path, names: Sequence[str]) -> tuple[Matches, list[str]]:
-    """Return the places that a table names, and a line for each row that was left out.
+    """Return the positions in a table, and a message for each row that was left out.
 
     Rows without a heliostat are skipped: they are outlines without a name. An empty
     ``corner`` is the middle of the mirror.
@@ -74,14 +74,14 @@ def read_matches(path: str | Path, names: Sequence[str]) -> tuple[Matches, list[
     Parameters
     ----------
     path
-        CSV with `COLUMNS`; others are not read.
+        CSV with `COLUMNS`; other columns are ignored.
     names
         Names of the plant's heliostats.
 
     Raises
     ------
     FormatError
-        If it cannot be read, lacks a column, or names nothing.
+        If the table cannot be read, lacks a column, or names no mirror.
     """
     rows = read_rows(Path(path), "a table of mirrors named in photographs")
     rows.need([name for name in COLUMNS if name != "corner"])
@@ -111,7 +111,7 @@ def _corners(rows: Rows) -> list[str]:
     for k, text in enumerate(rows.texts("corner")):
         name = " ".join(text.replace("_", " ").split()).casefold() or MIDDLE
         if name not in known:
-            rows.refuse(k, "corner", f"{text!r} is none of {', '.join(known)}")
+            rows.refuse(k, "corner", f"{text!r} is not one of {', '.join(known)}")
         names.append(name)
     return names
 
@@ -123,7 +123,7 @@ def turn_by_hand(
     matches: Matches,
     flight: str = "",
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Return photographs with the attitudes that a person's places give, and the problems.
+    """Return photographs with attitudes from positions named by a user, and the problems.
 
     Parameters
     ----------
@@ -134,13 +134,14 @@ def turn_by_hand(
     stand
         All mirrors in their expected poses.
     matches
-        Places that were named.
+        Named positions.
     flight
         Name of the flight; empty if it is the only one.
 
     Returns
     -------
-    The photographs, those with places `by_hand`, and a line for each whose places were not used.
+    The photographs, marked `by_hand` if they have named positions, and a message for each
+    photograph whose positions were not used.
     """
     turned, problems = [], []
     for photo in photos:
@@ -160,12 +161,15 @@ def _turned(
     matches: Matches,
     rows: npt.NDArray[np.intp],
 ) -> Photo | str:
-    """Return a photograph with the attitude of its places, or why they give none."""
+    """Return a photograph with the attitude from its named positions, or why it has none."""
     unknown = [matches.heliostat[k] for k in rows if matches.heliostat[k] not in stand.names]
     if unknown:
         return f"heliostat {unknown[0]} was not commanded in this flight; correct the name"
     if len(rows) < FEWEST:
-        return f"{len(rows)} place is named, {FEWEST} are needed and 3 show a wrong name; name more"
+        return (
+            f"{len(rows)} place is named; {FEWEST} are needed, and 3 to detect a wrong name; name "
+            "more"
+        )
     plane = undistort(camera, matches.pixel[rows])
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -182,7 +186,7 @@ def _turned(
         directions = points - photo.position
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         if float(np.linalg.svd(directions - directions.mean(axis=0))[1][0]) < 1e-3:
-            return "its places are all at one point; name mirrors farther from each other"
+            return "all its places coincide; name mirrors that are farther apart"
         current = photo.moved(photo.position, nearest_rotation(directions, rays))
     gap = np.linalg.norm(current.pixels(camera, points) - matches.pixel[rows], axis=-1)
     side = np.sqrt(quad_area(current.pixels(camera, stand.corners[mirrors])))
@@ -191,8 +195,8 @@ def _turned(
     if not off[worst] < _OFF:
         name, corner = matches.heliostat[rows[worst]], matches.corner[rows[worst]]
         return (
-            f"{name}, {corner}, is {gap[worst]:.0f} px from where the other places put it; "
-            "correct its name or its place"
+            f"{name}, {corner}, is {gap[worst]:.0f} px from the position that the other places "
+            "imply; correct its name or its place"
         )
     return replace(current, by_hand=True)
 
@@ -200,7 +204,7 @@ def _turned(
 def _point(
     photo: Photo, camera: LedCamera, stand: MirrorPoses, row: int, corner: str
 ) -> FloatArray:
-    """Return the point that a place shows, ENU metres, (3,)."""
+    """Return the point that a named position shows, ENU metres, (3,)."""
     if corner in CORNERS:
         return as_float(stand.corners[row, CORNERS.index(corner)])
     if corner == LIGHT:

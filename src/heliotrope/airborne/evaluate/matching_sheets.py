@@ -33,7 +33,7 @@ _TICK, _NUMBER = 100, 500
 
 @dataclass(frozen=True)
 class Sheets:
-    """What was written: the pictures, the table, and the number of outlines of each picture."""
+    """The files written: pictures, table, and the number of outlines in each picture."""
 
     pictures: tuple[Path, ...]
     table: Path
@@ -48,19 +48,20 @@ def write_sheets(flights: "Sequence[FlightData]", names: Sequence[str], out: Pat
     flights
         Flights whose photographs have been read.
     names
-        Names of photographs, NAME or FLIGHT/NAME; none: all in which no mirror was identified.
+        Names of photographs, NAME or FLIGHT/NAME; if empty, all in which no mirror was identified.
     out
         Folder.
 
     Raises
     ------
     InputError
-        If there is nothing to name, a photograph is unknown, or the folder has a table already.
+        If there is nothing to name, a photograph is unknown, or the folder already contains a
+        table.
     """
     table = out / "matches.csv"
     if table.exists():
         raise InputError(
-            f"{table}: there is one already, perhaps with names in it; move it, or give --out"
+            f"{table}: this file already exists and may contain names; move it, or use --out"
         )
     chosen = _chosen(flights, names)
     pictures, counts, rows = [], [], []
@@ -97,21 +98,21 @@ def _chosen(
         unnamed = [(f, p) for f, p, reading in every if reading.nameable]
         if not unnamed:
             raise InputError(
-                "the mirrors of all photographs are identified, or cannot be seen; nothing is to "
-                "be named. --photo NAME writes the picture of a certain photograph"
+                "the mirrors in all photographs are identified or not visible, so there is "
+                "nothing to name. --photo NAME writes the picture of a specific photograph"
             )
         return unnamed
     chosen = []
     for name in names:
         mine = [(f, p) for f, p, _ in every if name in (p.name, f"{f.name}/{p.name}")]
         if not mine:
-            raise InputError(f"--photo: there is no photograph {name}; give the name of a file")
+            raise InputError(f"--photo: there is no photograph {name}; use the name of a file")
         chosen += mine
     return chosen
 
 
 def _patches(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPoses) -> Patches:
-    """Return the patches that may be mirrors: the most, if not far more than there are mirrors."""
+    """Return the largest set of patches that is not far larger than the number of mirrors."""
     side, near = expected_size(camera, photo, stand)
     if not near.any():
         return Patches(np.empty((0, 2)), np.empty(0))

@@ -37,7 +37,7 @@ Rows = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Turned:
-    """A dark flight, as its lights show it.
+    """The result of a dark flight, derived from its lights.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Turned:
     reflections
         Reflections of all spots.
     common
-        Covariance of the turn that all photographs and mirrors share, rad², (3, 3).
+        Covariance of the rotation common to all photographs and mirrors, rad², (3, 3).
     """
 
     photos: tuple[Photo, ...]
@@ -62,12 +62,12 @@ class Turned:
         Parameters
         ----------
         place
-            Standard deviation of the mirrors' positions as seen from the drone, m: the
-            photographs say nothing more about them.
+            Standard deviation of the mirrors' positions relative to the drone, m; the photographs
+            do not improve it.
 
         Notes
         -----
-        A turn ω of the photographs moves a mirror at d by ω × d.
+        A rotation ω of the photographs moves a mirror at d by ω × d.
         """
         middle = as_float([p.position for p in self.photos]).mean(axis=0)
         away = self.stand.vertex - middle
@@ -97,7 +97,7 @@ def turn_together(
     stand
         Mirrors as commanded.
     shape
-        Gives the surface of a mirror's row; slopes do not matter here.
+        Function that returns the surface of a mirror by index; slopes do not matter here.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def turn_together(
     """
 
     def found_by(photos: Sequence[Photo], mirrors: MirrorPoses) -> Reflections:
-        # The common turn moves lights beside the mirrors they lie on.
+        # The common rotation can move lights off the mirrors they belong to.
         return spot_reflections(photos, readings, camera, mirrors, shape, beside=BESIDE)
 
     now, mirrors = list(photos), stand
@@ -126,7 +126,7 @@ def turn_together(
         if np.abs(mirrors.rotation - before.rotation).max() < _STILL:
             break
     off = np.cross(stand.rotation[rows, :, 2], mirrors.rotation[rows, :, 2])
-    # Each mirror gives two components; the common turn takes three of their sum.
+    # Each mirror provides two components; the common rotation uses three of the total.
     variance = float(np.sum(off**2)) / max(2 * len(rows) - 3, 1)
     common = as_float(variance * np.linalg.inv(_lever(stand, rows)))
     return Turned(tuple(now), mirrors, found_by(now, mirrors), common)
@@ -140,7 +140,7 @@ def _lever(stand: MirrorPoses, rows: Rows) -> FloatArray:
 def _attitudes(
     photos: Sequence[Photo], reflections: Reflections, stand: MirrorPoses, shape: ShapeOf
 ) -> list[Photo]:
-    """Turn each photograph so that its lights are seen along the normals of the mirrors."""
+    """Rotate each photograph so that its lights are seen along the mirror normals."""
     rays, targets = np.empty((len(reflections), 3)), np.empty((len(reflections), 3))
     for row in np.unique(reflections.heliostat).tolist():
         mine = np.flatnonzero(reflections.heliostat == row)
@@ -166,7 +166,7 @@ def _attitudes(
 
 
 def _orientations(stand: MirrorPoses, reflections: Reflections, shape: ShapeOf) -> MirrorPoses:
-    """Turn each mirror by the median difference of its lights."""
+    """Rotate each mirror by the median difference of its lights."""
     turns = stand.rotation.copy()
     for row in np.unique(reflections.heliostat).tolist():
         own = reflections.of(row)
@@ -178,7 +178,7 @@ def _orientations(stand: MirrorPoses, reflections: Reflections, shape: ShapeOf) 
 def _as_commanded(
     photos: Sequence[Photo], mirrors: MirrorPoses, stand: MirrorPoses, rows: Rows
 ) -> tuple[list[Photo], MirrorPoses]:
-    """Turn everything together so that the mirrors stand as commanded on average."""
+    """Rotate everything together so that, on average, the mirrors are oriented as commanded."""
     off = np.cross(stand.rotation[rows, :, 2], mirrors.rotation[rows, :, 2])
     common = np.linalg.solve(_lever(stand, rows), off.sum(axis=0))
     back = rotation(-common, float(np.linalg.norm(common)))

@@ -62,12 +62,12 @@ class FacetMean:
     Attributes
     ----------
     facet, count
-        Its number, and how many points it has: without outliers, unless most of them are.
+        Facet index, and its number of points without outliers, unless most points are outliers.
     mean
         Mean of the differences, rotX and rotY, rad, (2,): its canting error relative to the mean of
         all; NaN without points.
     sigma
-        Plain standard error of the mean, rad, (2,).
+        Standard error of the mean, σ/√n, rad, (2,).
     """
 
     facet: int
@@ -383,7 +383,7 @@ def measure_field(
 
 
 def _common_scatter(orientations: Sequence[Orientation]) -> float | None:
-    """Return the typical scatter of a flight's mirrors, rad; None if too few show it."""
+    """Return the typical scatter of a flight's mirrors, rad; None if too few are well measured."""
     known = [float(np.mean(o.sigma**2)) for o in orientations if o.count >= FEWEST]
     return float(np.sqrt(np.median(known))) if len(known) >= _ENOUGH_MIRRORS else None
 
@@ -392,12 +392,12 @@ def _checked(reflections: Reflections, shape: MirrorShape) -> Reflections:
     if not len(reflections):
         raise InputError("orientation: no reflections; at least one is needed")
     if (reflections.heliostat != reflections.heliostat[0]).any():
-        raise InputError("orientation: reflections of several heliostats; give those of one")
+        raise InputError("orientation: got reflections of several heliostats; pass those of one")
     highest = int(reflections.facet.max())
     if highest >= len(shape):
         raise InputError(
             f"orientation: a reflection on facet {highest}, but the mirror has {len(shape)} "
-            "facets, counted from 0; is this another kind of heliostat?"
+            "facets, counted from 0; check the heliostat type"
         )
     return reflections
 
@@ -412,7 +412,7 @@ def _mean(
     if mean == "plain":
         return as_float(omega[keep].mean(axis=0))
     if mean != "area":
-        raise InputError(f"orientation: there is no mean {mean!r}; give 'plain' or 'area'")
+        raise InputError(f"orientation: unknown mean {mean!r}; use 'plain' or 'area'")
     part = own.take(keep)
     uv = shape.along_facet(part.facet, part.xy)
     return as_float(spread_mean(omega[keep], shape, part.facet, uv).weights @ omega[keep])
@@ -484,8 +484,8 @@ def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
     lines = []
     if o.count < FEWEST:
         lines.append(
-            f"only {o.count} reflections: its σ leans on the usual scatter of mirrors; fly more "
-            f"points, at least {FEWEST}"
+            f"only {o.count} reflections: its σ relies on the typical scatter of mirrors; fly at "
+            f"least {FEWEST} points"
         )
     area = np.prod(shape.half_size, axis=-1)
     share = area / area.sum()
@@ -500,7 +500,7 @@ def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
             )
         )
         lines.append(
-            f"unsymmetric sampling: the centre of the points is {off[0]:+.2f} half widths to the "
+            f"asymmetric sampling: the centre of the points is {off[0]:+.2f} half widths to the "
             f"right of and {off[1]:+.2f} half heights above that of the mirror; if the "
             f"differences change linearly across it, the error is {effect}"
         )
@@ -520,7 +520,7 @@ def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
     for name, p in zip(("rotX", "rotY"), o.normality, strict=True):
         if p < _NORMAL:
             lines.append(
-                f"the differences in {name} are not normally distributed (p = {p:.1e}); take its "
+                f"the differences in {name} are not normally distributed (p = {p:.1e}); treat its "
                 "standard deviation as an order of magnitude"
             )
     return lines
@@ -534,11 +534,11 @@ def _tilt_by_gradient(o: Orientation, xy: FloatArray, offset: FloatArray) -> Flo
 
 
 def _off_the_others(o: Orientation, f: FacetMean) -> FloatArray | None:
-    """Return a facet's mean less the median of the others' if it is beyond chance."""
+    """Return a facet's mean minus the median of the others' means, if significant."""
     others = [g for g in o.facets if g.facet != f.facet and g.count >= 3]
     if f.count < 3 or not others:
         return None
-    # The median, so that the odd facet is reported and not all the others.
+    # Use the median, so that the one deviating facet is reported and not all the others.
     away = f.mean - np.median([g.mean for g in others], axis=0)
     error = np.sqrt(f.sigma**2 + np.mean([g.sigma**2 for g in others], axis=0))
     if ((np.abs(away) > _CANTED_SIGMA * error) & (np.abs(away) > _CANTED)).any():

@@ -67,15 +67,16 @@ class Photogrammetry:
     Attributes
     ----------
     position, rotation
-        Of the photographs, ENU metres, (P, 3), and (P, 3, 3).
+        Positions and attitudes of the photographs, ENU metres, (P, 3), and (P, 3, 3).
     points
         Corners of the targets, ENU metres, (Q, 3).
     camera
         The camera with the lens that the images show.
     covariance
-        Of the positions relative to each other, after the best similarity, m², (3P, 3P).
+        Covariance of the positions relative to each other, after the best similarity transform, m²,
+        (3P, 3P).
     deviation
-        RMS of the residuals in their standard deviations: 1 if those are right.
+        RMS of the residuals in units of their standard deviations; 1 if these are correct.
     sights
         Corners used.
     """
@@ -95,9 +96,9 @@ class Photogrammetry:
 
 
 def usable(targets: Sequence[SeenTargets]) -> tuple[list[int], dict[int, str]]:
-    """Return the photographs that can be used, and why others cannot, by their index.
+    """Return the usable photographs, and why others cannot be used, by index.
 
-    Targets that fewer than two photographs show do not count.
+    Targets visible in fewer than two photographs do not count.
     """
     number = np.concatenate([s.number for s in targets]) if targets else np.empty(0, np.intp)
     shared = np.flatnonzero(np.bincount(number, minlength=1) >= 2)
@@ -108,8 +109,8 @@ def usable(targets: Sequence[SeenTargets]) -> tuple[list[int], dict[int, str]]:
             good.append(k)
         else:
             unusable[k] = shown.problem or (
-                f"it shows {count} targets that other photographs show too, {FEWEST_OF_PHOTO} are "
-                "needed"
+                f"it shows only {count} targets that other photographs also show; "
+                f"{FEWEST_OF_PHOTO} are needed"
             )
     return good, unusable
 
@@ -117,14 +118,14 @@ def usable(targets: Sequence[SeenTargets]) -> tuple[list[int], dict[int, str]]:
 def locate(
     photos: Sequence[Photo], targets: Sequence[SeenTargets], camera: LedCamera
 ) -> Photogrammetry:
-    """Return where photographs were taken, from the targets that they show.
+    """Locate photographs from the targets that they show.
 
     Parameters
     ----------
     photos, targets
         Photographs as recorded, and the targets in each; all usable.
     camera
-        Lens, as its file states it.
+        Lens as stated in the camera file.
 
     Raises
     ------
@@ -133,14 +134,14 @@ def locate(
     """
     if len(photos) < FEWEST_PHOTOS:
         raise InputError(
-            f"{len(photos)} photographs show coded targets, {FEWEST_PHOTOS} are needed; fly a dome "
-            "over them (heliotrope drone dome)"
+            f"{len(photos)} photographs show coded targets; {FEWEST_PHOTOS} are needed: fly a "
+            "dome over them (heliotrope drone dome)"
         )
     sights, numbers = _sights(targets)
     if len(numbers) < FEWEST_TARGETS:
         raise InputError(
-            f"{len(numbers)} coded targets are seen in two photographs or more, {FEWEST_TARGETS} "
-            "are needed; lay out more of them"
+            f"{len(numbers)} coded targets are seen in two photographs or more; {FEWEST_TARGETS} "
+            "are needed: lay out more"
         )
     state = _start(photos, sights, camera, 4 * len(numbers))
     return _result(*_adjusted(state, photos, camera, sights))
@@ -174,7 +175,7 @@ class _State:
 
 
 def _start(photos: Sequence[Photo], sights: Sights, camera: LedCamera, points: int) -> _State:
-    """Return the recorded poses, and the points nearest to the rays from there."""
+    """Return the recorded poses, and the points nearest to the rays from these poses."""
     position = as_float([p.position for p in photos])
     turned = as_float([p.rotation for p in photos])
     plane = undistort(camera, sights.pixel)
@@ -192,7 +193,7 @@ def _start(photos: Sequence[Photo], sights: Sights, camera: LedCamera, points: i
 
 
 def _projected(state: _State, sights: Sights) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return pixels (K, 2), and their derivatives by φ, p, X (K, 2, 9), and lens (K, 2, 9)."""
+    """Return pixels (K, 2), and their derivatives: by φ, p, X (K, 2, 9), and lens (K, 2, 9)."""
     import cv2
 
     local = np.einsum(
@@ -224,7 +225,7 @@ def _adjusted(
         pixel, by_pose, by_lens = _projected(state, sights)
         gap = sights.pixel - pixel
         scaled = np.linalg.norm(gap, axis=-1) / sights.sigma
-        # The start is right to decimetres: no outliers until it has been left.
+        # The start is accurate only to decimetres, so reject no outliers in the first step.
         limit = max(_HUBER, 3.0 * float(np.median(scaled)))
         weight = np.minimum(1.0, limit / np.maximum(scaled, 1e-9)) / sights.sigma**2
         jacobian = _jacobian(by_pose, by_lens, sights, len(photos), size)
@@ -244,7 +245,7 @@ def _adjusted(
     else:
         raise InputError(
             f"the photogrammetry of {len(photos)} photographs does not converge; check that "
-            "camera.toml is the file of this camera, and that no target lies there twice"
+            "camera.toml is the file of this camera, and that no target number occurs twice"
         )
     kept = scaled < 4.0
     freedom = max(2 * int(kept.sum()) - size + 7, 1)
@@ -309,9 +310,10 @@ def _result(state: _State, made: Photogrammetry, normal: FloatArray) -> Photogra
 
 
 def relative(position: FloatArray) -> FloatArray:
-    """Return the matrix (3P, 3P) that takes the best similarity off displacements of positions.
+    """Return the matrix (3P, 3P) that removes the best similarity transform from displacements.
 
-    Of P displacements it leaves what no common shift (3), turn (3) and growth (1) explains.
+    It leaves the part of P displacements that no common shift (3), rotation (3) or scale (1)
+    explains.
     """
     away = position - position.mean(axis=0)
     modes = np.concatenate(
@@ -323,9 +325,9 @@ def relative(position: FloatArray) -> FloatArray:
 
 
 def compared(recorded: FloatArray, adjusted: FloatArray) -> tuple[FloatArray, float]:
-    """Return recorded less adjusted positions after the best similarity, (P, 3), and its scale.
+    """Return recorded minus adjusted positions after the best similarity, (P, 3), and its scale.
 
-    The adjusted positions (P, 3) are fitted into the recorded ones (Umeyama 1991).
+    The adjusted positions (P, 3) are fitted to the recorded ones (Umeyama 1991).
     """
     a, b = adjusted - adjusted.mean(axis=0), recorded - recorded.mean(axis=0)
     u, size, vt = np.linalg.svd(b.T @ a)

@@ -32,9 +32,9 @@ MOST_ARROWS, MOST_NAMES = 300, 40
 def heliostat_drawing(name: str, o: Orientation, shape: MirrorShape) -> str:
     """Return the picture of one heliostat, as SVG.
 
-    Sampling points on the mirror, each with an arrow along which its normal leans from the
-    expected one, and the differences about both axes: their distribution, by facet, and in the
-    order of the photographs.
+    It shows the sampling points on the mirror, each with an arrow for the tilt of its normal
+    relative to the expected normal, and the differences about both axes: their distribution, by
+    facet, and in the order of the photographs.
     """
     panels = [_points(o, shape), _distribution(o, 0), _distribution(o, 1), _facets(o), _order(o)]
     title = f"{name}: {o.count} reflections, {int(o.outlier.sum())} rejected, {o.distance:.0f} m"
@@ -42,7 +42,7 @@ def heliostat_drawing(name: str, o: Orientation, shape: MirrorShape) -> str:
 
 
 def field_map(orientations: Orientations, position: FloatArray, title: str = "") -> "Figure":
-    """Return a map of the field: deviations of the mirrors, and how well they are known.
+    """Return a map of the field with the deviations of the mirrors and their uncertainties.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def field_map(orientations: Orientations, position: FloatArray, title: str = "")
         ax.set_ylabel("north, m")
         ax.grid(alpha=0.3)
     axes[0, 0].set_title("deviation of the orientation", fontsize=10)
-    axes[0, 1].set_title("how well it is known", fontsize=10)
+    axes[0, 1].set_title("uncertainty of the orientation", fontsize=10)
     if 0 < len(rows) <= MOST_ARROWS:
         _leans(axes[0, 0], orientations, places[rows])
     if 0 < len(rows) <= MOST_NAMES:
@@ -97,7 +97,7 @@ def rms(values: FloatArray) -> float:
 
 
 def _leans(ax: "Axes", orientations: Orientations, places: FloatArray) -> None:
-    """Draw the direction in which normals lean from the expected ones, as seen from above."""
+    """Draw the tilt of normals relative to the expected normals, as seen from above."""
     lean = 1e3 * np.array([_lean(o) for o in orientations.found])
     size = max(rms(np.linalg.norm(lean[:, :2], axis=-1)), 1e-6)
     span = max(float(np.ptp(places[:, :2], axis=0).max()), 10.0)
@@ -143,7 +143,7 @@ def _points(o: Orientation, shape: MirrorShape) -> Panel:
         390.0,
         x,
         y,
-        "sampling points, and the lean of the normals",
+        "sampling points and tilt of the normals",
         "x, m (right, seen from the front)",
         "y, m",
     ).equal()
@@ -203,7 +203,7 @@ def _facets(o: Orientation) -> Panel:
         1e3 * np.array([getattr(f, what) for f in o.facets]) for what in ("mean", "sigma")
     )
     reach = np.where(np.isfinite(errors), errors, 0.0)
-    # As many labels as there is room for.
+    # Draw as many labels as fit.
     every = 1 + (len(o.facets) - 1) // _MOST_LABELS
     labels = tuple("" if f.facet % every else f"{f.facet}: {f.count}" for f in o.facets)
     panel = Panel(

@@ -33,7 +33,7 @@ Image = npt.NDArray[np.float32]
 
 #: Side of a typical mirror in the reduced picture, px.
 _SIDE = 10.0
-#: Least correlation of drawing and photograph, and how far the best place must exceed any other.
+#: Minimum correlation of drawing and photograph, and how far the best place must exceed any other.
 LEAST, MARGIN = 0.7, 0.06
 #: With this correlation of its light, the colour of a photograph is not tried.
 _CERTAIN = 0.9
@@ -46,7 +46,7 @@ _TURNS, _CANDIDATES, _ROUNDS = 17, 4, 60
 
 @dataclass(frozen=True)
 class _Place:
-    """Where the drawing fits: correlation, attitude, and the mirrors' middles there, px, (M, 2)."""
+    """A position where the drawing fits: correlation, attitude, and mirror centres, px, (M, 2)."""
 
     fit: float
     rotation: FloatArray
@@ -56,14 +56,14 @@ class _Place:
 def outlines(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[FloatArray, FloatArray]:
     """Return the corners of all mirrors in a photograph, px, (N, 4, 2), and their distances, (N,).
 
-    Those of mirrors seen from behind too: they hide others.
+    Includes mirrors seen from behind, because they hide others.
     """
     away = np.linalg.norm(stand.vertex - photo.position, axis=-1)
     return photo.pixels(camera, stand.corners), as_float(away)
 
 
 def overlay(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPoses) -> Identified:
-    """Return the attitude in which the mirrors of a field, overlapping, lie over a photograph.
+    """Return the attitude in which the overlapping mirrors of a field match a photograph.
 
     The result names mirrors but no patches.
     """
@@ -83,7 +83,7 @@ def overlay(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPose
         fit = f"{100 * best[0].fit:.0f} %" if best else "nothing"
         text = (
             f"wrong_field: the {len(rows)} mirrors that should be in it correlate to {fit} with "
-            "it; check the field and the commands that were given"
+            "it; check the field and the commands"
         )
         return Identified(photo.rotation, none, none, text)
     first = best[0]
@@ -125,7 +125,7 @@ def _places(
     scale: float,
     reach: int,
 ) -> list[_Place]:
-    """Return the places where the drawing fits, the best first."""
+    """Return the positions where the drawing fits, best first."""
     import cv2
 
     coarse: list[tuple[float, float, FloatArray]] = []
@@ -162,7 +162,7 @@ def _places(
 
 
 def _move(shift: FloatArray, focal: float) -> FloatArray:
-    """Return the camera's turn that moves its picture by ``shift`` (right, down), px."""
+    """Return the camera rotation that moves its picture by ``shift`` (right, down), px."""
     x, y = np.arctan(shift / focal).tolist()
     return (rotation([0.0, 1.0, 0.0], x) @ rotation([1.0, 0.0, 0.0], -y)).T
 
@@ -176,7 +176,7 @@ def _refined(
     scale: float,
     turned: FloatArray,
 ) -> _Place | None:
-    """Return the place that the drawing of an attitude converges to; None if it does not."""
+    """Return the position to which an attitude's drawing converges; None if it does not."""
     import cv2
 
     fit, middle = -1.0, np.empty((0, 2))

@@ -35,13 +35,13 @@ def spot_reflections(
     Parameters
     ----------
     photos, readings
-        Photographs where they were taken, and their readings.
+        Photographs with estimated positions, and their readings.
     camera
         The camera with its lamp.
     stand
         The mirrors.
     shape
-        Gives the surface of a mirror's row; slopes do not matter here.
+        Function that returns the surface of a mirror by index; slopes do not matter here.
     shifts
         Displacement of each mirror's image in each photograph, undistorted coordinates,
         (P, N, 2); none if omitted.
@@ -70,7 +70,7 @@ def spot_reflections(
         facet, xy = _intersect(shape(int(row)), start, directions[mine] @ turned, beside)
         kept = facet >= 0
         if beside == 0.0:
-            # Through a gap between facets the spot of a mirror behind shines, weakly.
+            # The spot of a mirror behind shines weakly through a gap between facets.
             kept &= (shape(int(row)).facet_at(xy) >= 0) | (flux[mine] > _WEAK * typical)
         distance = np.linalg.norm(start, axis=-1)
         # Foreshortening blurs the position of a spot along an oblique mirror.

@@ -180,7 +180,7 @@ def read_photo(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoRead
         All mirrors in their expected poses.
     """
     if photo.path is None:
-        return PhotoReading(photo.name, "unreadable: there is no file")
+        return PhotoReading(photo.name, "unreadable: no such file")
     try:
         picture = decode(photo.path)
     except HeliotropeError as error:
@@ -189,8 +189,8 @@ def read_photo(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoRead
     if (width, height) != camera.size:
         return PhotoReading(
             photo.name,
-            f"unreadable: {width} × {height} px, but the camera file says "
-            f"{camera.size[0]} × {camera.size[1]} px; give the file of this camera",
+            f"unreadable: {width} × {height} px, but the camera file says {camera.size[0]} × "
+            f"{camera.size[1]} px; use the file of this camera",
         )
     return look(picture, photo, camera, stand)
 
@@ -199,7 +199,7 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
     """Return the reading of a decoded picture; see `read_photo`."""
     side, near = expected_size(camera, photo, stand)
     if not near.any():
-        return PhotoReading(photo.name, "wrong_field: no mirror of the field can be in it")
+        return PhotoReading(photo.name, "wrong_field: no mirror of the field can be in view")
     typical = float(np.median(side[near]))
     if typical < SMALLEST:
         return PhotoReading(
@@ -210,7 +210,11 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
     clipped = float((picture[::8, ::8] >= 254).all(axis=2).mean())
     if clipped > 0.5:
         return PhotoReading(
-            photo.name, f"overexposed: {100 * clipped:.0f} % of it is clipped; shorten the exposure"
+            photo.name,
+            (
+                f"overexposed: {100 * clipped:.0f} % of the photograph is clipped; shorten the "
+                "exposure"
+            ),
         )
     if photo.by_hand:
         if is_dark(picture):
@@ -267,7 +271,7 @@ def _look_along(
     stand: MirrorPoses,
     reaches: Sequence[float],
 ) -> PhotoReading:
-    """Return the reading of a picture with an attitude right to the first of ``reaches``, px."""
+    """Read a picture whose attitude is accurate to the first of ``reaches``, px."""
     turned = photo
     # Edges against the ground correct the attitude; then they are measured where they belong.
     for reach in reaches:
@@ -280,8 +284,8 @@ def _look_along(
         if int(good.sum()) < FEWEST:
             return PhotoReading(
                 photo.name,
-                f"nothing: {int(good.sum())} corners of mirrors stand clear of others, {FEWEST} "
-                "are needed; fly higher",
+                f"nothing: {int(good.sum())} mirror corners are clear of other mirrors; {FEWEST} "
+                "are needed: fly higher",
             )
         corners = np.full(lines.corners.shape, np.nan)
         corners[good] = undistort(camera, lines.corners[good])
@@ -296,7 +300,7 @@ def _nothing_in_frame(photo: Photo) -> PhotoReading:
 
 
 def _consistent(lines: Outlines, expected: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return the corners (M, 4) that were found and are not another edge's."""
+    """Return the mask of corners (M, 4) that were found and do not belong to another edge."""
     size = np.sqrt(quad_area(expected))
     shift = np.where(lines.known[..., None], lines.corners - expected, np.nan)
     if not lines.known.any():

@@ -55,7 +55,7 @@ def read_reference(path: str | Path) -> Reference:
     Raises
     ------
     FormatError
-        If it cannot be read, a row cannot be used, or a heliostat stands there twice.
+        If the file cannot be read, a row cannot be used, or a heliostat is listed twice.
     """
     file = check_file(path, "a table of reference orientations (.csv)")
     rows = read_rows(file, "a table of reference orientations")
@@ -64,13 +64,13 @@ def read_reference(path: str | Path) -> Reference:
     rows.check("elevation_deg", np.abs(angles[1]) > 90.0, angles[1], "° is beyond ±90°")
     rows.refuse_bad()
     if not len(rows):
-        raise FormatError(file, "no rows; give one for each heliostat")
+        raise FormatError(file, "no rows; write one row per heliostat")
     known: dict[tuple[str, str], FloatArray] = {}
     flights = rows.texts("flight") if "flight" in rows.columns else [""] * len(angles[0])
     normals = direction(*np.radians(angles))
     for flight, name, normal in zip(flights, rows.texts("heliostat"), normals, strict=True):
         if (flight, name) in known:
-            raise FormatError(file, f"heliostat {name} is there twice; give one row for each pose")
+            raise FormatError(file, f"heliostat {name} is listed twice; write one row per pose")
         known[flight, name] = normal
     return Reference(known)
 
@@ -82,14 +82,14 @@ class Compared:
     Attributes
     ----------
     label
-        Name, with the flight's before it if there are several.
+        Name, preceded by that of the flight if there are several.
     reference
         Unit normal, ENU, (3,).
     shape
         Its surface, with the slope map if there is one.
     ideal, measured
-        By the ideal surface and by the measured one; None without a slope map, or if it could not
-        be evaluated.
+        Orientations with the ideal and with the measured surface; None without a slope map, or if
+        the evaluation failed.
     """
 
     label: str
@@ -99,7 +99,7 @@ class Compared:
     measured: Orientation | None
 
     def offset(self, surface: str) -> FloatArray:
-        """Return rotX and rotY from the reference to the result, rad, (2,); NaN without one."""
+        """Return rotX and rotY from the reference to the result, rad (2,); NaN without a result."""
         orientation: Orientation | None = getattr(self, surface)
         if orientation is None:
             return np.full(2, np.nan)
@@ -136,8 +136,8 @@ def compare(flights: Sequence[FlightResult], reference: Reference) -> tuple[Comp
             compared.append(Compared(flight.label(name), normal, shape, results[0], measured_one))
     if not compared:
         raise InputError(
-            "reference: none of its heliostats was measured; its names are those of the plant, and "
-            "its flights those of the campaign's folders"
+            "reference: none of its heliostats was measured; use heliostat names from the plant "
+            "and flight names from the campaign's folders"
         )
     return tuple(compared)
 

@@ -43,7 +43,7 @@ def write_reference(compared: Sequence[Compared], folder: Path, *, page: bool = 
 
 
 def offset_table(compared: Sequence[Compared]) -> Table:
-    """Return head and rows of table 3, with mean, spread and RMS below; mrad."""
+    """Return header and rows of table 3, with mean, spread and RMS at the end; mrad."""
     head = ["heliostat", *(f"{s}, {a}" for s in SURFACES for a in ("rotX", "rotY"))]
     rows = [
         [row["heliostat"], *(_cell(row[f"rot_{a}_{s}_mrad"]) for s in SURFACES for a in "xy")]
@@ -60,7 +60,7 @@ def offset_table(compared: Sequence[Compared]) -> Table:
 
 
 def _angles(compared: Sequence[Compared], which: str) -> Table:
-    """Return head and rows of table 4 (azimuth) or 5 (elevation)."""
+    """Return header and rows of table 4 (azimuth) or 5 (elevation)."""
     head = ["heliostat", "reference, °"]
     head += [f"{s}, {what}" for s in SURFACES for what in ("°", "deviation, mrad")]
     rows = []

@@ -183,7 +183,7 @@ def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflection
             name,
             ~((column >= 0) & (column == np.floor(column))) & np.isfinite(column),
             column,
-            " is no whole number from 0",
+            " is not a whole number from 0",
         )
     sigma = numbers["sigma_m"]
     rows.check("sigma_m", ~(sigma > 0.0) & np.isfinite(sigma), sigma, " m must be above 0")

@@ -152,7 +152,9 @@ def write_campaign_report(
     """
     names = [f.name.replace("/", "-") for f in flights]
     if not names or len(set(names)) < len(names):
-        raise InputError(f"flight report: flights {names}; give one or more with different names")
+        raise InputError(
+            f"flight report: flights {names}; pass one or more flights with different names"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     _write_tables(flights, folder)
     every = [(f, o) for f in flights for o in f.found.found]
@@ -222,7 +224,7 @@ def _map(flight: MeasuredFlight) -> "Markup":
 
 @dataclass(frozen=True)
 class _Table:
-    """A table: its head, and rows of cells."""
+    """A table: its header, and rows of cells."""
 
     head: Sequence[str]
     rows: Iterable[Sequence[object]]
@@ -298,5 +300,5 @@ def _of_facets(flights: Sequence[MeasuredFlight]) -> _Table:
 
 
 def _both(row: dict[str, Any], name: str, sign: str = "") -> str:
-    """Return the figures of rotX and rotY as one cell."""
+    """Format the values of rotX and rotY as one table cell."""
     return ", ".join(f"{row[f'{name}_{a}_mrad']:{sign}.3f}" for a in ("x", "y"))

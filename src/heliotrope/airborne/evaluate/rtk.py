@@ -85,7 +85,7 @@ def check_rtk(
     problems = tuple(s.why_unused() for s in seen if s.problem)
     if len(good) < 3:
         first = f"; the first: {problems[0]}" if problems else ""
-        raise InputError(f"{len(good)} photographs can be used, three are needed{first}")
+        raise InputError(f"{len(good)} photographs can be used; three are needed{first}")
     recorded, used = [photos[k] for k in good], [seen[k] for k in good]
     usual = adjust_photos(recorded, used, camera, stand, priors or Priors())
     places, corners = as_float([p.position for p in recorded]), corners_of(used)
@@ -115,10 +115,10 @@ def check_rtk(
 def check_rtk_by_targets(
     photos: Sequence[Photo], targets: Sequence[SeenTargets], camera: LedCamera
 ) -> tuple[RtkCheck, Photogrammetry, tuple[str, ...]]:
-    """Return how RTK positions scatter about those from coded targets, as appendix A does.
+    """Return the scatter of RTK positions about those from coded targets, as in appendix A.
 
-    The photogrammetric positions are fitted into RTK's by a similarity, so nothing is said of a
-    common offset, turn or scale.
+    The photogrammetric positions are fitted to the RTK positions by a similarity transform, so a
+    common offset, rotation or scale cannot be determined.
 
     Raises
     ------
@@ -134,7 +134,8 @@ def check_rtk_by_targets(
         first = f"; the first of the others: {problems[0]}" if problems else ""
         raise InputError(f"{error}{first}") from None
     gap, _ = compared(as_float([p.position for p in recorded]), located.position)
-    # The similarity takes seven of the 3P degrees of freedom, not only the three of the mean.
+    # The similarity transform uses seven of the 3P degrees of freedom, not only the three of the
+    # mean.
     fair = gap * np.sqrt((len(gap) - 1.0) / (len(gap) - 7.0 / 3.0))
     unknown = np.full(3, np.nan)
     sigma = located.position_sigma
@@ -154,7 +155,7 @@ def check_rtk_by_targets(
 
 
 def share_of_rtk(gap: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the scatter of RTK without that of photogrammetry, and its 95 % interval.
+    """Return the scatter of RTK alone, without that of photogrammetry, and its 95 % interval.
 
     Restricted maximum likelihood for each axis: a difference has the variance of RTK, which is
     the same for all, and that of its own photograph; their mean is unknown. (Ours; the paper's
@@ -163,7 +164,7 @@ def share_of_rtk(gap: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatA
     Parameters
     ----------
     gap
-        RTK less photogrammetry, m, (P, 3), P at least 3.
+        RTK minus photogrammetry, m, (P, 3), P at least 3.
     sigma
         Standard deviations of the photogrammetric positions, m, (P, 3).
 

@@ -10,7 +10,7 @@ _WIDTH, _HEIGHT, _STEP = 250.0, 210.0, 320.0
 
 
 def rtk_drawing(check: RtkCheck) -> str:
-    """Return RTK less photogrammetry as SVG: a histogram of each axis, about its mean.
+    """Return RTK minus photogrammetry as SVG: a histogram for each axis, about its mean.
 
     The curve is the normal distribution of the differences' standard deviation; the title gives the
     standard deviation of RTK alone.
@@ -31,7 +31,7 @@ def rtk_drawing(check: RtkCheck) -> str:
             (low, high),
             (0.0, most),
             title=f"{axis}: RTK's σ {1e3 * check.rtk[k]:.1f} mm",
-            across="RTK less photogrammetry, mm",
+            across="RTK minus photogrammetry, mm",
             up="photographs" if k == 0 else "",
         )
         panel.bars(edges, counts[k], _BAR)

@@ -77,7 +77,7 @@ def to_sightings(
         value.
     """
     if per not in ("reflection", "orientation"):
-        raise InputError(f"to_sightings: per={per!r}; give 'reflection' or 'orientation'")
+        raise InputError(f"to_sightings: per={per!r}; use 'reflection' or 'orientation'")
     if not orientations.found:
         raise InputError("to_sightings: no heliostat has an orientation; nothing to calibrate with")
     n = len(orientations.names)

@@ -182,7 +182,7 @@ def spread_mean(
     uv: npt.ArrayLike,
     prior: float = SCATTER,
 ) -> SpreadMean:
-    """Return the mean over the mirror as n points show it.
+    """Estimate the mean over the mirror from n points.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def spread_mean(
     facet, uv
         Facet of each point, (n,), and its position along the facet's axes, m, (n, 2).
     prior
-        Scatter of the values as known before, rad, see `few_sigma`.
+        Prior scatter of the values, rad, see `few_sigma`.
 
     Returns
     -------
@@ -210,7 +210,7 @@ def spread_mean(
 
 @lru_cache(maxsize=1)
 def _one_thread() -> "ThreadpoolController":
-    """Return a limit of threads: a mirror's matrices are too small to share the work."""
+    """Return a thread limit; a mirror's matrices are too small for several threads."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()

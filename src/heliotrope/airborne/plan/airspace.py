@@ -65,7 +65,8 @@ class KeepOut:
             raise InputError(f"{what}: corners of shape {corners.shape}; give finite (V, 2)")
         if len(corners) < 3 and not (len(corners) == 1 and self.radius > 0.0):
             raise InputError(
-                f"{what}: {len(corners)} corners; give three or more, or one place and a radius"
+                f"{what}: {len(corners)} corners; specify three or more, or one position and a "
+                "radius"
             )
         if not self.radius >= 0.0:
             raise InputError(f"{what}: radius {self.radius} m must not be below 0")
@@ -165,7 +166,7 @@ class Airspace:
         if not 0.0 <= self.min_height < self.max_height:
             raise InputError(
                 f"heights {self.min_height:g} m to {self.max_height:g} m: the lower one must be 0 "
-                "or more, and below the upper one"
+                "or more and below the upper one"
             )
         if not self.margin >= 0.0:
             raise InputError(f"margin {self.margin} m must not be below 0")
@@ -173,7 +174,7 @@ class Airspace:
             fence = as_float(self.fence)
             if fence.ndim != 2 or fence.shape[-1] != 2 or len(fence) < 3:
                 raise InputError(
-                    f"fence of shape {fence.shape}: give three corners or more, (V, 2)"
+                    f"fence of shape {fence.shape}: specify three corners or more, (V, 2)"
                 )
             _polygon(fence, "fence")
             object.__setattr__(self, "fence", fence)
@@ -342,12 +343,12 @@ def path_length(points: FloatArray) -> float:
 
 
 def _polygon(corners: FloatArray, what: str) -> None:
-    """Refuse a polygon that encloses no area or whose edges cross."""
+    """Raise an error for a polygon that encloses no area or whose edges cross."""
     polygon = Polygon(corners)
     if not polygon.is_valid or polygon.area <= 0.0:
         raise InputError(
             f"{what}: its edges cross or enclose no area ({shapely.is_valid_reason(polygon)}); "
-            "give the corners in order around it"
+            "list the corners in order around the area"
         )
 
 

@@ -75,7 +75,7 @@ class PointSelection:
 
     def __post_init__(self) -> None:
         if self.points < 1:
-            raise InputError(f"{self.points} calibration points: give 1 or more")
+            raise InputError(f"{self.points} calibration points: must be 1 or more")
         if not (np.isfinite(self.sigma) and self.sigma > 0.0):
             raise InputError(f"sigma {self.sigma} rad of a normal must be above 0")
         if not (np.isfinite(self.scatter) and self.scatter >= 0.0):
@@ -83,17 +83,17 @@ class PointSelection:
         if not 0.0 <= self.min_elevation < self.max_elevation <= 0.5 * np.pi:
             raise InputError(
                 f"elevations {np.degrees(self.min_elevation):g}° to "
-                f"{np.degrees(self.max_elevation):g}°: give 0° to 90°, the lower first"
+                f"{np.degrees(self.max_elevation):g}°: must be 0° to 90°, the lower first"
             )
         if not 0.0 < self.share <= 1.0:
-            raise InputError(f"share {self.share}: give a number above 0, up to 1")
+            raise InputError(f"share {self.share}: must be above 0, up to 1")
 
     def check(self, names: tuple[str, ...], model: str) -> None:
         """Raise an error unless the points outnumber the unknowns of a model."""
         if self.points <= len(names):
             raise InputError(
                 f"{self.points} calibration points: the model {model} has {len(names)} unknowns; "
-                f"give {len(names) + 1} or more"
+                f"use {len(names) + 1} points or more"
             )
 
 
@@ -110,7 +110,7 @@ class CalibrationPoints:
     facing
         Poses, batch shape (K, n).
     plan
-        The choice for the mirror in the middle, with the expected errors.
+        The selection made for the central heliostat, with the expected errors.
     prospect
         What the photographs will show, (K, n).
     """
@@ -172,7 +172,7 @@ def calibration_points(
     Raises
     ------
     InputError
-        If fewer directions are possible than points are wanted.
+        If fewer directions are possible than points requested.
     """
     armature, drives = Armature(mirrors.armature.table[rows]), Drive(mirrors.drives.table[rows])
     centre = armature.origin_1.mean(axis=0)
@@ -244,7 +244,7 @@ def _free(
     rows: npt.NDArray[np.intp],
     sampling: Sampling,
 ) -> npt.NDArray[np.bool_]:
-    """Return the points that have room for a pattern around them."""
+    """Return the points with enough room for a pattern around them."""
     corners, distance = mirrors.corners[rows], sampling.distance
     middle = corners.mean(axis=2, keepdims=True)
     slope = mirrors.slopes[rows][:, :, None] - (corners - middle) / (2.0 * sampling.focal)
@@ -265,7 +265,7 @@ def _candidates(
     names: tuple[str, ...],
     sigma: FloatArray,
 ) -> CandidateSightings:
-    """Return sightings of the drone by one mirror; their "time" is the row of the direction."""
+    """Return one mirror's sightings of the drone; their "time" is the index of the direction."""
     facing = face(middle.armature, middle.drives, points[:, None])
     rows = np.flatnonzero(facing.able[:, 0])
     counts = facing.counts[rows, 0]

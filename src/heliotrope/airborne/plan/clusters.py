@@ -78,7 +78,7 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
     near = np.asarray(tree.query(flat, k=min(5, len(flat)))[0])[:, 1:]
     spacing = float(np.median(near.mean(axis=1)))
     if spacing <= 0.0:
-        raise InputError("clusters: most heliostats have one and the same position")
+        raise InputError("clusters: most heliostats have the same position")
     side = spacing / np.sqrt(_SQUARES)
     low, high = flat.min(axis=0) - spacing, flat.max(axis=0) + spacing
     counts = np.ceil((high - low) / side).astype(np.int64)
@@ -120,7 +120,7 @@ def clusters(
         raise InputError("clusters: there is no heliostat")
     for name, value in (("size", size), ("largest radius", max_radius)):
         if not value > 0.0:
-            raise InputError(f"cluster {name} {value:g} m: give a length above 0")
+            raise InputError(f"cluster {name} {value:g} m: must be a length above 0")
     area = ground_areas(place)
     count = max(1, int(np.ceil(area.sum() / (0.25 * np.pi * size**2))))
     while True:

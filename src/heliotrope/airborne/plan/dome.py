@@ -35,13 +35,13 @@ class Dome:
     center
         Middle of the targets on the ground, ENU metres, (3,).
     position
-        Of the P photographs in the order of the flight, ENU metres, (P, 3).
+        Positions of the P photographs in flight order, ENU metres, (P, 3).
     rotation
         Camera axes to ENU, (P, 3, 3).
     targets
-        Where the targets are to lie; decimetres do not matter.
+        Positions where the targets are to be placed; decimetres do not matter.
     side
-        Of their black squares, m.
+        Side of their black squares, m.
     """
 
     center: FloatArray
@@ -73,11 +73,11 @@ def plan_dome(
     radius
         Distance of the photographs from it, m.
     elevations
-        Of the rings of photographs, rad.
+        Elevations of the rings of photographs, rad.
     photographs
-        In all; each ring has a share like its circumference, at least four.
+        Total number; each ring gets a number in proportion to its circumference, at least four.
     targets, spacing, side
-        Number of targets, a square of which is laid out; between neighbours; of the black
+        Number of targets, laid out in a square; distance between neighbours, m; side of the black
         squares, m.
 
     Raises
@@ -97,7 +97,7 @@ def plan_dome(
     rings = np.sort(as_float(elevations))
     if len(rings) < 2 or rings[0] < np.radians(15.0) or rings[-1] > np.radians(88.0):
         raise InputError(
-            f"dome: elevations {np.degrees(rings).tolist()}°; give two or more from 15 to 88"
+            f"dome: elevations {np.degrees(rings).tolist()}°; use two or more from 15 to 88"
         )
     middle = as_vectors(center, "center")
     share = np.cos(rings) / np.cos(rings).sum()
@@ -130,18 +130,18 @@ def write_dome(
     speed: float = 3.0,
     rest: float = 2.5,
 ) -> list[Path]:
-    """Write waypoint files, a sheet to print for each target, and where each target lies.
+    """Write waypoint files, a printable sheet for each target, and a table of target positions.
 
     Parameters
     ----------
     dome, site, folder
-        The flight, the place of ENU's origin, and where the files go.
+        The flight, the site of the ENU origin, and the output folder.
     home
-        Place of take-off, ENU metres, (3,).
+        Take-off position, ENU metres, (3,).
     formats, aircraft
         See `heliotrope.airborne.plan.flight_files.write_plan`.
     speed, rest
-        Between photographs, m/s, and time to come to rest, s.
+        Speed between photographs, m/s, and time to come to rest, s.
     """
     origin = site.latitude_deg, site.longitude_deg, site.height
     start = as_vectors(home, "home")

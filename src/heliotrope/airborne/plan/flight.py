@@ -56,13 +56,13 @@ class Craft:
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= 50:
-            raise InputError(f"{self.count} drones: give 1 to 50")
+            raise InputError(f"{self.count} drones: must be 1 to 50")
         if not 0.0 < self.speed <= 15.0:
-            raise InputError(f"speed {self.speed:g} m/s: give more than 0 and at most 15")
+            raise InputError(f"speed {self.speed:g} m/s: must be above 0 and at most 15")
         for name in ("acceleration", "photo", "endurance"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} {value:g}: give a number above 0")
+                raise InputError(f"{name} {value:g}: must be above 0")
         if not (np.isfinite(self.change) and self.change >= 0.0):
             raise InputError(f"battery change {self.change:g} s must not be below 0")
 
@@ -200,9 +200,9 @@ class _Routes:
         if route is None:
             station = self.stations[row]
             raise InputError(
-                f"{self.labels[station.cluster]}, calibration point {station.point + 1}: there is "
-                "no free route to it and back; widen the fence, raise the upper height limit or "
-                "move the home point"
+                f"{self.labels[station.cluster]}, calibration point {station.point + 1}: no free "
+                "route there and back; widen the fence, raise the upper height limit or move the "
+                "home point"
             )
         return route
 
@@ -337,7 +337,7 @@ class _Work:
                 if at_home:
                     raise InputError(
                         f"{self.routes.labels[station.cluster]}: {travel:.0f} s to fly there and "
-                        f"{self.back(row):.0f} s back leave no time for a photograph in "
+                        f"{self.back(row):.0f} s back leave no time for a photograph within "
                         f"{self.craft.endurance:.0f} s; take off closer to it"
                     )
                 self.land()
@@ -463,7 +463,7 @@ def timeline(
 
 
 def separation(sorties: Sequence[Sortie], stations: Sequence[HoverStation], craft: Craft) -> float:
-    """Return the least distance of two drones, m, checked every second; infinite for one drone."""
+    """Return the smallest distance between drones, m, checked every second; inf for one drone."""
     drones = sorted({s.drone for s in sorties})
     if len(drones) < 2:
         return float(np.inf)
@@ -531,14 +531,16 @@ def camera_target(
     """
     for name, value in (("minutes", minutes), ("targets", targets), ("clear share", clear)):
         if not (np.isfinite(value) and value > 0.0):
-            raise InputError(f"{name} {value:g}: give a number above 0")
+            raise InputError(f"{name} {value:g}: must be above 0")
     begin = np.datetime64(f"{year}-01-01").astype("datetime64[s]").astype(np.float64)
     # Every 29 minutes of a year, which samples all hours of the day equally.
     moments = begin + np.arange(0.0, 365.0 * 86400.0, 29.0 * 60.0)
     up = position(moments, site).elevation >= min_elevation
     sunny = 24.0 * float(up.mean()) * min(clear, 1.0)
     if sunny <= 0.0:
-        raise InputError(f"{site.label}: the sun is never {np.degrees(min_elevation):g}° high")
+        raise InputError(
+            f"{site.label}: the sun never reaches an elevation of {np.degrees(min_elevation):g}°"
+        )
     hours = photographs * minutes / 60.0 / targets
     return CameraTarget(hours, hours / sunny, hours / sunny / 30.44, sunny)
 

@@ -160,13 +160,13 @@ def write_missions(
     """Write the waypoint files of missions into a folder for each format; see `write_plan`."""
     for name in formats:
         if name not in FORMATS:
-            raise InputError(f"format {name!r}: give some of {', '.join(FORMATS)}")
+            raise InputError(f"format {name!r}: choose from {', '.join(FORMATS)}")
     try:
         for name in ("", *formats):
             (into / name).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"{into}: cannot be created ({error.strerror}); give another folder"
+            f"{into}: cannot be created ({error.strerror}); choose another folder"
         ) from None
     written = []
     for done, flown in enumerate(missions):
@@ -223,7 +223,7 @@ def commands(plan: FlightPlan) -> str:
 
 
 def document(plan: FlightPlan) -> dict[str, Any]:
-    """Return the plan as plan.json holds it; names carry the units."""
+    """Return the plan as stored in plan.json; names include the units."""
     settings, air = plan.settings, plan.settings.airspace
     timing = {v.station: [np.inf, 0.0] for s in plan.sorties for v in s.visits}
     for sortie in plan.sorties:
@@ -354,7 +354,7 @@ def read_airspace(path: str | Path, base: Airspace) -> tuple[Airspace, FloatArra
     known = {"min_height_m", "max_height_m", "margin_m", "home", "fence", "keep_out"}
     for key, node in root.items():
         if key not in known:
-            raise node.fail(f"unknown; known are {', '.join(sorted(known))}")
+            raise node.fail(f"unknown key; known keys are {', '.join(sorted(known))}")
     volumes = list(base.keep_outs)
     if root.has("keep_out"):
         volumes += [_keep_out(node) for node in root["keep_out"].elements()]

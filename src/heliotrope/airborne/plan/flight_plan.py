@@ -74,11 +74,13 @@ class PlanSettings:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.spread <= np.radians(45.0):
-            raise InputError(f"spread {np.degrees(self.spread):g}°: give more than 0°, up to 45°")
+            raise InputError(
+                f"spread {np.degrees(self.spread):g}°: must be above 0° and at most 45°"
+            )
         if not 0.0 < self.view < np.pi:
-            raise InputError(f"view {np.degrees(self.view):g}°: give more than 0°, below 180°")
+            raise InputError(f"view {np.degrees(self.view):g}°: must be above 0° and below 180°")
         if not 0.0 < self.hours_a_day <= 24.0:
-            raise InputError(f"{self.hours_a_day:g} hours a day: give more than 0, up to 24")
+            raise InputError(f"{self.hours_a_day:g} hours a day: must be above 0 and at most 24")
 
 
 @dataclass(frozen=True)
@@ -351,6 +353,6 @@ def _home(plant: Plant, settings: PlanSettings) -> FloatArray:
     if not settings.airspace.free_legs(start[None], up[None])[0]:
         raise InputError(
             f"home at {start[0]:.1f} m east, {start[1]:.1f} m north: it is in a keep-out or "
-            "outside the fence; give another with --home"
+            "outside the fence; choose another with --home"
         )
     return start

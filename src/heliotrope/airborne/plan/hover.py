@@ -71,16 +71,16 @@ class Sampling:
         for name, unit in units.items():
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} {value:g}{unit}: give a number above 0")
+                raise InputError(f"{name} {value:g}{unit}: must be above 0")
         if not 0.0 <= self.pointing <= 0.1:
             raise InputError(
-                f"pointing error {1e3 * self.pointing:g} mrad: give 0 to 100 mrad; roughly align "
-                "mirrors with larger errors first"
+                f"pointing error {1e3 * self.pointing:g} mrad: must be 0 to 100 mrad; roughly "
+                "align mirrors with larger errors first"
             )
         if not abs(self.focal) > 0.0:
-            raise InputError("focal length 0 m: give another, or infinity for flat facets")
+            raise InputError("focal length 0 m: use another value, or infinity for flat facets")
         if np.shape(self.led_offset) != (3,) or not np.isfinite(self.led_offset).all():
-            raise InputError("led_offset: give three numbers, right, down and forward, in metres")
+            raise InputError("led_offset: use three numbers (right, down, forward) in metres")
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def mirrors(plant: Plant) -> HoverMirrors:
         if len(group.mechanism.driven) != 2:
             raise InputError(
                 f"group {name}: its mechanism has {len(group.mechanism.driven)} drive; a flight "
-                "needs heliostats that turn about two axes"
+                "needs heliostats with two axes"
             )
     parts = []
     for group in plant.groups.values():
@@ -199,10 +199,10 @@ def face(
 
     Notes
     -----
-    Lamp and camera are at the same point, so the law asks for the normal n ∥ p − m.
-    The vertex m moves with the pose. The direction to p is taken from the previous vertex, and its
-    error shrinks by (offset / distance) in each of four rounds: at 100 m and an offset of 0.5 m,
-    to less than a nanometre.
+    Lamp and camera are treated as one point, so the normal must satisfy n ∥ p − m. The vertex m
+    moves with the pose. The direction to p is taken from the previous vertex, and its error shrinks
+    by (offset / distance) in each of four rounds: at 100 m and an offset of 0.5 m, to less than a
+    nanometre.
     """
     goal = as_float(point)
     start = armature.origin_1
@@ -234,7 +234,8 @@ class Pattern:
     spacing
         Spacing between neighbours, m.
     samples
-        Expected on each facet; fewer than asked for if the least spacing does not allow more.
+        Expected number of samples per facet; fewer than requested if the minimum spacing does not
+        allow more.
     camera
         Positions of the camera, row by row back and forth, ENU metres, (H, 3).
     """
@@ -297,14 +298,14 @@ def reach(
 
 
 def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tuple[float, float]:
-    """Return the spacing of a pattern, m, and the samples that it gives on the worst facet.
+    """Return the spacing of a pattern, m, and the number of samples on the worst facet.
 
     Parameters
     ----------
     facet_area, slant
         Smallest facet, m², and distance to the drone, m, of n mirrors, (n,).
     sampling
-        Sampling asked for.
+        Requested sampling.
 
     Raises
     ------
@@ -315,8 +316,8 @@ def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tu
     if scale.min() < _BLURRED:
         raise InputError(
             f"facets of {sampling.focal:g} m focal length, seen from "
-            f"{float(slant[scale.argmin()]):.0f} m: close to twice the focal length a facet lights "
-            "up as a whole; change the distance"
+            f"{float(slant[scale.argmin()]):.0f} m: close to twice the focal length the whole "
+            "facet lights up; change the distance"
         )
     # Drone spacing that gives the number of samples asked for.
     required = float((np.sqrt(facet_area / sampling.samples) * scale).min())
@@ -344,7 +345,7 @@ def pattern(
     point, direction
         Point that the mirrors face, and the normal of the plane, (3,).
     sampling
-        Sampling asked for.
+        Requested sampling.
     """
     p, d = as_float(point), as_float(direction)
     low, high = reach(corners, slopes, facing_vertex, p, d, sampling)

@@ -21,7 +21,7 @@ class Prospect:
     Attributes
     ----------
     reflections
-        Expected on the visible part of each mirror, (K, n).
+        Expected number on the visible part of each mirror, (K, n).
     side
         Root of each mirror's area in a photograph, px, (K, n).
     """
@@ -45,7 +45,7 @@ def prospect(
     """Return the prospect of patterns around ``points`` (K, 3) for the mirrors ``rows``, (n,).
 
     ``facing`` are their poses, batch shape (K, n). Mirrors of other clusters are not considered:
-    they stand in other poses, or move.
+    they are in other poses, or moving.
     """
     corners = mirrors.corners[rows]
     facets = np.isfinite(corners[:, :, 0, 0]).sum(axis=1)

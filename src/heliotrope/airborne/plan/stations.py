@@ -58,7 +58,7 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
     root = read_json(path, "a flight plan (plan.json)")
     version = root["format"].text()
     if version != "heliotrope flight plan 1":
-        raise root["format"].fail(f"{version!r} is not known; give 'heliotrope flight plan 1'")
+        raise root["format"].fail(f"{version!r} is unknown; use 'heliotrope flight plan 1'")
     index = {name: i for i, name in enumerate(names)}
     clusters: dict[str, tuple[npt.NDArray[np.intp], FloatArray]] = {}
     for node in root["clusters"].elements():

@@ -82,11 +82,12 @@ class Mission:
 
     def __post_init__(self) -> None:
         if not len(self.latitude_deg):
-            raise InputError(f"flight {self.name}: it has no waypoint; give one or more")
+            raise InputError(f"flight {self.name}: no waypoints; use one or more")
         if (np.abs(self.height) > 500.0).any():
             worst = float(self.height[int(np.argmax(np.abs(self.height)))])
             raise InputError(
-                f"flight {self.name}: a waypoint {worst:.1f} m above take-off; drones accept 500 m"
+                f"flight {self.name}: a waypoint {worst:.1f} m above take-off; drones accept at "
+                "most 500 m"
             )
 
     def __len__(self) -> int:
@@ -178,7 +179,7 @@ def _check_litchi(mission: Mission) -> None:
         k = int(np.argmin(gap))
         raise InputError(
             f"flight {mission.name}: waypoints {k + 1} and {k + 2} are {gap[k]:.2f} m apart; "
-            f"Litchi asks for {_LITCHI_APART} m: raise the least spacing, or leave out this format"
+            f"Litchi requires {_LITCHI_APART} m: raise the least spacing, or leave out this format"
         )
 
 
@@ -203,7 +204,9 @@ def wpml(mission: Mission, aircraft: str = "M3E") -> bytes:
     if aircraft not in AIRCRAFT:
         raise UnknownNameError("aircraft", aircraft, AIRCRAFT)
     if len(mission) > 65_536:
-        raise InputError(f"flight {mission.name}: {len(mission)} waypoints; WPML holds 65,536")
+        raise InputError(
+            f"flight {mission.name}: {len(mission)} waypoints; WPML allows at most 65,536"
+        )
     template = _document(mission, aircraft, template=True)
     waylines = _document(mission, aircraft, template=False)
     stream = io.BytesIO()
@@ -315,7 +318,7 @@ def _placemark(mission: Mission, k: int, template: bool) -> str:
 
 
 def _actions(mission: Mission, k: int) -> str:
-    """Return gimbal, rest and photograph; nothing where the drone only passes."""
+    """Return gimbal, hover and photograph actions; none where the drone only passes."""
     if not mission.photo[k]:
         return ""
     position = "<wpml:payloadPositionIndex>0</wpml:payloadPositionIndex>"
@@ -372,7 +375,7 @@ def qgc(mission: Mission, fence: Fence | None = None) -> str:
     mission
         The flight.
     fence
-        Airspace that the autopilot gets with the plan.
+        Airspace uploaded to the autopilot with the plan.
     """
     items: list[dict[str, Any]] = []
 

@@ -23,7 +23,7 @@ _START = datetime(2026, 6, 21, 10, 0, tzinfo=UTC)
 
 @dataclass(frozen=True)
 class DomeFlight:
-    """A simulated dome flight: photographs as taken and as recorded, and the targets' truth."""
+    """A simulated dome flight: photographs as taken and as recorded, and the true targets."""
 
     camera: LedCamera
     known_camera: LedCamera
@@ -37,7 +37,7 @@ def fly_dome(
 ) -> DomeFlight:
     """Return a dome flight with errors of RTK, gimbal, lens file and hovering.
 
-    The targets lie decimetres from where they are planned, a little tilted.
+    The targets are decimetres off their planned positions and slightly tilted.
     """
     applied = errors or Errors()
     rng = np.random.default_rng(seed)

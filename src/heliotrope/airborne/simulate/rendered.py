@@ -150,9 +150,9 @@ def compare(
 
 
 def visible_reflections(flight: Flight, exact: Reflections) -> dict[int, str]:
-    """Return the rows of reflections that no nearer mirror hides, within the frame.
+    """Return the reflections in the frame that no nearer mirror hides.
 
-    Each has its place: the first of `KINDS` that applies.
+    Each is labelled with its surroundings: the first of `KINDS` that applies.
     """
     stand, camera = flight.truth, flight.camera
     kinds: dict[int, str] = {}

@@ -64,7 +64,7 @@ class Conditions:
     motion
         Motion of the image during the exposure, pixels right and down.
     electrons
-        At full scale.
+        Electrons at full scale.
     read_noise
         Electrons.
     quality
@@ -282,7 +282,7 @@ def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene, r
 
 
 def _cover(image: Light, outline: FloatArray, colour: FloatArray, strength: float) -> None:
-    """Blend a colour over the pixels in a polygon (K, 2), each by its covered share."""
+    """Blend a colour over the pixels of a polygon (K, 2), each by its covered fraction."""
     height, width = image.shape[:2]
     low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 2, [width, height])
@@ -319,7 +319,7 @@ def _spot(
 
 
 def _bell(cells: npt.NDArray[np.intp], center: float, sigma: float) -> FloatArray:
-    """Return the share of a normal distribution in each cell of width 1."""
+    """Return the fraction of a normal distribution in each cell of width 1."""
     from scipy.special import ndtr
 
     edges = np.concatenate([cells - 0.5, cells[-1:] + 0.5])

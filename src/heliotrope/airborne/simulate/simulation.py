@@ -158,7 +158,7 @@ def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
     if (status != TrackingStatus.OK).any():
         i = int(np.flatnonzero(status != TrackingStatus.OK)[0])
         raise InputError(
-            f"heliostat {heliostats.names[i]}: cannot face {to.tolist()} m; choose another point"
+            f"heliostat {heliostats.names[i]}: cannot turn to {to.tolist()} m; choose another point"
         )
     return result.best_counts
 
@@ -247,7 +247,8 @@ def fly(
         _photograph(f"DJI_{k + 1:04d}.JPG", time, place, as_float(focus), applied, rng)
         for k, (time, place) in enumerate(zip(times, places, strict=True))
     ]
-    # Drawn last, so that a flight without these errors is the same as before they were thought of.
+    # Drawn last, so that flights without these errors stay the same as before these errors were
+    # added.
     stand = standing(really, counts)
     if applied.kinematics > 0.0:
         off = applied.kinematics * rng.normal(0.0, 1.0, stand.vertex.shape)

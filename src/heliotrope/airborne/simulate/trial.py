@@ -75,7 +75,7 @@ class TrialMirror:
     shape
         The mirror with its true slopes.
     rotation, vertex
-        True, (3, 3) and (3,).
+        True rotation, (3, 3), and vertex, (3,).
     expected_rotation, expected_vertex
         Expected.
     reflections
@@ -146,7 +146,7 @@ def trial_mirror(shape: MirrorShape, conditions: TrialConditions, seed: int) -> 
     places = np.stack(np.meshgrid(_line(c.columns) * half[0], _line(c.rows) * half[1]), axis=-1)
     places = places.reshape(-1, 2) + c.hover * rng.standard_normal((c.columns * c.rows, 2))
     own = np.concatenate([places, np.full((len(places), 1), c.distance)], axis=-1)
-    # Roughly where the mirror really points, which a first photograph shows.
+    # Roughly the mirror's true direction, which a first photograph would show.
     camera = expected_vertex + own @ true.T
     led = camera + c.lamp * right
     points = reflection_points(real, true, vertex, camera, led)

@@ -48,7 +48,7 @@ DAMPING, HARDER, REFUSALS = 1e-3, 8.0, 25
 
 @njit(**INNER)
 def loss_and_weights(square, loss):
-    """Loss ρ(s), its derivative ρ', and what the curvature 2 ρ'' adds along the residual.
+    """Loss ρ(s), its derivative ρ', and the contribution of the curvature 2 ρ'' along the residual.
 
     Far out the loss is concave along the residual; there the curvature is taken as 0, which
     keeps the matrix of the step positive definite.
@@ -97,7 +97,7 @@ def cholesky_solve(matrix, right, factor, out):
 
 @njit(**INNER)
 def inverse_from(factor, out):
-    """Inverse of factor · factorᵀ, of which the lower half is read."""
+    """Inverse of factor · factorᵀ; only the lower half of ``factor`` is read."""
     size = factor.shape[0]
     lower = np.empty((size, size))
     for j in range(size):
@@ -118,11 +118,11 @@ def inverse_from(factor, out):
 
 @njit(**INNER)
 def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
-    """Cost at y with gradient (P,) and hessian (P, P), lower half, by y.
+    """Cost at y, its gradient (P,) and the lower half of its Hessian (P, P) with respect to y.
 
-    The hessian is Gauss-Newton's with the weights of the loss, which the covariance is
-    made of; ``curved`` (1.0 or 0.0: for each bool there would be a kernel) adds the curvature of
-    the loss, which is the better step.
+    The Hessian is the Gauss-Newton approximation weighted by the loss, from which the covariance is
+    also computed. ``curved`` = 1.0 adds the curvature of the loss, which yields a better step (a
+    float, because numba would compile a kernel per bool).
     """
     base, codes, sigma, rows, data, squares, scratch, wrenches, jacobian = problem
     size = codes.shape[0]
@@ -198,7 +198,7 @@ def _minimise(problem, y, loss, scale, near, arrays, limit):
             damping = max(HARDER * damping, DAMPING)
             new = np.nan
         if math.isnan(new):
-            # Only rounding is left to gain.
+            # Further gains would be rounding errors.
             _normal_equations(problem, y, loss, scale, 1.0, hessian, gradient)
             return cost, iteration + 1, True
         for p in range(size):
@@ -291,7 +291,8 @@ def fit_block(
                 cost, steps, converged = _minimise(problem, y, kind, scale, near, solver, limit)
                 total += steps
                 if turn < rounds:
-                    # Few sightings fit themselves too well, so the stated sigma counts too.
+                    # With few sightings the residuals are too small, so the stated sigma is blended
+                    # in.
                     free = max(0.0, 2.0 * kept - size)
                     new = _median_scale(squares, keep, rows)
                     total_square = PRIOR_FREEDOM + 2.0 * kept * new * new * (free > 0.0)

@@ -61,8 +61,8 @@ def apply_parameters(codes, x, position, origins, angles, drives, vertex, normal
 def scratch_mechanism(joints, drives, slots, size):
     """Arrays for one moved mechanism, its pose at zero joint angles, and P twists.
 
-    A twist is (w, d); its place holds the number of driven joints before it, its drive (−1: none)
-    and its slot.
+    A twist is (w, d); its entry in the layout holds the number of driven joints before it, its
+    drive (−1: none) and its slot.
     """
     moved = (
         np.empty(3), np.empty((joints, 3)), np.empty(joints), np.empty((1, drives, slots)),
@@ -188,7 +188,7 @@ def _direction(ends, far, i, m):
 
 @njit(**INLINED)
 def _gap_axes(data, i, inverse):
-    """The two whitened axes f_k of sighting i, over the scale of the residuals."""
+    """The two whitened axes f_k of sighting i, divided by the scale of the residuals."""
     axes, whiten = data[5], data[6]
     a = (axes[i, 0, 0], axes[i, 0, 1], axes[i, 0, 2])
     b = (axes[i, 1, 0], axes[i, 1, 1], axes[i, 1, 2])
@@ -215,7 +215,7 @@ def _store(wrenches, k, q_0, g_0, q_1, g_1):
 
 @njit(**INLINED)
 def _turn_back(axis, point, sine, cosine, q, g):
-    """Turn a wrench back about the line through ``point``."""
+    """Rotate a wrench back about the line through ``point``."""
     q = about(axis, -sine, cosine, add(q, cross(point, g)))
     g = about(axis, -sine, cosine, g)
     return minus(q, cross(point, g)), g
@@ -223,7 +223,7 @@ def _turn_back(axis, point, sine, cosine, q, g):
 
 @njit(**INLINED)
 def sighting_residual(g, drives, data, i, inverse, wrenches):
-    """Residual of sighting i over the scale; fills wrenches (3, 2, 6)."""
+    """Residual of sighting i divided by the scale; fills wrenches (3, 2, 6)."""
     t = turns(drives, data[0], i)
     m = place_vertex(g, t)
     n = turned(g, t, (g[15], g[16], g[17]))

@@ -241,7 +241,7 @@ def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> S
 
 
 def derivative_by_turn(mechanism: Mechanism, sightings: Sightings) -> FloatArray:
-    """Return derivatives of whitened residuals by the rotation that is removed, (M, 2, 2).
+    """Return derivatives of whitened residuals with respect to the removed rotation, (M, 2, 2).
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def _axes(mechanism: Mechanism, counts: FloatArray) -> FloatArray:
 def derivative_by_shared(
     mechanism: Mechanism, sightings: Sightings, shift: FloatArray
 ) -> FloatArray:
-    """Return derivatives of whitened residuals by the shared errors removed, (M, 2, K).
+    """Return derivatives of whitened residuals by the removed shared errors, (M, 2, K).
 
     Parameters
     ----------

@@ -66,11 +66,11 @@ class FitOutcome(IntEnum):
 _TEXTS = {
     FitOutcome.CONVERGED: "converged",
     FitOutcome.NOT_CONVERGED: "the iteration did not settle; the parameters may not be the best",
-    FitOutcome.TOO_FEW: "no sightings: the parameters are the prior's",
+    FitOutcome.TOO_FEW: "no sightings, so the parameters stay at their prior values",
     FitOutcome.FAILED: "the residuals are not finite from the start; check the nominal mechanism",
-    FitOutcome.MISFIT: "no plausible parameters explain the sightings; they are the prior's",
-    FitOutcome.UNMOVED: "the mirror did not move: the parameters are the prior's",
-    FitOutcome.CLOCK: "the clock may be wrong: the parameters would take up its error",
+    FitOutcome.MISFIT: "no plausible parameters explain the sightings; they stay at the prior",
+    FitOutcome.UNMOVED: "the mirror did not move, so the parameters stay at their prior values",
+    FitOutcome.CLOCK: "the clock may be wrong, and the parameters would absorb its error",
 }
 
 
@@ -169,12 +169,12 @@ class FieldFit(Value, Framed):
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def __getitem__(self, heliostat: int | str) -> "FieldFit":
-        """Return the fit of one heliostat, by name or by row, without the axis N.
+        """Return the fit of one heliostat, by name or index, without the axis N.
 
         Raises
         ------
         InputError
-            If there is no such row.
+            If there is no such index.
         UnknownNameError
             If there is no such name.
         """
@@ -184,7 +184,7 @@ class FieldFit(Value, Framed):
             heliostat = self.heliostats.index(heliostat)
         count = np.size(self.scale)
         if not 0 <= heliostat < count:
-            raise InputError(f"heliostat {heliostat}: {count} were fitted; give a row or a name")
+            raise InputError(f"heliostat {heliostat}: {count} were fitted; pass an index or a name")
         return self.of_one(heliostat) if np.ndim(self.scale) else self
 
     def only(self, row: int) -> "FieldFit":
@@ -363,7 +363,7 @@ def _fit(
 
 
 def _reject(result: FieldFit, mechanism: Mechanism) -> None:
-    """Reject parameters that no mechanism can have; the heliostat keeps its nominal ones."""
+    """Reject impossible parameters; the heliostat keeps its nominal parameters."""
     most = np.array([mechanism.most(name) for name in result.names])
     beyond = ~(np.abs(result.values) <= most).all(axis=1)
     result.outcome[beyond & (result.outcome != FitOutcome.FAILED)] = FitOutcome.MISFIT
@@ -375,28 +375,31 @@ def _check_options(loss: str, max_iterations: int) -> None:
     if loss not in _LOSSES:
         raise UnknownNameError("loss", str(loss), _LOSSES)
     if not max_iterations >= 1:
-        raise InputError(f"max_iterations: {max_iterations}; give at least 1")
+        raise InputError(f"max_iterations: {max_iterations}; must be at least 1")
 
 
 def names_of(model: str | Sequence[str], mechanism: Mechanism) -> tuple[str, ...]:
-    """Return the parameters of a model by name, or of a list of names.
+    """Return the parameter names of a model or of an explicit list.
 
     Raises
     ------
     InputError
-        If it is neither.
+        If the argument is neither a name nor a list of names.
     UnknownNameError
         If there is no such model or parameter.
     """
     if isinstance(model, str):
         return parameter_table.model(model, mechanism.parameters)
     if not isinstance(model, list | tuple):
-        raise InputError(f"model: {kind_of(model)}; give the name of a model or a list of names")
+        raise InputError(
+            f"model: {kind_of(model)}; pass the name of a model or a list of parameter names"
+        )
     for name in model:
         if not isinstance(name, str):
             raise InputError(
-                f"model: {kind_of(name)} is not the name of a parameter; give names (fit_terms "
-                "fits own terms of drives, and its result gives sightings without them)"
+                f"model: {kind_of(name)} is not the name of a parameter; pass parameter names "
+                "(fit_terms fits own terms of drives, and its result gives sightings without "
+                "them)"
             )
         mechanism.parameter(name)
     return tuple(model)
@@ -415,7 +418,7 @@ def mask_of(selection: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArra
     mask = np.asarray(selection)
     if mask.shape != (rows,) or (mask.dtype != np.bool_ and rows):
         raise InputError(
-            f"{name}: {mask.dtype} of shape {mask.shape}; give a mask of booleans, ({rows},)"
+            f"{name}: {mask.dtype} of shape {mask.shape}; pass a boolean mask of shape ({rows},)"
         )
     return mask.astype(np.bool_)
 
@@ -429,8 +432,8 @@ def _priors(
     for name in names:
         if name.endswith("_worm_ratio"):
             raise InputError(
-                f"fit: {name} is searched, not fitted; give worm_ratio in the plant file, or the "
-                "model auto"
+                f"fit: {name} is found by a search, not by a fit; set worm_ratio in the plant "
+                "file, or use model auto"
             )
     columns = []
     for name in names:
@@ -439,14 +442,14 @@ def _priors(
             raise InputError(f"prior of {name}: {value} must be above 0 and finite")
         if value.shape not in ((), (len(mechanism),)):
             raise InputError(
-                f"prior of {name}: shape {value.shape}; give a number, or {len(mechanism)} of them"
+                f"prior of {name}: shape {value.shape}; pass one number or {len(mechanism)} numbers"
             )
         columns.append(np.broadcast_to(value, (len(mechanism),)))
     return np.stack(columns, axis=-1) if columns else np.empty((len(mechanism), 0))
 
 
 def canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
-    """Return the rows sorted by heliostat, then in an order that does not depend on their order."""
+    """Return sighting indices by heliostat, then in an order independent of the input."""
     first = (s.counts[:, -1], s.time, s.heliostat)
     order = np.lexsort(first)
     alike = np.ones(max(len(order) - 1, 0), dtype=np.bool_)

@@ -80,7 +80,7 @@ def table_terms(joint: str, drive: int, knots: npt.ArrayLike, prior: float) -> l
     """
     at = as_numbers(knots, "knots")
     if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0.0).all():
-        raise InputError(f"knots of {joint}: shape {at.shape}; give at least 2 ascending angles")
+        raise InputError(f"knots of {joint}: shape {at.shape}; pass at least 2 ascending angles")
 
     def hat(k: int) -> Callable[[FloatArray], FloatArray]:
         heights = np.eye(len(at))[k]
@@ -245,14 +245,14 @@ def _check(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> None:
     driven = [mechanism.joints[d] for d in mechanism.driven]
     names = [term.name for term in terms]
     if not names:
-        raise InputError("terms: 0 given; give at least 1, or use fit")
+        raise InputError("terms: the list is empty; pass at least 1 term, or use fit")
     for term in terms:
         if names.count(term.name) > 1:
-            raise InputError(f"term {term.name}: the name occurs twice; give each its own")
+            raise InputError(f"term {term.name}: the name occurs twice; name each term differently")
         if term.joint not in driven:
             raise UnknownNameError(f"driven joint (of term {term.name})", term.joint, driven)
         if not 0.0 < term.prior < np.inf:
-            raise InputError(f"term {term.name}: prior {term.prior}; give a number above 0")
+            raise InputError(f"term {term.name}: prior {term.prior}; it must be a number above 0")
 
 
 def _places(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> list[int]:
@@ -262,7 +262,7 @@ def _places(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> list[int]:
 
 
 def _shapes(terms: Sequence[DriveTerm], nominal: Mechanism, counts: FloatArray) -> FloatArray:
-    """Return the error by each term for a coefficient of 1, (M, K)."""
+    """Return the error from each term for a coefficient of 1, (M, K)."""
     angles = nominal.drives.angles(counts)
     columns = []
     for term in terms:
@@ -272,7 +272,7 @@ def _shapes(terms: Sequence[DriveTerm], nominal: Mechanism, counts: FloatArray) 
             column = np.empty(0)
         if column.shape != (len(counts),) or not np.isfinite(column).all():
             raise InputError(
-                f"term {term.name}: its function gave shape {column.shape} for angles "
+                f"term {term.name}: its function returned shape {column.shape} for angles "
                 f"{angles.shape}; return one finite number for each row"
             )
         columns.append(column)
@@ -286,7 +286,7 @@ def _moved(
     terms: Sequence[DriveTerm],
     values: FloatArray,
 ) -> FloatArray:
-    """Return the counts (M, D) at which mechanisms (M,) without terms stand as with them."""
+    """Return the counts (M, D) at which mechanisms (M,) have the same pose without their terms."""
     angles = mechanism.drives.angles(counts)
     for k, drive in enumerate(_places(mechanism, terms)):
         angles[:, drive] += values[:, k] * shapes[:, k]

@@ -40,8 +40,9 @@ def gram(
 ):
     """K (2 n, 2 m) of sightings with Jacobians (n, 2, P) and (m, 2, P).
 
-    ``part`` (C,) is the parameter of each process, ``amplitude`` and ``tau`` (C,) theirs;
-    ``same``: both are the same rows, so that i = j shares its drift even at an unknown time.
+    ``part`` (C,) is the parameter of each process, ``amplitude`` and ``tau`` (C,) belong to the
+    processes; ``same`` means that both sets are the same sightings, so that i = j shares its drift
+    even at an unknown time.
     """
     n, m, size = first.shape[0], second.shape[0], first.shape[2]
     out = np.empty((2 * n, 2 * m))
@@ -76,7 +77,7 @@ def gram(
 def _decaying_gram(
     jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
 ):
-    """As `gram` of the same rows, by symmetry; fills the lower half of ``decay`` (n, n, G).
+    """As `gram` for one set of sightings; fills the lower half of ``decay`` (n, n, G).
 
     Processes of one group have one time constant, so that one exponential serves them all. With
     unknown times the decay is 0.
@@ -116,7 +117,7 @@ def _decaying_gram(
 def cost_and_gradient(
     jacobian, time, label, epoch, residual, static, regime, step, part, group, amplitude, tau, noise
 ):
-    """Negative log likelihood and its gradient by log (noise, amplitudes (C,), times (G,)).
+    """Negative log likelihood, and its gradient by log (noise, amplitudes (C,), times (G,)).
 
     ``group`` (C,) says which of the G times a process has; ``tau`` is (G,).
     """
@@ -180,7 +181,7 @@ def pooled_block(
     start,
     stop,
 ):
-    """Cost and gradient of heliostats ``start`` to ``stop``, one a row."""
+    """Cost and gradient of heliostats ``start`` to ``stop``, one per row."""
     for i in range(start, stop):
         a, b = offsets[i], offsets[i + 1]
         cost, gradient = cost_and_gradient(
@@ -205,9 +206,10 @@ def pooled_block(
 
 @njit(**OPTIONS)
 def step_sums(inverse, alpha, slope):
-    """Sums over the rows from each sighting on, by the zeros: UᵀK⁻¹U (n, Z, Z) and UᵀK⁻¹r (n, Z).
+    """Sums over each sighting and later ones: UᵀK⁻¹U (n, Z, Z) and UᵀK⁻¹r (n, Z).
 
-    ``slope`` (n, 2, Z) are the derivatives by the Z zeros; U are those of the rows from k on.
+    ``slope`` (n, 2, Z) are the derivatives with respect to the Z zeros; U are those from sighting k
+    onwards.
     """
     n, size = slope.shape[0], slope.shape[2]
     totals, rights = np.zeros((n, size, size)), np.zeros((n, size))
@@ -240,7 +242,7 @@ def step_gains(
 ) -> FloatArray:
     """Gain in log evidence by a step of the zeros before each sighting, sorted by time, (n,).
 
-    ``variance`` (Z,) is that of the step; the first sighting has no step before it. The gain is
+    ``variance`` (Z,) is the variance of the step; no step precedes the first sighting. The gain is
     −½ log |1 + V UᵀK⁻¹U| + ½ bᵀ(V⁻¹ + UᵀK⁻¹U)⁻¹ b, b = UᵀK⁻¹r (matrix determinant lemma).
     """
     totals, rights = step_sums(inverse, alpha, slope)

@@ -18,7 +18,7 @@ FEWEST = 3
 
 @njit(**INNER)
 def _segment(residual, jacobian, start, stop, shift):
-    """Cost of one segment with zeros of its own, by re-weighted least squares from its median."""
+    """Cost of one segment with its own zeros, by reweighted least squares from the median."""
     n = stop - start
     values = np.empty((2, n))
     for i in range(n):
@@ -57,7 +57,7 @@ def _segment(residual, jacobian, start, stop, shift):
 
 @njit(**OPTIONS)
 def partition(residual, jacobian, places, smallest):
-    """Best cut of sightings (n, 2) at ``places``; returns labels (n,), 0 for the common zeros."""
+    """Best partition of sightings (n, 2) with cuts at ``places``; labels (n,), 0: common zeros."""
     n, count = len(residual), len(places)
     plain = np.zeros(n + 1)
     for i in range(n):

@@ -131,7 +131,7 @@ def _same(mean, covariance, i, j):
 
 @njit(**INNER)
 def _merge(mean, covariance, weight, i, j):
-    """Moments of hypotheses i and j together, into i."""
+    """Merge hypotheses i and j into i, preserving their combined moments."""
     total = weight[i] + weight[j]
     a, b = weight[i] / total, weight[j] / total
     size = mean.shape[1]
@@ -166,7 +166,7 @@ def _total(values, count):
 
 @njit(**INNER)
 def _heaviest_first(weight, count):
-    """Places of the weights, the largest first, equal ones in their order."""
+    """Indices of the weights in descending order; equal weights keep their order."""
     order = np.empty(count, dtype=np.int64)
     for k in range(count):
         j = k
@@ -179,9 +179,9 @@ def _heaviest_first(weight, count):
 
 @njit(**INNER)
 def _reduce(mean, covariance, weight, regime, count):
-    """Order hypotheses by weight, merge those alike and drop the improbable; return their number.
+    """Sort hypotheses by weight, merge similar and drop improbable ones; return their number.
 
-    The best are at the places in ``keep``.
+    Their indices are in ``keep``.
     """
     order = _heaviest_first(weight, count)
     keep = np.empty(MOST, dtype=np.int64)

@@ -271,11 +271,11 @@ def _figures_of(
 
 
 def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAccuracy | None:
-    """Return the zeros before the fit and the scatter after it, of held-out sightings.
+    """Return the zeros before the fit and the scatter after it, from held-out sightings.
 
-    Guo's γ', α' are the drives' angles: those of the nominal drives for the zeros, (44) and
-    (46), so that the zero itself is found, and not what the fit leaves of it; those of the learnt
-    drives for the scatter, (45) and (47). His γ, α, (43), are the angles at which the learnt
+    Guo's γ', α' are drive angles. For the zeros, (44) and (46), they are the angles of the nominal
+    drives, so that the zero itself is found and not its remainder after the fit; for the scatter,
+    (45) and (47), those of the learnt drives. His γ, α, (43), are the angles at which the learnt
     mechanism reflects the source to the observed destination.
     """
     learned_mirrors = moved_by(learned.mechanism, sightings.heliostat, learned.names, values)
@@ -311,7 +311,7 @@ def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAcc
 
 
 def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, ...]:
-    """Return a line on each heliostat that was not learnt or that no parameters explain, and why.
+    """Return a message for each heliostat that was not learnt or that no parameters explain.
 
     Parameters
     ----------
@@ -362,14 +362,14 @@ def _scatter(white: FloatArray, sigma: FloatArray) -> str:
     beam = 1e3 * float(np.median(white * sigma))
     return (
         f"half of its beams are more than {beam:.2f} mrad, {np.median(white):.0f} times their "
-        "sigma, from where the others put them; give the true sigma, or check model and counts"
+        "sigma, from where the others put them; specify the true sigma, or check model and counts"
     )
 
 
 def _reason(beyond: int, unexplained: int, count: int) -> str:
     if beyond > unexplained:
         return (
-            f"{beyond} of {count} sightings have counts beyond the reach of its drives. Probably "
+            f"{beyond} of {count} sightings have counts outside the range of its drives. Probably "
             "the counts were recorded wrongly, or the properties of its drives are wrong."
         )
     if unexplained > NOTHING * count:

@@ -150,7 +150,7 @@ class Hyperparameters:
         return np.asarray(np.log(np.concatenate([[self.noise], self.amplitude, self.tau])))
 
     def with_vector(self, vector: FloatArray) -> "Hyperparameters":
-        """Return these with noise, amplitudes and time constants set from a log vector."""
+        """Return a copy with noise, amplitudes and time constants set from a log vector."""
         values = np.exp(vector)
         c = len(self.processes)
         return replace(
@@ -222,7 +222,7 @@ class Linear:
     steps
         Times of the steps of the zeros, days, ascending, (K,).
     suspect
-        Whether a sighting is far from the robust fit and is used only if the others agree with it,
+        Whether a sighting is far from the robust fit, and so used only if the others agree with it,
         (n,).
     """
 
@@ -256,7 +256,7 @@ class Linear:
         return np.asarray(np.nan_to_num(np.abs(time[:, None] - known).min(axis=1), nan=0.0))
 
     def take(self, rows: npt.ArrayLike) -> "Linear":
-        """Return some of the rows."""
+        """Return the sightings at some indices."""
         index = np.asarray(rows)
         return replace(
             self,
@@ -276,7 +276,7 @@ class Linear:
         return np.where(self.own, hyper.wide, hyper.spread)
 
     def rest(self, hyper: Hyperparameters) -> FloatArray:
-        """Value less the part that the population mean explains, (n, 2)."""
+        """Value minus the part explained by the population mean, (n, 2)."""
         return np.ascontiguousarray(self.value - self.jacobian @ self.mean(hyper))
 
 
@@ -419,7 +419,7 @@ def _search(
 
 
 def _no_less_than_nothing(covariances: FloatArray, before: FloatArray) -> FloatArray:
-    """Covariances (m, P, P) without negative eigenvalues from rounding.
+    """Remove negative eigenvalues caused by rounding from covariances (m, P, P).
 
     Directions that the data determine almost exactly are differences of nearly equal numbers. In
     units of the prior standard deviations (variances ``before``, (m, P)), no direction is assumed
@@ -489,7 +489,7 @@ class Posterior:
         return values, _no_less_than_nothing(covariances, own)
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return z² (n,), error (n, 2), covariance (n, 2, 2) of each given the other sightings."""
+        """Return z² (n,), error (n, 2), covariance (n, 2, 2) of each sighting given the others."""
         return left_out(self.inverse, self.alpha)
 
     def log_predictive(self) -> FloatArray:
@@ -542,7 +542,7 @@ def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
 
 
 def permissive(hyper: Hyperparameters) -> Hyperparameters:
-    """Return ``hyper`` with zeros that may move as far within days as a step moves them.
+    """Return ``hyper`` with zeros that may move within days by as much as a step.
 
     A sighting that is an outlier even then does not indicate a step.
     """
@@ -564,8 +564,8 @@ def permissive(hyper: Hyperparameters) -> Hyperparameters:
 def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
     """Return the times (days) of steps of the zeros that the evidence supports.
 
-    The best time is found in closed form, then the next given the first, as long as the log
-    evidence grows enough.
+    The best time is found in closed form, then the next given the first, and so on as long as the
+    log evidence increases enough.
     """
     moving = np.flatnonzero(hyper.step > 0)
     order = np.argsort(data.time, kind="stable")

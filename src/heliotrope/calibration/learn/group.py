@@ -31,14 +31,15 @@ APART = 3600.0
 
 @dataclass(frozen=True)
 class GroupHistory:
-    """All measurements of a group of mirrors.
+    """All measurements of a group of heliostats.
 
     Attributes
     ----------
     mechanism
-        Nominal mechanisms of its N mirrors, (N,).
+        Nominal mechanisms of the N heliostats, (N,).
     sightings
-        The photographs of each, of heliostat 0; None without any, N.
+        Photographs of each heliostat, as sightings of heliostat 0; None if there are none; N in
+        total.
     model
         The constant parameters.
     before
@@ -53,7 +54,7 @@ class GroupHistory:
 
 @dataclass(frozen=True)
 class GroupTask:
-    """What a group is learnt from: M sightings of K of its mirrors; see `GroupHistory`."""
+    """Data from which a group is learnt: M sightings of K of its heliostats; see `GroupHistory`."""
 
     mechanism: Mechanism
     sightings: Sightings
@@ -70,10 +71,10 @@ class LearntGroup:
     hyper
         Its hyperparameters.
     heliostats, sightings
-        Numbers of each that they were learnt from.
+        Number of heliostats and of sightings from which they were learnt.
     gain
-        How much better they foretell a sighting from those before it than the hyperparameters
-        before: mean difference of the log probability density.
+        How much better they predict a sighting from the earlier ones than the previous
+        hyperparameters did: mean difference of the log probability density.
     """
 
     hyper: Hyperparameters
@@ -83,12 +84,12 @@ class LearntGroup:
 
 
 def defaults(mechanism: Mechanism, model: tuple[str, ...]) -> Hyperparameters:
-    """Return the hyperparameters that hold before anything was learnt."""
+    """Return the hyperparameters that apply before anything is learnt."""
     return replace(drift.start(mechanism, model), rate=drift.step_rate(()))
 
 
 def able(histories: Sequence[Sightings | None]) -> npt.NDArray[np.intp]:
-    """Return the rows of mirrors with enough sightings to teach, on two days or more."""
+    """Return the heliostats with enough sightings to learn from, on at least two days."""
     rows = []
     for row, sightings in enumerate(histories):
         known = np.zeros(0) if sightings is None else sightings.time[np.isfinite(sightings.time)]
@@ -103,7 +104,7 @@ def gathered(group: GroupHistory) -> GroupTask:
     Raises
     ------
     InputError
-        If fewer than `TEACHERS` mirrors can teach.
+        If fewer than `TEACHERS` heliostats have enough sightings.
     """
     rows = able(group.sightings)
     if len(rows) < TEACHERS:
@@ -121,9 +122,9 @@ def gathered(group: GroupHistory) -> GroupTask:
 
 
 def thinned(sightings: Sightings, most: int = MOST) -> Sightings:
-    """Return some of a mirror's sightings in order of time: whole visits, the last one among them.
+    """Return some of a heliostat's sightings in order of time: whole visits, with the last one.
 
-    Visits are kept whole, for what moves within hours, and spread over the years, for what moves
+    Visits are kept whole to show motion within hours, and spread over the years to show motion
     within months.
     """
     order = np.flatnonzero(np.isfinite(sightings.time))
@@ -151,7 +152,7 @@ def learn_group(task: GroupTask) -> LearntGroup:
 
 
 def density(task: GroupTask, fitted: FieldFit, hyper: Hyperparameters) -> float:
-    """Return the log probability density of all sightings, each foretold by those before it."""
+    """Return the log density of all sightings, each predicted from the earlier ones."""
     total = 0.0
     for row in range(len(task.mechanism)):
         if int(fitted.outcome[row]) == FitOutcome.CONVERGED:
@@ -163,7 +164,7 @@ def density(task: GroupTask, fitted: FieldFit, hyper: Hyperparameters) -> float:
 
 
 def described(hyper: Hyperparameters) -> str:
-    """Return the drift and the noise in words."""
+    """Describe the drift and the noise in words."""
     tau = dict(zip(hyper.groups, hyper.tau.tolist(), strict=True))
     parts = []
     for group in hyper.groups:
@@ -184,7 +185,7 @@ _ARRAYS = ("mean", "spread", "regime", "step", "wide", "amplitude", "tau")
 
 
 def document_of(hyper: Hyperparameters) -> dict[str, Any]:
-    """Return hyperparameters for JSON."""
+    """Return hyperparameters as a record for JSON."""
     return {
         "names": list(hyper.names),
         "processes": [[p.parameter, p.group] for p in hyper.processes],
@@ -201,7 +202,7 @@ def read_hyperparameters(document: dict[str, Any]) -> Hyperparameters:
     Raises
     ------
     InputError
-        If it is not such a document.
+        If the document is not valid.
     """
     try:
         arrays: dict[str, Any] = {n: np.array(document[n], dtype=np.float64) for n in _ARRAYS}

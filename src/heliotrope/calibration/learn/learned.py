@@ -132,7 +132,7 @@ class Learned(Value, Framed):
     around
         Site of the heliostats, if known.
     misfits
-        Heliostats that their sightings do not describe, with the reason; these are not learnt.
+        Heliostats that do not fit their sightings, with the reason; these are not learnt.
     """
 
     mechanism: Mechanism
@@ -169,7 +169,7 @@ class Learned(Value, Framed):
         return heliostat
 
     def __getitem__(self, heliostat: int | str) -> "Learned":
-        """Return one heliostat of the field, by name or by row."""
+        """Return one heliostat of the field, by name or index."""
         i = self.row(heliostat)
         mine = np.flatnonzero(self.sightings.heliostat == i)
         place = np.full(len(self.sightings), -1)
@@ -190,7 +190,7 @@ class Learned(Value, Framed):
         )
 
     def doubted(self) -> "Learned":
-        """Return the same result marked as doubtful clock: no heliostat counts as learnt."""
+        """Return the result marked for a doubtful clock: no heliostat counts as learnt."""
         outcome = self.static.outcome.copy()
         outcome[np.isin(outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))] = (
             FitOutcome.CLOCK
@@ -310,7 +310,7 @@ class Learned(Value, Framed):
         invalid = (rows < 0) | (rows >= len(self.members))
         if invalid.any():
             raise InputError(
-                f"heliostat: row {rows[invalid].flat[0]} is not learnt; rows go from 0 to "
+                f"heliostat: row {rows[invalid].flat[0]} was not learnt; rows run from 0 to "
                 f"{len(self.members) - 1}"
             )
         when = np.broadcast_to(unix_seconds(time, unknown=True), rows.shape)
@@ -424,12 +424,12 @@ def _forecast(
     place = site or learned.around.site
     if place is None:
         raise InputError(
-            "forecast: it was learnt from mechanisms alone, so the sun above them is unknown; give "
+            "forecast: the model was learnt from mechanisms alone, without a site; pass "
             "site=Site(latitude, longitude, height), or learn from plant[name] or the plant"
         )
     when = np.atleast_1d(unix_seconds(times))
     if when.ndim != 1:
-        raise InputError(f"times: shape {when.shape}; give a list of times, (T,)")
+        raise InputError(f"times: shape {when.shape}; pass a one-dimensional array of times (T,)")
     light, aim = solar.vector(when, place), point_of(target, learned.around.targets)
     mine = learned.sightings.heliostat == row
     if steered is None:

@@ -138,7 +138,7 @@ def prepare(
 
 
 def _without_unusable(prepared: Prepared, usable: npt.NDArray[np.bool_]) -> Prepared:
-    """Leave out sightings; ``usable`` is in the order of the rows of all heliostats."""
+    """Leave out unusable sightings; ``usable`` is in the order of all heliostats' sightings."""
     if usable.all():
         return prepared
     regime, unusable = prepared.regime.copy(), prepared.unusable.copy()
@@ -158,7 +158,7 @@ def _without_unusable(prepared: Prepared, usable: npt.NDArray[np.bool_]) -> Prep
 def relinearise(
     mechanism: Mechanism, sightings: Sightings, prepared: Prepared, members: Sequence[Posterior]
 ) -> Prepared:
-    """Linearise each sighting again about the posterior of its heliostat at its time.
+    """Relinearise each sighting about its heliostat's posterior at that time.
 
     A Gauss-Newton step on the whole history: the robust fit may lie far from the posterior with
     population, regimes and drift, and the law of a jack is not linear.
@@ -205,7 +205,7 @@ def repeatability(time: FloatArray, residual: FloatArray) -> float:
 def _by_heliostat(
     s: Sightings, used: npt.NDArray[np.bool_], count: int
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Offsets (N + 1,) and the used rows by heliostat, in an order independent of the input."""
+    """Offsets (N + 1,) and used sightings by heliostat, in an order independent of the input."""
     order = canonical_order(s)
     order = order[used[order]]
     return np.searchsorted(s.heliostat[order], np.arange(count + 1)), order
@@ -249,7 +249,7 @@ def _without_outliers(hyper: Hyperparameters, data: Linear) -> Linear:
 def finish(
     hyper: Hyperparameters, data: Linear, own: bool = True
 ) -> tuple[Posterior, npt.NDArray[np.bool_]]:
-    """Return one heliostat's posterior under the field's ``hyper``, and the mask of its outliers.
+    """Return one heliostat's posterior under the field's ``hyper``, and a mask of its outliers.
 
     With ``own`` its noise and drift may differ from the field's.
     """
@@ -281,8 +281,8 @@ def learn(
 ) -> Learned:
     """Learn parameters, regimes, drift and noise of every heliostat.
 
-    A heliostat that its sightings do not describe keeps its nominal parameters and does not
-    influence the field; ``misfits`` of the result names it with the reason.
+    A heliostat that does not fit its sightings keeps its nominal parameters and does not influence
+    the field; the result lists it in ``misfits`` with the reason.
 
     Parameters
     ----------
@@ -406,7 +406,7 @@ def _cut(
     task: Task,
     rows: npt.NDArray[np.intp],
 ) -> tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, npt.NDArray[np.intp]]:
-    """The part of a field with heliostats ``rows``, renumbered, and the rows of its sightings."""
+    """Select heliostats ``rows`` of a field, renumbered, and the indices of their sightings."""
     place = np.full(len(mechanism), -1)
     place[rows] = np.arange(len(rows))
     mine = np.flatnonzero(place[sightings.heliostat] >= 0)

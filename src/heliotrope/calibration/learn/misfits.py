@@ -1,4 +1,4 @@
-"""Heliostats that their sightings do not describe, with the likely reason.
+"""Heliostats that do not fit their sightings, with the likely reason.
 
 If a motor is connected in reverse, or sightings are assigned to the wrong heliostat, the sightings
 fit no parameters, or only absurd ones. Each likely mistake is a hypothesis: the sightings are
@@ -91,7 +91,7 @@ def find_misfits(
     used: npt.NDArray[np.bool_] | None = None,
     targets: Sequence[Target] = (),
 ) -> tuple[Misfit, ...]:
-    """Return the heliostats that their sightings do not describe.
+    """Return the heliostats that do not fit their sightings.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def find_misfits(
 
 
 def scattered(row: int, white: FloatArray, sigma: FloatArray) -> Misfit | None:
-    """Return the misfit of a heliostat whose sightings contradict each other; None if they agree.
+    """Return the misfit of a heliostat whose sightings are inconsistent; None if they agree.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def _reflected(
 
 
 def _some(sightings: Sightings, most: int) -> Sightings:
-    """Return at most ``most`` sightings, spread over all."""
+    """Return at most ``most`` sightings, spread evenly over all."""
     places = np.linspace(0, len(sightings) - 1, min(most, len(sightings))).round().astype(np.intp)
     return sightings.take(np.unique(places))
 
@@ -251,8 +251,8 @@ def _unmoved(mechanism: Mechanism, sightings: Sightings) -> Iterator[Misfit]:
             yield Misfit(
                 int(row),
                 FitOutcome.UNMOVED,
-                f"the mirror did not move: {amount(len(mine), 'sighting')} of different suns have "
-                "the same counts; check its motors and the log of the counts",
+                f"the mirror did not move: {amount(len(mine), 'sighting')} under different sun "
+                "directions have the same counts; check its motors and the log of the counts",
             )
 
 
@@ -272,7 +272,7 @@ def _median_errors(mechanism: Mechanism, sightings: Sightings, fitted: FieldFit)
 def _hopeless(
     mechanism: Mechanism, mine: Sightings, outcome: FitOutcome, strain: float, error: float
 ) -> str | None:
-    """Return why a fit cannot be valid even without wrong sightings, None if it can."""
+    """Return why a fit cannot be valid even if no sighting is wrong; None if it can."""
     still = [
         mechanism.joints[joint]
         for d, joint in enumerate(mechanism.driven)

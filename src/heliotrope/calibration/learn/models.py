@@ -191,7 +191,7 @@ def choose_model(scored: tuple[ScoredModel, ...]) -> ScoredModel:
 
 
 def describe(scored: tuple[ScoredModel, ...]) -> tuple[str, ...]:
-    """Return a line on the comparison of models; nothing if there was none."""
+    """Return one line on the comparison of models; no line if there was none."""
     if not scored:
         return ()
     listed = ", ".join(f"{c.name} {c.behind:.3f}±{c.behind_error:.3f}" for c in scored)

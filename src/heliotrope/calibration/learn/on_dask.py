@@ -21,7 +21,7 @@ def connect(scheduler: str) -> "Client":
     Raises
     ------
     InputError
-        If dask.distributed is not installed, or no scheduler answers there.
+        If dask.distributed is not installed, or no scheduler replies at this address.
     """
     try:
         from distributed import Client, LocalCluster
@@ -42,7 +42,7 @@ def connect(scheduler: str) -> "Client":
         return Client(scheduler, timeout="5s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"scheduler {scheduler!r}: no answer ({str(error).splitlines()[0]}); give "
+            f"scheduler {scheduler!r}: no reply ({str(error).splitlines()[0]}); use "
             "tcp://HOST:PORT of a running dask scheduler, or local:N"
         ) from None
 
@@ -66,7 +66,7 @@ def runner(client: "Client") -> Runner:
 
 
 def disconnect(client: "Client") -> None:
-    """Leave the scheduler; stop it if `connect` started it on this machine."""
+    """Disconnect from the scheduler, and stop it if `connect` started it on this computer."""
     machines = client.cluster
     client.close()  # type: ignore[no-untyped-call]
     if machines is not None:

@@ -25,7 +25,8 @@ from heliotrope.mechanism.chain import Mechanism
 
 #: Fewest visits for a comparison.
 FEWEST = 8
-#: Only the last visits are compared: older ones cost time and tell of an older machine.
+#: Only the latest visits are compared, because older visits cost time and describe an older state
+#: of the mechanism.
 MOST = 60
 #: Sightings that constants are fitted to and models are chosen by, the last ones: work that
 #: does not grow with the age of the plant.
@@ -35,7 +36,7 @@ NOISES = np.geomspace(0.2, 2.0, 9)
 
 
 def latest(sightings: Sightings) -> Sightings:
-    """Return the last `RECENT` sightings; those of unknown time are the first to go."""
+    """Return the latest `RECENT` sightings; sightings of unknown time are dropped first."""
     if len(sightings) <= RECENT:
         return sightings
     order = np.argsort(np.nan_to_num(sightings.time, nan=-np.inf), kind="stable")
@@ -106,7 +107,7 @@ class OwnModel:
             return fitted
         count, ratios = len(fitted.names), np.array([e.ratio - e.known for e in self.errors])
         sigmas = np.array([e.sigma for e in self.errors])
-        # A harmonic of a known ratio is as exact as that, and as far away as its turns.
+        # A harmonic is as exact as the known ratio.
         priors = np.where(sigmas > 0.0, sigmas, np.abs(ratios))
         covariance = np.zeros((1, count + len(ratios), count + len(ratios)))
         covariance[:, :count, :count] = fitted.covariance
@@ -180,7 +181,7 @@ def _scored(
 def _left_out(
     mechanism: Mechanism, s: Sightings, names: tuple[str, ...], mean: FloatArray
 ) -> FloatArray:
-    """Log density of each visit given the others, (V,), with the noise that makes it largest."""
+    """Log density of each visit given the others, (V,), at the noise that maximises it."""
     fitted = fit(mechanism, s, names)
     moved = mechanism.with_parameters(fitted.parameters)
     line = linearise(moved[s.heliostat], s, names)

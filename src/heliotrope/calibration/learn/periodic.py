@@ -38,13 +38,13 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.kernels import slots as slot
 
-#: A peak that chance makes more often than this is not taken.
+#: A peak with a larger false-alarm probability than this is rejected.
 LEVEL = 1e-3
 #: A second peak this close in −ln P leaves the ratio open: it is one hundredth as probable.
 RIVAL = float(np.log(100.0))
 #: Fewest degrees of freedom that the constants must leave.
 FREEDOM = 10
-#: The constants float within this many times their priors.
+#: The constants may vary within this many times their priors.
 WIDER = 3.0
 #: Fewest turns of the worm within the range of a drive; slower waves look like constants.
 FEWEST_TURNS = 1.5
@@ -57,7 +57,8 @@ VISIT = 300.0
 #: Harmonics of a known ratio: a bore off centre errs once in a turn of the worm, an oval worm twice
 #: (Malan, thesis, 6.4), one with three lobes three times.
 HARMONICS = np.array([1.0, 2.0, 3.0])
-#: Fits that take the wave of a ratio that is found into account, each from the ratio of the last.
+#: Number of fits that include the wave of a ratio that was found, each starting from the previous
+#: ratio.
 REFINEMENTS = 3
 #: Residuals of the robust fit longer than this, in units of its scale, do not count.
 OUTLIER = 5.0
@@ -119,7 +120,7 @@ class PeriodicError:
         }
 
     def __str__(self) -> str:
-        """Return one line for people."""
+        """Return one line for display."""
         size = 1e3 * float(np.nanmedian(self.amplitude))
         count = int(np.isfinite(self.amplitude).sum())
         phase = f", phase {np.degrees(self.phase[0]):.0f}°" if len(self.phase) == 1 else ""
@@ -132,16 +133,17 @@ class PeriodicError:
 
 @dataclass(frozen=True)
 class _Member:
-    """One heliostat: V visits, whitened residuals, and what the constants can explain.
+    """One heliostat: V visits, whitened residuals, and the effect of the constants.
 
     Attributes
     ----------
     row
         Row of the heliostat.
     x, lever
-        Argument of the worm (V, D) and derivative of the residual by the angle, (V, 2, D).
+        Argument of the wave (V, D) and derivative of the residual with respect to the angle, (V, 2,
+        D).
     whiten
-        Makes the noise white and takes the part of the constants out, (2 V, 2 V).
+        Matrix that whitens the noise and removes the contribution of the constants, (2 V, 2 V).
     rest
         Whitened residuals, (2 V,).
     freedom
@@ -167,7 +169,7 @@ class _Member:
         waves = self.waves(drive, ratios)
         normal = np.swapaxes(waves, 1, 2) @ waves
         right = np.swapaxes(waves, 1, 2) @ self.rest
-        # A wave that the constants can imitate has next to no columns left; it gains nothing.
+        # A wave that the constants can imitate has almost nothing left, and gains nothing.
         size = np.trace(normal, axis1=1, axis2=2)
         normal = normal + (1e-9 * size + 1e-30)[:, None, None] * np.eye(2)
         coefficients = np.linalg.solve(normal, right[..., None])[..., 0]
@@ -181,7 +183,7 @@ def search_periodic_errors(
 ) -> tuple[PeriodicError, ...]:
     """Return the best periodic error of each drive whose ratio is unknown, most significant first.
 
-    Each comes with its probability of arising by chance; use only errors that are
+    Each is returned with its probability of arising by chance; use only errors that are
     `PeriodicError.found`. The search runs from `FEWEST_TURNS` to as many periods within the range
     of the drive as there are calibration visits, because more periods than visits cannot be
     distinguished from fewer. For a drive whose ratio is known only the `HARMONICS` are tried, and
@@ -225,7 +227,7 @@ def _joint(mechanism: Mechanism, drive: int) -> str:
 def _known_ratios(mechanism: Mechanism) -> dict[int, float]:
     """Ratio of each drive that may have a periodic error, 0 if unknown.
 
-    A drive whose heliostats have several ratios is left out: an error has one ratio.
+    Drives whose heliostats have different ratios are skipped, because an error has a single ratio.
     """
     table = mechanism.drives.table[..., SLOTS["worm_ratio"]].reshape(-1, len(mechanism.driven))
     return {
@@ -247,8 +249,8 @@ def _members(
 ) -> list[_Member]:
     """Heliostats with enough visits after a robust fit of all constants and of known worms.
 
-    The last ``out`` of the ``worms`` are fitted, so that the noise is known without them, but they
-    do not float with the constants.
+    The last ``out`` of the ``worms`` are fitted, so that the noise excludes them, but they are not
+    projected out with the constants.
     """
     names = (*parameter_table.model("full", mechanism.parameters), *worms)
     fitted = fit(mechanism, s, names)
@@ -320,7 +322,7 @@ def _visit_means(time: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def _without(member: _Member, drive: int, ratio: float) -> _Member:
-    """Project a wave that was found out of the residuals, as the constants are."""
+    """Project a wave that was found out of the residuals, as for the constants."""
     basis, _ = np.linalg.qr(member.waves(drive, np.array([ratio]))[0])
     out = np.eye(len(basis)) - basis @ basis.T
     return replace(
@@ -355,7 +357,8 @@ def _peak(
     bounds = (near - step, near + step)
     solution = minimize_scalar(lost, bounds=bounds, method="bounded")
     ratio, height = float(solution.x), -float(solution.fun)
-    # −ln P is a log likelihood ratio but for terms of order 1/ν: its curvature gives the variance.
+    # −ln P is a log likelihood ratio up to terms of order 1/ν, so its curvature yields the
+    # variance.
     far = 0.25 * step
     curvature = (lost(ratio + far) + 2.0 * height + lost(ratio - far)) / far**2
     return ratio, height, float(1.0 / np.sqrt(max(curvature, 1e-12)))
@@ -364,7 +367,7 @@ def _peak(
 def _strongest(
     mechanism: Mechanism, s: Sightings, drives: dict[int, float], taken: tuple[PeriodicError, ...]
 ) -> tuple[int, PeriodicError] | None:
-    """The drive with the highest peak, and its error; the waves of ``taken`` errors float."""
+    """The drive with the highest peak, and its error; ``taken`` waves are projected out."""
     members = _members(with_ratios(mechanism, taken), s, _worms(taken))
     spectra: dict[int, tuple[FloatArray, FloatArray, float]] = {}
     grids = {k: _grid(members, k) for k in drives} if members else {}
@@ -404,8 +407,8 @@ def _strongest(
         known=known,
     )
     for _ in range(REFINEMENTS if error.found else 0):
-        # The wave was noise to the fit that found it: too large a noise makes the constants stiff,
-        # and stiff constants bias the ratio.
+        # The fit that found the wave counted it as noise; noise that is too large makes the
+        # constants stiff, which biases the ratio.
         errors = (*taken, error)
         members = _members(with_ratios(mechanism, errors), s, _worms(errors), out=2)
         if not known:
@@ -429,10 +432,10 @@ def _worms(errors: tuple[PeriodicError, ...]) -> tuple[str, ...]:
 def _colour(
     members: list[_Member], drive: int, ratio: float, ratios: FloatArray, width: float
 ) -> float:
-    """How much higher than white noise the spectrum around a peak is without it, at least 1.
+    """Ratio of the spectrum around a peak, without the peak, to white noise; at least 1.
 
-    What the constants of a real machine leave is no white noise but a hill of slow waves: at
-    Jülich twice as high as noise up to some ten turns.
+    The residuals of a real heliostat are not white noise but a broad hump of slow waves: at Jülich
+    twice as high as noise up to about ten turns.
     """
     rest = [_without(m, drive, ratio) for m in members if m.freedom > FREEDOM]
     if not rest:

@@ -41,14 +41,14 @@ class Flown:
     Attributes
     ----------
     sightings
-        Sightings of heliostat 0, less the mean of the errors that the flight's measurements share,
-        (R,).
+        Sightings of heliostat 0, corrected for the mean of the errors that the flight's
+        measurements share, (R,).
     shift
         Displacement of their ends by one unit of each of K shared errors, ENU, m, (R, 3, K).
     covariance
         Covariance of these errors, from everything known about them except this mirror, (K, K).
     turn_sigma
-        Standard deviation of the rotation that all measurements of this mirror share, rad.
+        Standard deviation of the rotation common to all measurements of this mirror, rad.
     """
 
     sightings: Sightings
@@ -144,7 +144,7 @@ class _Rows:
     def of_flight(
         cls, moved: Mechanism, flown: Flown, hyper: Hyperparameters, off: FloatArray
     ) -> "_Rows":
-        """Return a flight's rows; their sigma is their noise, whatever photographs have."""
+        """Return a flight's linearised sightings; their noise is their own sigma."""
         sightings = flown.sightings
         placed = moved[sightings.heliostat]
         line = linearise(placed, sightings, hyper.names)
@@ -167,7 +167,7 @@ class _Rows:
 
 
 def _updated(belief: Belief, number: int, rows: _Rows, k: int) -> Belief:
-    """Return the belief after row k of one source: 0 for photographs, or the number of a flight."""
+    """Return the belief after sighting k of a source: 0 for photographs, or a flight's number."""
     names = rows.names(number)
     if names and k == 0:
         belief = stream.with_constants(belief, names, np.ones(len(names)))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from heliotrope.calibration.learn._regime_kernels import FEWEST, partition
 from heliotrope.geometry import FloatArray
 
-#: Cuts are tried at this many places at most, the longest gaps.
+#: Cuts are tried at no more than this many positions: the longest gaps.
 PLACES = 300
 
 
@@ -29,9 +29,9 @@ def find_regimes(
     residual
         Residuals under the common zeros, in units of the noise, (n, 2).
     jacobian
-        Their derivative by the two zeros, (n, 2, 2).
+        Their derivatives with respect to the two zeros, (n, 2, 2).
     smallest
-        Least mean length of the shift, units of the noise; smaller shifts count as drift.
+        Minimum mean length of the shift, in units of the noise; smaller shifts count as drift.
     """
     times = np.asarray(time, dtype=np.float64)
     rest, slope = np.asarray(residual, dtype=np.float64), np.asarray(jacobian, dtype=np.float64)

@@ -120,7 +120,7 @@ def _predict(
     priors: dict[str, npt.ArrayLike],
     runner: Runner | None,
 ) -> Prediction:
-    """Predict some sightings, each by a copy of its heliostat that has seen the earlier ones."""
+    """Predict some sightings, each by a copy of its heliostat that has learnt the earlier ones."""
     sightings = learned.sightings
     histories = [_before(learned, int(row)) for row in asked]
     owner = np.repeat(np.arange(len(asked)), [len(h) for h in histories])
@@ -141,7 +141,7 @@ def _predict(
 
 
 def _before(learned: Learned, row: int) -> npt.NDArray[np.intp]:
-    """Rows of the same heliostat measured before ``row``; with an unknown time: those learnt."""
+    """Sightings of the same heliostat before ``row``; for an unknown time, those learnt from."""
     sightings: Sightings = learned.sightings
     mine = sightings.heliostat == sightings.heliostat[row]
     when = sightings.time[row]

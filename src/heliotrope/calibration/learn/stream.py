@@ -30,8 +30,8 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 
-#: New regimes a day (a reference lost, a repair), and returns from one. The training part of Jülich
-#: holds two in 18,000 days of mirrors, and 24 mistakes in 925 sightings.
+#: New regimes per day (a reference lost, a repair), and returns from a regime. The training part of
+#: Jülich contains two in 18,000 heliostat days, and 24 faulty sightings among 925.
 LOST, FOUND = 1.0 / 10_000.0, 1.0 / 200.0
 #: Share of sightings that show something else.
 MISTAKES = 0.025
@@ -53,16 +53,16 @@ class Event(IntEnum):
 
 @dataclass(frozen=True)
 class Layout:
-    """Places in the state, and what `kernels.update` reads of the hyperparameters.
+    """Positions in the state, and the hyperparameters that `kernels.update` needs.
 
     Attributes
     ----------
     view
         Matrix from the state to the parameters, (P, S).
     zeros, offsets
-        Places of the zeros' constants and of their offsets in a regime, (Z,).
+        Positions of the zeros' constants and of their offsets in a regime, (Z,).
     first
-        Place of the first process.
+        Position of the first process.
     step, lost
         Variances of a step and of the offset in a regime, (Z,).
     tau
@@ -233,8 +233,8 @@ def begin(
 def with_constants(belief: Belief, names: tuple[str, ...], spread: FloatArray) -> Belief:
     """Return the belief with more constants, of mean 0 and standard deviations ``spread`` (K,).
 
-    They may be errors that some sightings share, such as those of a flight, and be left out again
-    after these (`without_constants`).
+    They may be errors shared by some sightings, such as those of a flight, and can be removed again
+    after these sightings (`without_constants`).
     """
     h, place = belief.hyper, len(belief.hyper.names)
     nothing, more = np.zeros(len(names)), np.asarray(spread, dtype=np.float64)
@@ -301,7 +301,7 @@ def update(
     Parameters
     ----------
     belief
-        Before it.
+        Belief before the sighting.
     jacobian
         Whitened derivatives, (2, P).
     value
@@ -340,7 +340,7 @@ def update(
 
 
 def _chances(rate: float, days: float) -> FloatArray:
-    """Prior probabilities of the events before a sighting, and of a mistake, (5,)."""
+    """Prior probabilities of the events before a sighting, and of a faulty sighting, (5,)."""
     chance = np.zeros(5)
     chance[kernels.BLUNDER] = MISTAKES
     if days > STEP_GAP:
@@ -359,7 +359,7 @@ def observe(
     Parameters
     ----------
     belief
-        Before it.
+        Belief before the sighting.
     mechanism
         Nominal mechanism of the heliostat, (1,).
     sighting

@@ -30,16 +30,16 @@ def find_unusable(
 ) -> npt.NDArray[np.bool_]:
     """Return the mask of sightings beyond the reach at the start of a fit or at its end, (M,).
 
-    Where a fit gave no parameters that a mechanism can have, none of its sightings is usable.
+    If a fit found no possible parameters, none of its sightings is usable.
 
     Parameters
     ----------
     mechanism
         Nominal, (N,).
     sightings
-        M of these heliostats.
+        M sightings of these heliostats.
     fitted
-        Fit of them.
+        Fit of these sightings.
     """
     lost = np.isin(fitted.outcome, (FitOutcome.FAILED, FitOutcome.MISFIT))
     bad = lost[sightings.heliostat]

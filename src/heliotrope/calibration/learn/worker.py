@@ -19,7 +19,7 @@ from heliotrope.calibration.learn.group import (
 from heliotrope.errors import InputError
 from heliotrope.processes import give_way
 
-#: Threads of the process: the plant beside it has its own work.
+#: Threads of the process; the plant needs the other cores for its own work.
 ENVIRONMENT = {"HELIOTROPE_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 _LEAST_URGENT = 19
 
@@ -30,24 +30,26 @@ def asked(task: GroupTask) -> bytes:
 
 
 def answered(text: bytes) -> LearntGroup:
-    """Return the result of the process that learns.
+    """Return the result of the learning process.
 
     Raises
     ------
     InputError
-        If it is no such answer, or names an error.
+        If the output is not a valid result, or reports an error.
     """
     try:
         answer: dict[str, Any] = dict(json.loads(text))
     except (TypeError, ValueError) as error:
-        raise InputError(f"the process that learns gave no result ({error})") from error
+        raise InputError(f"the learning process returned no result ({error})") from error
     if problem := answer.get("error"):
         raise InputError(str(problem))
     try:
         counts = int(answer["heliostats"]), int(answer["sightings"])
         return LearntGroup(read_hyperparameters(answer["hyper"]), *counts, float(answer["gain"]))
     except (KeyError, TypeError) as error:
-        raise InputError(f"the process that learns gave half a result ({error!r})") from error
+        raise InputError(
+            f"the learning process returned an incomplete result ({error!r})"
+        ) from error
 
 
 def _answer(data: bytes) -> dict[str, Any]:
@@ -65,7 +67,7 @@ def _answer(data: bytes) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Learn the group that the input has."""
+    """Learn the group read from standard input."""
     give_way(_LEAST_URGENT)
     sys.stdout.write(json.dumps(_answer(sys.stdin.buffer.read())))
 

@@ -47,7 +47,7 @@ class Option:
 
 
 def gains(covariance: FloatArray, form: FloatArray, option: Option) -> FloatArray:
-    """Fall of the expected squared error by one sighting of each heliostat, rad², (n,)."""
+    """Decrease of the expected squared error by one sighting of each heliostat, rad², (n,)."""
     falls = np.empty(len(option.rows))
     for a in range(0, len(falls), CHUNK):
         part = option.rows[a : a + CHUNK]

@@ -53,7 +53,7 @@ class Timing:
         for field in fields(self):
             value = getattr(self, field.name)
             if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"{field.name} {value} s: give 0 s or more")
+                raise InputError(f"{field.name} {value} s must be 0 s or more")
         if self.slot < 0.1:
             raise InputError(f"a slot of {self.slot:g} s: settle, exposure and clear are too short")
 
@@ -168,16 +168,20 @@ def plan_campaign(
         If there are no heliostats or targets, or the sun is not up in the time span.
     """
     if not fleets or not sum(len(f) for f in fleets) or not targets:
-        raise InputError("campaign: give heliostats and at least one target")
+        raise InputError("campaign: specify heliostats and at least one target")
     if count is not None and count < 1:
-        raise InputError(f"count {count}: give 1 or more measurements")
+        raise InputError(f"count {count}: must be 1 or more measurements")
     if not 0.0 <= worth < 1.0:
-        raise InputError(f"worth {worth:g}: give a share from 0 to below 1")
+        raise InputError(f"worth {worth:g}: must be a fraction from 0 to below 1")
     if not (np.isfinite([start, stop, every]).all() and every > 0.0):
-        raise InputError(f"campaign: {start} to {stop} s every {every} s; give finite numbers")
+        raise InputError(
+            f"campaign: {start} to {stop} s every {every} s; all must be finite numbers"
+        )
     drives = {len(f.mechanism.driven) for f in fleets}
     if len(drives) != 1:
-        raise InputError("campaign: mechanisms with different numbers of drives; plan each alone")
+        raise InputError(
+            "campaign: mechanisms with different numbers of drives; plan each group separately"
+        )
     schedule = _Schedule(
         tuple(fleets),
         site,
@@ -218,7 +222,7 @@ def _cells(
     if not up.any():
         raise InputError(
             f"campaign: the sun never reaches {np.degrees(schedule.limits.min_elevation):g}° in "
-            "the span; choose other times or lower the least elevation"
+            "this period; choose other times or lower the minimum elevation"
         )
     size = max(1, round(every / slot))
     opens = np.flatnonzero(up & ~np.concatenate([[False], up[:-1]]))

@@ -98,11 +98,15 @@ class CommissionTerms:
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise InputError(f"commission: {name} {getattr(self, name)} must be 0 or more")
         if not 0.0 < self.clear <= 1.0:
-            raise InputError(f"commission: clear {self.clear}: give 0 to 1, not 0")
+            raise InputError(f"commission: clear {self.clear} must be above 0 and at most 1")
         if not 0.0 <= self.worth < 1.0:
-            raise InputError(f"commission: worth {self.worth}: give a share from 0 to below 1")
+            raise InputError(
+                f"commission: worth {self.worth}: must be a fraction from 0 to below 1"
+            )
         if self.shots < 1:
-            raise InputError(f"commission: {self.shots} photographs of a mirror; give 1 or more")
+            raise InputError(
+                f"commission: {self.shots} photographs per heliostat; must be 1 or more"
+            )
 
     @property
     def alone(self) -> float:
@@ -215,8 +219,8 @@ class CommissionPlan:
         share = {name: value / total for name, value in self.seconds.items()} if total else {}
         if self.terms.floor > self.terms.goal:
             return (
-                f"what a visit does not repeat: {1e3 * self.terms.floor:.2f} mrad stay "
-                "however often a mirror is measured"
+                f"error that visits do not repeat: {1e3 * self.terms.floor:.2f} mrad stay however "
+                "often a mirror is measured"
             )
         if share.get("idle", 0.0) > 1.0 - _BUSY:
             return (
@@ -283,7 +287,7 @@ def plan_commission(
     because the running schedule avoids them and visits an obstructed heliostat an hour later.
     """
     if not fleets or not sum(len(f) for f in fleets) or not targets:
-        raise InputError("commission: give heliostats and at least one target")
+        raise InputError("commission: specify heliostats and at least one target")
     chosen = terms or CommissionTerms()
     days, cells = _cells(site, start, stop, chosen)
     work = _Commissioning(fleets, targets, chosen, np.asarray(size, dtype=np.float64), measured)
@@ -317,13 +321,13 @@ def _cells(
 ) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
     """Days of sun, and their intervals, each (begin, end)."""
     if not (np.isfinite([start, stop]).all() and 0.0 < stop - start <= 366.0 * 86400.0):
-        raise InputError(f"commission: {start} to {stop} s; give a span of up to a year")
+        raise InputError(f"commission: {start} to {stop} s; the period must be at most a year")
     edges = np.append(np.arange(start, stop, 60.0), stop)
     up = solar.position(edges, site).elevation >= terms.limits.min_elevation
     if not (up[:-1] & up[1:]).any():
         raise InputError(
-            f"commission: the sun never reaches {np.degrees(terms.limits.min_elevation):g}° in the "
-            "span; choose other days or lower the least elevation"
+            f"commission: the sun never reaches {np.degrees(terms.limits.min_elevation):g}° in "
+            "this period; choose other days or lower the minimum elevation"
         )
     runs = np.split(np.arange(len(edges)), np.flatnonzero(np.diff(up.astype(np.int8))) + 1)
     days = [(float(edges[r[0]]), float(edges[r[-1]])) for r in runs if up[r[0]] and len(r) > 1]
@@ -416,7 +420,7 @@ class _Commissioning:
         self.curve.append((float(middle), float(high), float(rms)))
 
     def fill(self, begin: float, end: float, sun: FloatArray) -> None:
-        """Give the time of all targets, and of the receiver, in an interval to visits."""
+        """Fill the time of all targets, and of the receiver, in an interval with visits."""
         # Time left over from the previous interval, too short for a visit, is used now.
         unused = self._unused if begin == self._until else np.zeros_like(self._unused)
         carried = begin - unused
@@ -448,7 +452,7 @@ class _Commissioning:
         self._until = end
 
     def _use(self, j: int, span: dict[str, float]) -> None:
-        """Account for the time of a target, without that of the receiver."""
+        """Account for the time of a target; the receiver's time is excluded."""
         if j < len(self.targets):
             for name, value in span.items():
                 self.seconds[name] += value
@@ -486,14 +490,14 @@ class _Commissioning:
         return view, spread
 
     def _gains(self, view: TargetView, accuracy: float) -> FloatArray:
-        """Return the fall of each expected squared error, 0 where a visit is not worth it, rad²."""
+        """Return the decrease of each expected squared error, rad²; 0 if not worth a visit."""
         slope = view.slope * (self.sigma / accuracy)[:, None, None]
         falls = _gain.variance_gain(self.field.covariance, slope, self.field.form)
         worthy = view.able & self.counted & (falls > self.terms.worth * self.field.squares())
         return np.where(worthy, falls, 0.0)
 
     def _in_production(self, sun: FloatArray, terms: ReceiverTerms, now: float) -> _Choices:
-        """Return the visits on the receiver: those of mirrors that are known well enough."""
+        """Return the receiver visits, open to heliostats that are known well enough."""
         view, spread = self._seen_on(terms.face, sun)
         ready = self._shines & self.measured & (spread <= terms.known**2)
         ready &= now - self._shone >= terms.settings.every
@@ -524,16 +528,17 @@ class _Commissioning:
             light = terms.fitting(self.targets[j], self.size[many], slant, spread)
             if light >= terms.least:
                 return many[:light], True
-        # Those that have to go alone at first get every second visit.
+        # Heliostats whose first visit must be a single visit get every second visit.
         if self._last_joint[j] and (lost := choices.lost.first(free, 1)).size:
             return lost, False
         many = choices.known.first(free, terms.most)
         return (many, True) if len(many) >= terms.least else (alone, False)
 
     def _span(self, j: int, choices: _Choices, rows: Rows, joint: bool) -> dict[str, float]:
-        """Return the time of a visit by use, s; joint mirrors drive at once, and do not search.
+        """Return the time of a visit by use, s.
 
-        On the receiver they do not drive either.
+        In a joint visit heliostats drive simultaneously and do not search; on the receiver they do
+        not drive either.
         """
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
             return {"photographs": shining.span(len(rows), self._shining)}
@@ -546,7 +551,7 @@ class _Commissioning:
         return {"photographs": took, "travel": travel * (2.0 if own else 1.0)}
 
     def _own(self, choices: _Choices, rows: Rows) -> bool:
-        """Return whether each mirror of a joint visit has a code of its own."""
+        """Return whether each heliostat in a joint visit has its own code."""
         joint = self.terms.joint
         vague = joint is not None and (choices.spread[rows] > joint.known**2).any()
         return bool(vague or not self.measured[rows].all())
@@ -575,14 +580,14 @@ class _Commissioning:
         self.visits.append(Visit(begin, end, j, rows, joint, own, first, missed, after))
 
     def _misses(self, chance: FloatArray) -> Mask:
-        """Return the mask of beams that miss, (n,): as many as their chances say, spread evenly."""
+        """Return the mask of beams that miss, (n,): the expected number, spread evenly."""
         due = self._owed + np.cumsum(1.0 - chance)
         self._owed = float(due[-1]) % 1.0
         return np.asarray(np.diff(np.floor(due), prepend=0.0) > 0.0)
 
 
 def _descending(value: FloatArray) -> Rows:
-    """Return the rows of positive values, the largest first."""
+    """Return the indices of positive values, largest first."""
     return np.asarray(np.argsort(-value, kind="stable")[: int(np.sum(value > 0.0))])
 
 

@@ -61,7 +61,7 @@ def at(plan: CommissionPlan, time: float) -> tuple[float, float]:
 def visit_rows(
     plan: CommissionPlan, heliostats: Sequence[str], targets: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return one record for each mirror of each visit, in order of time."""
+    """Return one record for each heliostat of each visit, in order of time."""
     places = _places(plan, targets)
     return [
         {
@@ -167,7 +167,7 @@ def curve_picture(plan: CommissionPlan) -> "Figure":
 
 
 def _days(plan: CommissionPlan) -> Iterator[np.ndarray]:
-    """Rows of the curve, day by day."""
+    """Indices into the curve, day by day."""
     for begin, end in plan.days:
         rows = np.flatnonzero((plan.time >= begin) & (plan.time <= end))
         if rows.size:
@@ -175,7 +175,7 @@ def _days(plan: CommissionPlan) -> Iterator[np.ndarray]:
 
 
 def write_page(path: Path, plan: CommissionPlan, name: str, targets: Sequence[str]) -> None:
-    """Write the report: the sentence, the curve, and a row for each hour and target.
+    """Write the report: the summary, the curve, and a record for each hour and target.
 
     Parameters
     ----------

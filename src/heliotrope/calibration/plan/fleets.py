@@ -61,7 +61,7 @@ class Fleet:
 
     def __post_init__(self) -> None:
         if len(self.mechanism.shape) != 1:
-            raise InputError(f"mechanisms of shape {self.mechanism.shape}; give one axis (N,)")
+            raise InputError(f"mechanisms of shape {self.mechanism.shape}; must have one axis (N,)")
         count, p = len(self.mechanism), len(self.names)
         for name in ("information", "form"):
             shape = getattr(self, name).shape
@@ -224,8 +224,8 @@ def plan_each(
         name = fleet.labels[i]
         if not len(candidates):
             raise InputError(
-                f"heliostat {name}: no measurement is possible; the sun, the stops, the limits "
-                "or the turns of other heliostats leave no time; widen the span"
+                f"heliostat {name}: no measurement is possible, because sun, end stops, limits or "
+                "visits of other heliostats leave no time; lengthen the period"
             )
         plans[name] = plan_sightings(
             candidates, count, fleet.information[i], fleet.form[i], criterion=criterion

@@ -14,7 +14,7 @@ from heliotrope.geometry import FloatArray
 
 
 def _terms(covariance: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """J C (..., 2, P) and S (..., 2, 2)."""
+    """Return J C (..., 2, P) and S (..., 2, 2)."""
     product = jacobian @ covariance
     return product, np.eye(2) + product @ np.swapaxes(jacobian, -1, -2)
 
@@ -37,7 +37,7 @@ def information_gain(covariance: FloatArray, jacobian: FloatArray) -> FloatArray
 
 
 def variance_gain(covariance: FloatArray, jacobian: FloatArray, form: FloatArray) -> FloatArray:
-    """Fall of tr(form · C), (...)."""
+    """Decrease of tr(form · C), (...)."""
     product, s = _terms(covariance, jacobian)
     spread = product @ form @ np.swapaxes(product, -1, -2)
     return np.asarray(np.sum(_inverse(s) * spread, axis=(-1, -2)))

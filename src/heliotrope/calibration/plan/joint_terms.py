@@ -73,16 +73,17 @@ class JointTerms:
     def __post_init__(self) -> None:
         if not 2 <= self.least <= self.most or not (self.first == 0 or self.first >= self.least):
             raise InputError(
-                f"joint visits: {self.least} to {self.most} mirrors, {self.first} in a first visit;"
-                " give 2 or more, the smaller number first, and 0 or no fewer in a first visit"
+                f"joint visits: {self.least} to {self.most} mirrors, {self.first} in a first "
+                "visit; use 2 or more, the smaller number first, and in a first visit 0 or at "
+                "least the smaller number"
             )
         for name in ("known", "step", "sigma", "brightest"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"joint visits: {name} {getattr(self, name)} must be above 0")
         if not self.beside >= 0.0 or self.tries < 1:
             raise InputError(
-                f"joint visits: {self.beside} s beside the photographs, {self.tries} tries; give "
-                "0 s or more, and 1 or more"
+                f"joint visits: {self.beside} s beside the photographs, {self.tries} tries; must "
+                "be 0 s or more, and 1 or more tries"
             )
 
     @classmethod

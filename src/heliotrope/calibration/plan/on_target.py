@@ -67,7 +67,7 @@ def chance_by_try(
 
 
 def _cut(places: FloatArray, room: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the middles of an axis's pieces between windows' edges, and their chances, (N, C)."""
+    """Return the midpoints between window edges along an axis, and their probabilities, (N, C)."""
     lines = np.unique(places)
     edges = np.sort(np.concatenate([lines - room[:, None], lines + room[:, None]], axis=1), axis=1)
     chance = 0.5 * np.diff(erf(edges / (np.sqrt(2.0) * sigma[:, None])), axis=1)
@@ -77,7 +77,7 @@ def _cut(places: FloatArray, room: FloatArray, sigma: FloatArray) -> tuple[Float
 def search_places(target: Target, count: int) -> FloatArray:
     """Return the search points for a beam that earlier attempts missed, right and up, m, (K, 2).
 
-    The middle first, then around it.
+    The search starts at the middle and continues around it.
     """
     reach = int(np.ceil(np.sqrt(count)))
     line = np.arange(-reach, reach + 1)

@@ -206,7 +206,7 @@ def candidate_sightings(
     if not targets:
         raise InputError("planning: there is no target; a camera-target sighting needs one")
     if len(mechanism.shape) != 1:
-        raise InputError(f"mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
+        raise InputError(f"mechanisms of shape {mechanism.shape}; must have one batch axis (N,)")
     bounds = limits or SightingLimits()
     moments = np.atleast_1d(solar.unix_seconds(times))
     above = solar.position(moments, site)
@@ -312,8 +312,8 @@ def time_grid(start: float, stop: float, every: float) -> FloatArray:
         )
     if (stop - start) / every > 200_000:
         raise InputError(
-            f"{(stop - start) / every:.0f} times in the span are more than 200,000; give a "
-            "longer step or a shorter span"
+            f"{(stop - start) / every:.0f} times in the period exceed 200,000; use a longer step "
+            "or a shorter period"
         )
     return np.arange(np.ceil(start / every), np.floor(stop / every) + 1.0) * every
 
@@ -398,13 +398,13 @@ def plan_sightings(
     possible increase (Nemhauser et al. 1978); with exchange the tests find 98 % or more.
     """
     if criterion not in ("d", "v"):
-        raise InputError(f"criterion {criterion!r}: give d (determinant) or v (beam variance)")
+        raise InputError(f"criterion {criterion!r}: use d (determinant) or v (beam variance)")
     if count < 1:
-        raise InputError(f"count {count}: give 1 or more sightings")
+        raise InputError(f"count {count}: must be 1 or more sightings")
     if not len(candidates):
         raise InputError(
-            "planning: no candidate; the sun, the stops or the limits allow no sighting at these "
-            "times; widen the span"
+            "planning: no candidate, because sun, end stops or limits allow no sighting at these "
+            "times; lengthen the period"
         )
     matrix = as_float(information)
     scale = 1.0 / np.sqrt(np.diagonal(matrix))

@@ -11,13 +11,14 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 
-#: Time of a movement or of a frame beside the settling, s: 128 photographs took 254 s.
+#: Time of a movement or a frame excluding settling, s: 128 photographs took 254 s.
 _PHOTOGRAPH = 1.0
-#: Time beside photographs and new parameters, s: looks at the sun, the way back, the separation.
+#: Time excluding photographs and new parameters, s: sun checks, the return to the aim, the
+#: separation.
 _BESIDE = 15.0
 #: Time for which a mirror leaves the receiver for new parameters, s: 47, one by one, took 9.5 min.
 _AWAY = 12.0
-#: Share of its own power that a mirror's movements cost, by (rad)²: 50 of 150 cost 0.44 % with
+#: Fraction of its own power that a heliostat's movements cost, per rad²: 50 of 150 cost 0.44 % with
 #: movements of 1 mrad.
 _COST = 0.0044 * 150 / 50 / 1e-3**2
 #: Standard deviation of a centroid by a whole stack, rad.

@@ -166,7 +166,7 @@ def check_picture(path: str | Path) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in _PICTURES:
         raise InputError(
-            f"picture {path}: the name ends in {suffix!r}; give one of {', '.join(_PICTURES)}"
+            f"picture {path}: the name ends in {suffix!r}; use one of {', '.join(_PICTURES)}"
         )
     return suffix
 

@@ -90,7 +90,7 @@ class CalibrationReport:
         """
         kept = self._applied[1]
         if self.clock is not None and self.clock.found:
-            # What a wrong clock leaves is no fault of single mirrors.
+            # The errors caused by a wrong clock are not faults of single heliostats.
             return (str(self.clock), *self.notes, *kept)
         clock = () if self.clock is None else (str(self.clock),)
         return (*self.notes, *unexplained_mirrors(self.names, self.learned), *kept, *clock)

@@ -258,7 +258,7 @@ def read_json(path: str | Path) -> FieldParameters:
     root = _json.read_json(path, "a calibration")
     if not root.has("kind") or root["kind"].text() != KIND:
         raise root.fail(
-            f"not a calibration: kind must be {KIND!r}; give a file that heliotrope calibrate wrote"
+            f"not a calibration: kind must be {KIND!r}; use a file written by heliotrope calibrate"
         )
     root["version"].number(VERSION, VERSION)
     names = tuple(node.text() for node in root["parameters"].elements())
@@ -360,7 +360,9 @@ def write_paint(
     try:
         (place / "properties").mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{place}: cannot be made ({error.strerror}); give a folder") from None
+        raise InputError(
+            f"{place}: cannot be created ({error.strerror}); choose another folder"
+        ) from None
     omitted: dict[str, tuple[str, ...]] = {}
     for name, group in groups.items():
         file = place / "properties" / f"{name}.json"
@@ -480,14 +482,14 @@ def _moved(
     location: FloatArray,
     source: str | Path,
 ) -> tuple[FloatArray, dict[str, tuple[str, ...]]]:
-    """Return the learned locations (N, 3), and the parameters lost in that form, by name."""
+    """Return the learnt locations (N, 3), and the parameters lost in this format, by name."""
     rows, moved = {name: i for i, name in enumerate(names)}, location.copy()
     lost: dict[str, tuple[str, ...]] = {}
     for name in heliostats:
         if name not in rows:
             raise InputError(
-                f"heliostat {name}: {source} has no heliostat of that name; give the file that "
-                "the plant was read from"
+                f"heliostat {name}: {source} has no heliostat of that name; pass the file from "
+                "which the plant was read"
             )
         group, i = plant.find(name)
         values = {key: float(column[i]) for key, column in group.parameters.items()}
@@ -502,9 +504,9 @@ def _moved(
 
 
 def _calibrated(plant: Plant, learned: Learned, time: float | None, what: str) -> Plant:
-    """Return the plant with what was learnt, for ``what`` to write."""
+    """Return the plant with the learnt parameters, for ``what`` to write."""
     if not learned.heliostats:
         raise InputError(
-            f"{what}: it was learnt without names; learn from the plant, or plant[name]"
+            f"{what}: learnt without heliostat names; learn from the plant, or plant[name]"
         )
     return at_moment(learned.heliostats, learned, time).applied_to(plant)[0]

@@ -20,8 +20,10 @@ FolderArgument = Annotated[
 CampaignArgument = Annotated[
     Path,
     typer.Argument(
-        help="Folder with photographs, camera.toml and commands.csv; or of a campaign: one such "
-        "folder for each flight, named CLUSTER-POINT where commands.csv is the plan's."
+        help=(
+            "Folder with photographs, camera.toml and commands.csv; or of a campaign: one such "
+            "folder per flight, named CLUSTER-POINT if commands.csv comes from the plan."
+        )
     ),
 ]
 FieldOption = Annotated[Path, typer.Option("--field", help="Plant file or folder.")]
@@ -32,8 +34,10 @@ CommandsOption = Annotated[
     Path | None,
     typer.Option(help="Table of commands (CSV); default: commands.csv in the folder."),
 ]
-ClusterOption = Annotated[str, typer.Option(help="Cluster of the commands that was measured.")]
-PointOption = Annotated[str, typer.Option(help="Calibration point of the commands.")]
+ClusterOption = Annotated[str, typer.Option(help="Measured cluster, as named in the commands.")]
+PointOption = Annotated[
+    str, typer.Option(help="Measured calibration point, as numbered in the commands.")
+]
 SurveyOption = Annotated[
     float, typer.Option(min=0.1, max=100_000, help="Standard deviation of surveyed positions, mm.")
 ]
@@ -48,7 +52,7 @@ KinematicsOption = Annotated[
 RtkOption = Annotated[
     float,
     typer.Option(
-        min=0.1, max=100_000, help="Standard deviation of RTK's common offset (its base), mm."
+        min=0.1, max=100_000, help="Standard deviation of the common RTK offset (base station), mm."
     ),
 ]
 ProcessesOption = Annotated[
@@ -95,7 +99,7 @@ def rendered_camera(size: str, focal_px: float = 0.0) -> "LedCamera":
     width, height = int(match[1]), int(match[2])
     if 0.0 < focal_px < 1.0:
         raise InputError(
-            f"--focal-px {focal_px:g}: give 1 or more pixels, or 0 for 3/4 of the width"
+            f"--focal-px {focal_px:g}: use 1 or more pixels, or 0 for 3/4 of the width"
         )
     f = focal_px or 0.75 * width
     matrix = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
@@ -112,5 +116,5 @@ def formats(text: str) -> tuple[str, ...]:
         return ()
     for name in names:
         if name not in FORMATS:
-            raise InputError(f"--formats {name!r}: give some of {','.join(FORMATS)}, or none")
+            raise InputError(f"--formats {name!r}: choose from {','.join(FORMATS)}, or none")
     return names

@@ -18,10 +18,10 @@ def dome(
     field: Annotated[Path, typer.Argument(metavar="PLANT", help="Plant file or PAINT folder.")],
     into: Annotated[Path, typer.Option(help="Folder for waypoints and targets.")] = Path("dome"),
     at: Annotated[
-        str, typer.Option(help="Middle of the targets on the ground, E,N,U in m.")
+        str, typer.Option(help="Centre of the targets on the ground, E,N,U in m.")
     ] = "0,0,0",
     home: Annotated[
-        str, typer.Option(help="Take-off, E,N,U in m; default: the middle of the targets.")
+        str, typer.Option(help="Take-off point, E,N,U in m; default: the centre of the targets.")
     ] = "",
     radius: Annotated[
         float, typer.Option(min=1, max=1000, help="Distance of the photographs, m.")
@@ -84,13 +84,13 @@ def dome(
         aircraft=aircraft,
     )
     print(f"{len(planned)} photographs of {len(planned.targets)} coded targets: {into}")
-    print(f"sheets to print: {into / 'targets'}, where to lay them: {into / 'targets.csv'}")
+    print(f"sheets to print: {into / 'targets'}, where to place them: {into / 'targets.csv'}")
     if simulate:
         _simulate(planned, field, into / "photographs", size, rtk_mm, seed)
 
 
 def _degrees(text: str) -> list[float]:
-    refusal = f"--elevations {text!r}: give degrees from 0 to 90, such as 35,50,65,80"
+    refusal = f"--elevations {text!r}: use degrees from 0 to 90, such as 35,50,65,80"
     return list(parse_numbers(text, refusal, count=None, least=0.0, most=90.0))
 
 

@@ -138,7 +138,7 @@ def _show_orientations(result: "CampaignResult", out: Path) -> None:
     ]
     head = ["heliostat", "points", "outliers", "rotX", "rotY"]
     head += ["σ_mean X", "σ_mean Y", "σ_tot X", "σ_tot Y"]
-    print_table(head, body, "Orientation less command, mrad")
+    print_table(head, body, "Orientation minus command, mrad")
     if len(rows) > _ORIENTATIONS:
         print(f"and {len(rows) - _ORIENTATIONS} more in {out / 'orientations.csv'}")
 
@@ -148,5 +148,5 @@ def _show_reference(compared: "Sequence[Compared]", out: Path) -> None:
 
     table = offset_table(compared)
     body = [*table["rows"][:_ORIENTATIONS], *table["rows"][max(_ORIENTATIONS, len(compared)) :]]
-    print_table(table["head"], body, "Orientation less reference, mrad")
+    print_table(table["head"], body, "Orientation minus reference, mrad")
     print(f"written to {out}: reference.csv, and reference.html unless declined")

@@ -14,9 +14,7 @@ def match(
     field: shared.FieldOption,
     photo: Annotated[
         list[str] | None,
-        typer.Option(
-            help="A photograph, NAME or FLIGHT/NAME; default: all that are not identified."
-        ),
+        typer.Option(help="A photograph, NAME or FLIGHT/NAME; default: all unidentified ones."),
     ] = None,
     camera: shared.CameraOption = None,
     commands: shared.CommandsOption = None,
@@ -49,7 +47,7 @@ def match(
     for picture, count in zip(sheets.pictures, sheets.outlines, strict=True):
         print(f"{picture}: {count} outlines")
     print(
-        f"In {sheets.table} name three or more mirrors of each photograph, far from each other; "
-        "rows without a heliostat are not read."
+        f"In {sheets.table} name three or more mirrors in each photograph, far apart; rows "
+        "without a heliostat are ignored."
     )
     print(f"Then: heliotrope drone evaluate {folder} --field {field} --matches {sheets.table}")

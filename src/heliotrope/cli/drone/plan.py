@@ -55,7 +55,7 @@ def plan(
     ] = 56.0,
     pointing_mrad: Annotated[
         float,
-        typer.Option(min=0, max=1000, help="Pointing error of mirrors that patterns must cover."),
+        typer.Option(min=0, max=1000, help="Mirror pointing error that the patterns must cover."),
     ] = 5.0,
     samples: Annotated[
         float, typer.Option(min=1, max=1e6, help="Number of reflections per facet.")
@@ -200,7 +200,7 @@ def _selection(
 
     from heliotrope.airborne.plan.calibration_points import PointSelection
 
-    refusal = f"--elevations {elevations!r}: give two numbers of degrees from 0 to 90"
+    refusal = f"--elevations {elevations!r}: use two angles from 0 to 90 degrees"
     asked = parse_numbers(elevations, refusal, count=2, least=0.0, most=90.0)
     low, high = np.radians(asked).tolist()
     return PointSelection(
@@ -253,12 +253,12 @@ def _print(s: dict[str, Any]) -> None:
     print_table(["campaign", ""], rows)
     if few := s["orientations_with_few_reflections"]:
         print(
-            f"{few:,} of {s['orientations']:,} orientations will show fewer than 5 reflections: "
-            "mirrors are small for the pattern, or hidden by others; fly closer, or raise "
-            "--samples or the lower of --elevations"
+            f"{few:,} of {s['orientations']:,} orientations will show fewer than 5 reflections, "
+            "because their mirrors are too small for the pattern or hidden by others; fly "
+            "closer, or raise --samples or the lower of --elevations"
         )
     if s["drones"] > 1:
-        print(f"least distance between drones in the air: {s['separation_m']:.0f} m")
+        print(f"minimum distance between drones in the air: {s['separation_m']:.0f} m")
     if s["fewest_points_of_a_heliostat"] < s["calibration_points"]:
         print(
             "some heliostats cannot reach all directions within their stops; the worst has "

@@ -118,7 +118,7 @@ def _show(check: "RtkCheck") -> None:
     print_table(
         ["axis", "common offset", "± of it", "σ of both", "of photogrammetry", "of RTK", "95 %"],
         rows,
-        f"RTK less photogrammetry, {len(check.names)} photographs, mm",
+        f"RTK minus photogrammetry, {len(check.names)} photographs, mm",
     )
     body = [
         [axis, *(f"{1e6 * v:.1f}" for v in row)]

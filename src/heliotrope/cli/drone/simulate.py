@@ -26,12 +26,12 @@ def simulate(
     heliostats: Annotated[
         int,
         typer.Option(
-            min=1, max=1_000_000, help="Number of heliostats, those nearest to the middle."
+            min=1, max=1_000_000, help="Number of heliostats, nearest to the centre first."
         ),
     ] = 80,
     hover: Annotated[
         str,
-        typer.Option(help="Middle of the pattern, E,N,U in m; default: on the side of the tower."),
+        typer.Option(help="Centre of the pattern, E,N,U in m; default: on the side of the tower."),
     ] = "",
     distance: Annotated[
         float, typer.Option(min=5, max=10_000, help="Distance from the mirrors, m.")
@@ -96,9 +96,10 @@ def simulate(
     plan: Annotated[
         Path | None,
         typer.Option(
-            help="plan.json of a campaign: each pattern is flown into a separate folder; "
-            "--hover, --distance, --columns, --rows, --step, --heliostats are "
-            "ignored."
+            help=(
+                "plan.json of a campaign: each pattern is written to a separate folder; --hover, "
+                "--distance, --columns, --rows, --step, --heliostats are ignored."
+            )
         ),
     ] = None,
     stations: Annotated[

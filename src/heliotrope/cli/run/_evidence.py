@@ -45,12 +45,12 @@ class Evidence:
 
     def __post_init__(self) -> None:
         if self.authority is not None and self.syslog is None:
-            raise InputError("run: --syslog-authority belongs to --syslog tls://host")
+            raise InputError("run: --syslog-authority works only with --syslog tls://host")
         _ = self.receiver
         if self.heads is not None and not self.heads.is_dir():
-            raise InputError(f"run: --heads {self.heads}: there is no such folder; make it")
+            raise InputError(f"run: --heads {self.heads}: no such folder; create it")
         if not _LEAST <= self.hours <= _MOST:
-            raise InputError(f"run: --heads-every {self.hours:g} h; give {_LEAST:g} to {_MOST:g}")
+            raise InputError(f"run: --heads-every {self.hours:g} h must be {_LEAST:g} to {_MOST:g}")
 
     @property
     def receiver(self) -> Receiver | None:

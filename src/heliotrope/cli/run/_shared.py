@@ -111,7 +111,7 @@ class Shown:
     def __post_init__(self) -> None:
         if self.database is not None and not self.database.startswith("postgresql://"):
             raise InputError(
-                "run: --database must be postgresql://user@host/name; for SQLite give --data alone"
+                "run: --database must be postgresql://user@host/name; for SQLite use --data alone"
             )
         if self.certificate is not None and self.key is not None:
             from heliotrope.links.tls import server_tls
@@ -170,7 +170,7 @@ def check_console(shown: Shown) -> None:
         why = error.strerror or str(error)
         raise InputError(
             f"console: {shown.host} port {shown.port} cannot be opened ({why}); another program "
-            "may use it: choose another with --port"
+            "may be using it: choose another with --port"
         ) from None
     for module in _OF_CONSOLE:
         if importlib.util.find_spec(module) is None:
@@ -185,7 +185,7 @@ def check_console(shown: Shown) -> None:
 
 def _missing(error: ImportError) -> InputError:
     return InputError(
-        f"run: {error.name} is not installed; say pip install 'heliotrope[console]', or give "
+        f"run: {error.name} is not installed; run pip install 'heliotrope[console]', or give "
         "--no-console"
     )
 
@@ -439,7 +439,7 @@ async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> boo
     running: set[asyncio.Future[Any]] = {stowing, waiting}
     while running == {stowing, waiting}:
         if going := _on_the_way(live):
-            lines.print(f"{going}; Ctrl-C again ends at once")
+            lines.print(f"{going}; press Ctrl-C again to stop immediately")
         _, running = await asyncio.wait(running, timeout=_SAID, return_when=asyncio.FIRST_COMPLETED)
     waiting.cancel()
     stowing.cancel()
@@ -448,7 +448,7 @@ async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> boo
         if isinstance(error, Exception):
             raise error
     good = list(done) == [True]
-    lines.print("the field is stowed" if good else "not every heliostat is stowed")
+    lines.print("the field is stowed" if good else "not all heliostats are stowed")
     return good
 
 

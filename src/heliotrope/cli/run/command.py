@@ -368,7 +368,7 @@ def run(
             return
         assert clusters is not None
         if field is None:
-            raise InputError("run: --clusters needs the plant file; give it before")
+            raise InputError("run: --clusters needs a plant file; name it before the options")
         _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed))
         folder = field if field.is_dir() else field.parent
         choice = PlantChoice(folder, clusters, idle is not False, configure, check)

@@ -129,7 +129,7 @@ def _begin(
         return
     if loop is None and shown.data is None and shown.database is None:
         raise InputError(
-            "run: a real plant keeps its records; give --data FOLDER, or --database URL"
+            "run: a real plant must keep its records; use --data FOLDER or --database URL"
         )
     factory = None if loop is None else lambda: loop
     with one_error(), asyncio.Runner(loop_factory=factory) as runner:
@@ -178,7 +178,7 @@ def _check(
     )
     bare = [name for name, group in design.groups.items() if not group.machines]
     if bare:
-        print(f"no machine table, which --configure needs: group {', '.join(bare)}")
+        print(f"--configure needs a machine table, which is missing in group {', '.join(bare)}")
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ def _links_file(choice: PlantChoice) -> "LinksFile":
         from heliotrope.plant.io.links_file import read_links
     except ImportError as error:
         raise InputError(
-            f"run: {error.name} is not installed; say pip install 'heliotrope[control]'"
+            f"run: {error.name} is not installed; run pip install 'heliotrope[control]'"
         ) from None
     return read_links(choice.clusters)
 
@@ -328,7 +328,10 @@ async def _run(
 ) -> None:
     ending = begin(design, shown)
     if outside.reader is not None:
-        print("the simulated field begins; the first start compiles, and takes longer", flush=True)
+        print(
+            "starting the simulated field; the first start compiles code and takes longer",
+            flush=True,
+        )
     with computing() as worker, store(shown) as (keeper, folder):
         if prepare is not None:
             await prepare(keeper, design, outside.clock.utc())
@@ -345,7 +348,7 @@ async def _run(
         for local in outside.local:
             file = local.installation.bus_key_file
             if file is not None:
-                name = f"key of the bus of {local.installation.config.name}"
+                name = f"bus key of {local.installation.config.name}"
                 papers.renew(name, [file], local.installation.take_bus_keys)
         speed = 1.0 if outside.reader is None else outside.reader.state.asked
         if shown.console and shown.certificate is not None:

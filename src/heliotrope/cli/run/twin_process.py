@@ -53,7 +53,7 @@ class TwinField:
         """
         assert self.process.stdout is not None
         if self.process.stdout.readline().strip() != READY:
-            raise InputError("run: the simulated field has not begun; see the line before")
+            raise InputError("run: the simulated field did not start; see the line above")
 
     async def begin(self, keeper: "Keeper", design: "Plant", start: datetime) -> None:
         """Let the field store what the plant has kept; a new store gets yesterday's calibrations.

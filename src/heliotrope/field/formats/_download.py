@@ -244,10 +244,10 @@ def _cause(error: Exception) -> str:
     if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
         return "no connection; check the network and the address"
     if isinstance(error, httpx.TimeoutException):
-        return "the server does not answer in time"
+        return "the server did not reply in time"
     if isinstance(error, httpx.DecodingError):
-        return "the answer cannot be unpacked"
-    return "the connection broke off"
+        return "the server's reply cannot be decompressed"
+    return "the connection was lost"
 
 
 def _check_stop(channel: Channel) -> None:
@@ -259,7 +259,7 @@ def _check_status(response: "httpx.Response", url: str, *also: HTTPStatus) -> No
     status = response.status_code
     if status == HTTPStatus.OK or status in also:
         return
-    answer = f"the server answers {status} {response.reason_phrase}".rstrip()
+    answer = f"the server replied {status} {response.reason_phrase}".rstrip()
     if status in {HTTPStatus.NOT_FOUND, HTTPStatus.GONE}:
         raise NotFoundError(f"{url}: there is no such file ({answer})")
     if status >= HTTPStatus.INTERNAL_SERVER_ERROR or status in _LATER:
@@ -286,7 +286,7 @@ def _attempt(job: RemoteFile, channel: Channel) -> bool:
             return False
         if start and not _fits(response, start):
             job.part.unlink(missing_ok=True)
-            raise _LaterError("the incomplete file does not fit the one on the server")
+            raise _LaterError("the incomplete file does not match the one on the server")
         _check_status(response, job.url, *([HTTPStatus.PARTIAL_CONTENT] if start else []))
         start = start if status == HTTPStatus.PARTIAL_CONTENT else 0
         said = FileRecord(
@@ -374,7 +374,7 @@ def _json(url: str, content: bytes) -> Any:
         return json.loads(content)
     except ValueError:
         start = content[:40].decode("utf-8", "replace")
-        raise FetchError(f"{url}: the answer is not JSON; it begins {start!r}") from None
+        raise FetchError(f"{url}: the reply is not JSON; it begins with {start!r}") from None
 
 
 def _size(path: Path | None) -> int:

@@ -52,7 +52,7 @@ class Values:
         """Return an attribute that must be there and not be blank."""
         value = element.get(attribute)
         if value is None or not value.strip():
-            raise self.error(element, f"<{element.tag}> has no {attribute}; give one")
+            raise self.error(element, f"<{element.tag}> has no {attribute}; add the attribute")
         return value
 
     def child(self, element: XmlElement, tag: str) -> XmlElement:
@@ -62,7 +62,7 @@ class Values:
             raise self.error(
                 element,
                 f"<{element.tag}> {element.get('name') or ''} has {len(children)} elements "
-                f"<{tag}>; it needs one",
+                f"<{tag}>; it needs exactly one",
             )
         return children[0]
 
@@ -95,15 +95,14 @@ class Values:
             if match is None or not math.isfinite(value):
                 raise self.error(
                     element,
-                    f"<{element.tag}> {attribute}: {part.strip()!r} is not a finite "
-                    "number; write it with digits and a point",
+                    f"<{element.tag}> {attribute}: {part.strip()!r} is not a finite number; write "
+                    "it with digits and a decimal point",
                 )
             if match[2] is not None and match[2] not in units:
                 known = ", ".join(units) or "none"
                 raise self.error(
                     element,
-                    f"<{element.tag}> {attribute}: unit {match[2]!r} is not known here; "
-                    f"known: {known}",
+                    f"<{element.tag}> {attribute}: unknown unit {match[2]!r}; known: {known}",
                 )
             numbers[i] = value * (unit if match[2] is None else units[match[2]])
         return numbers

@@ -50,7 +50,7 @@ def _values(table: StrictTable | None, made: type[CodedSettings]) -> dict[str, A
     for name, setting in made.settings().items():
         key, written = setting.key(name), f"{name}_rad"
         if key in given and written in given:
-            raise InputError(f"{made.kind}: {name} is given twice, the second time as {written}")
+            raise InputError(f"{made.kind}: {name} is set twice, the second time as {written}")
         if key in given:
             value = given.pop(key)
             values[name] = value * setting.scale if setting.unit else value

@@ -230,7 +230,7 @@ class _Reader:
             "initial_angle",
         )
         missing = [key for key in needed if key not in values]
-        self.check_missing(missing, f"give here, or as columns {where}.KEY,", where)
+        self.check_missing(missing, f"specify here, or as columns {where}.KEY,", where)
         # Popped first: an unpacked generator would run only after **values.
         constants = [values.pop(key) for key in needed]
         return drive_kinds.linear_paint(*constants, **values)
@@ -258,7 +258,7 @@ class _Reader:
             if len(getattr(chain, key)) != joints:
                 raise self.fail(f"{key} has {len(getattr(chain, key))} rows for {joints} joints")
         if not chain.driven or any(not 0 <= d < joints for d in chain.driven):
-            raise self.fail(f"driven {chain.driven}: give indices of joints from 0 to {joints - 1}")
+            raise self.fail(f"driven {chain.driven}: use joint indices from 0 to {joints - 1}")
         driven = [self.drive(chain.joints[d]).table for d in chain.driven]
         return Mechanism(
             kind=self.group.kind,
@@ -302,14 +302,15 @@ class _Reader:
         if sorted(table.axes) != sorted(joints):
             listed = ", ".join(table.axes) or "none"
             raise self.fail(
-                f"axes of {listed}; give those of {' and '.join(joints)}", "machine.axes"
+                f"axes of {listed}; specify those of {' and '.join(joints)}", "machine.axes"
             )
         first = table.leaves_stow_first or joints[0]
         if first not in joints:
             raise self.fail(f"{first!r} is no driven joint; they are {joints}", "machine")
         if len(joints) != 2:
             raise self.fail(
-                "local controllers drive two joints, and this kind has one; remove it", "machine"
+                "local controllers drive two joints, but this kind has one; remove the table",
+                "machine",
             )
         drives = Drive(
             np.broadcast_to(mechanism.drives.table, (len(self.rows), 2, slot.DRIVE_SLOTS))
@@ -398,7 +399,7 @@ class _Reader:
         counts = self.number(f"{where}_steps", steps)
         angle = self.number(f"{where}_deg", deg)
         if counts is not None and angle is not None:
-            raise self.fail("it is given in steps and in deg; keep one", where)
+            raise self.fail("set both in steps and in degrees; keep one", where)
         if counts is not None:
             return np.broadcast_to(counts, self.rows.shape)
         radians = drive.table[:, stop] if angle is None else np.radians(angle)
@@ -406,7 +407,7 @@ class _Reader:
 
     def stow(self, drives: Drive, table: MachineTable) -> npt.NDArray[np.int64]:
         if (table.stow_steps is None) == (table.stow_deg is None):
-            raise self.fail("give either stow_steps or stow_deg", "machine")
+            raise self.fail("set either stow_steps or stow_deg", "machine")
         if table.stow_steps is not None:
             steps = self.array("machine.stow_steps", table.stow_steps)
         else:
@@ -437,7 +438,7 @@ class _Reader:
     def defocus(self, table: MachineTable) -> FloatArray:
         units = [u for u in ANGLE_UNITS if getattr(table, f"defocus_{u}") is not None]
         if len(units) != 1:
-            raise self.fail("give one of defocus_deg, defocus_mrad, defocus_rad", "machine")
+            raise self.fail("set one of defocus_deg, defocus_mrad, defocus_rad", "machine")
         key = f"defocus_{units[0]}"
         angles = self.array(f"machine.{key}", getattr(table, key))
         names = [self.table.name[row] for row in self.rows]
@@ -510,8 +511,8 @@ def group_document(
     own = [row.name for row in m.own if row.name in heliostats.parameters]
     if own:
         raise InputError(
-            f"group {name}: parameter {own[0]} belongs to an own joint, which a plant file "
-            "cannot hold; write the plant without it"
+            f"group {name}: parameter {own[0]} belongs to a user-defined joint, which a plant "
+            "file cannot hold; write the plant without it"
         )
     for parameter, values in heliostats.parameters.items():
         columns[f"parameters.{_column(m, parameter)}"] = values

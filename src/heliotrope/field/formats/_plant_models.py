@@ -79,7 +79,7 @@ class MarkTable(StrictTable):
     kind: Literal["corner", "tee", "square", "disc", "tag", "picture"]
     at_m: Vector = Field(description="ENU of vertex, middle of the bar, or centre.")
     size_m: Positive
-    stroke_m: Positive | None = Field(None, description="Of corner or tee; default: size / 5.")
+    stroke_m: Positive | None = Field(None, description="For corner or tee; default: size / 5.")
     turn_deg: Number = Field(0.0, description="Counterclockwise, as seen from the front.")
     code: str = Field("", description="Tag: 4X4_50:7 or APRILTAG_36h11:7; picture: its file.")
 
@@ -162,10 +162,12 @@ class BoxTable(StrictTable):
     kind: Literal["box"]
     center_m: Vector
     size_m: Annotated[list[Positive], Field(min_length=3, max_length=3)] = Field(
-        description="To its right, forwards, and up."
+        description="To the right of the camera, forward, and up."
     )
-    azimuth_deg: Number = Field(0.0, description="Azimuth of its forward direction.")
-    azimuth_rad: Number | None = Field(None, description="Instead, as the program writes it.")
+    azimuth_deg: Number = Field(0.0, description="Azimuth of the forward direction.")
+    azimuth_rad: Number | None = Field(
+        None, description="Alternative form, which the program writes."
+    )
 
 
 class SphereTable(StrictTable):
@@ -289,29 +291,32 @@ class SteppingTable(StrictTable):
 
     microsteps: Annotated[
         list[Annotated[int, Field(ge=1, le=256)]], Field(min_length=2, max_length=2)
-    ] = Field(description="Of a full step, of both driven joints in their order.")
+    ] = Field(description="Of a full step, for both driven joints in order.")
     rests: bool = Field(
-        False, description="Whether the drivers are off between motions, which end on full steps."
+        False,
+        description="Whether the drivers switch off between motions, which then end on full steps.",
     )
 
 
 class MachineTable(StrictTable):
     """``[groups.NAME.machine]``: what local controllers store besides the calibration."""
 
-    axes: dict[str, AxisTable] = Field(description="By driven joint.")
+    axes: dict[str, AxisTable] = Field(description="For each driven joint.")
     stow_steps: Annotated[list[Steps], Field(min_length=2, max_length=2)] | None = Field(
-        None, description="Of both driven joints in their order; or stow_deg."
+        None, description="For both driven joints in order; or stow_deg."
     )
     stow_deg: Pair | None = None
     defocus_deg: Pair | None = Field(
-        None, description="By which both joints turn away; or defocus_mrad, defocus_rad."
+        None, description="Angles by which both joints turn away; or defocus_mrad, defocus_rad."
     )
     defocus_mrad: Pair | None = None
     defocus_rad: Pair | None = None
     defocus_spread: Annotated[float, Field(ge=0.0, le=4.0, allow_inf_nan=False)] = Field(
         1.0,
-        description="Each mirror turns by up to this many times more, so that their beams part; "
-        "0: all by the same angles.",
+        description=(
+            "Each heliostat turns by up to this many times more, so that the beams spread; 0: all "
+            "by the same angles."
+        ),
     )
     stow_lights: bool = Field(
         False,
@@ -320,11 +325,13 @@ class MachineTable(StrictTable):
     )
     tilt_sensor: bool = Field(
         False,
-        description="Whether each mirror carries a sensor of its tilt: automatic control then lets "
-        "each be diagnosed at stow, on each day before it is raised.",
+        description=(
+            "Whether each mirror carries a tilt sensor: automatic control then diagnoses every "
+            "heliostat at stow each day before raising it."
+        ),
     )
     standby_m: Vector | None = Field(
-        None, description="ENU; without: the local controller keeps the point it has."
+        None, description="ENU; if omitted, the local controller keeps its present point."
     )
     leaves_stow_first: str | None = Field(
         None, description="Joint that moves first when leaving stow; default: the first driven."
@@ -335,7 +342,7 @@ class MachineTable(StrictTable):
         "the local controller finds its own.",
     )
     stepping: SteppingTable | None = Field(
-        None, description="Without: the local controller keeps what it has."
+        None, description="If omitted, the local controller keeps its present values."
     )
 
 
@@ -457,7 +464,7 @@ def _with_numbers(settings: type[CodedSettings]) -> Callable[[type[Made]], type[
             usual = f"{text}; default: {one.default / setting.scale:g}."
             keys[setting.key(one.name)] = kind, Field(None, description=usual)
             if setting.unit == "mrad":
-                written = Field(None, description="Instead, as the program writes it.")
+                written = Field(None, description="Alternative form, which the program writes.")
                 keys[f"{one.name}_rad"] = kind, written
         return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **keys)
 
@@ -468,14 +475,16 @@ def _with_numbers(settings: type[CodedSettings]) -> Callable[[type[Made]], type[
 class JointVisitsTable(StrictTable):
     """``[joint_visits]``: several heliostats on one target at once, told apart by movements."""
 
-    allowed: bool = Field(True, description="False: each heliostat is calibrated alone.")
+    allowed: bool = Field(True, description="False: each heliostat is calibrated on its own.")
 
 
 @_with_numbers(ReceiverSettings)
 class ReceiverVisitsTable(StrictTable):
     """``[receiver_visits]``: heliostats that shine on a receiver, measured there."""
 
-    camera: str = Field(min_length=1, description="A camera with a place that sees the receiver.")
+    camera: str = Field(
+        min_length=1, description="A camera of known position that sees the receiver."
+    )
     receiver: str = Field(min_length=1, description="A planar receiver.")
 
 
@@ -490,7 +499,7 @@ class TimetableTable(StrictTable):
     )
     every_s: Number | None = Field(None, description="Interval, from midnight UTC; 60 to 86400.")
     rule: Literal["", "first", "never"] = Field(
-        "", description="Instead of times: taken before others, or only by persons."
+        "", description="Instead of times: calibrated before others, or only by operators."
     )
 
 
@@ -499,12 +508,14 @@ class ApprovalTable(StrictTable):
 
     parameters: bool = Field(
         False,
-        description="True: a person's change of a heliostat's parameters, or their roll-back, "
-        "waits until another engineer approves it.",
+        description=(
+            "True: when a user changes or rolls back a heliostat's parameters, the change waits "
+            "until another engineer approves it."
+        ),
     )
     within_s: Number = Field(
         ApprovalSettings.within,
-        description="Time after which a change that nobody has approved ends; 60 to 604800.",
+        description="Time after which an unapproved change expires; 60 to 604800.",
     )
 
 
@@ -532,13 +543,16 @@ class AimsTable(StrictTable):
     )
     margin: Number = Field(0.05, description="Share kept for the model's own error; 0 to 0.5.")
     probability: Number = Field(
-        AimSettings.probability, description="That the limit holds everywhere; 0.5 to 0.9999."
+        AimSettings.probability,
+        description="Probability that the limit holds everywhere; 0.5 to 0.9999.",
     )
-    drift_mrad: Number = Field(0.0, description="Error that all normals share; 0 to 50.")
-    clock_s: Number = Field(0.0, description="Error of the field's clock; 0 to 600.")
-    cluster_mrad: Number = Field(0.0, description="Error that a cluster's normals share; 0 to 50.")
+    drift_mrad: Number = Field(0.0, description="Error common to all mirror normals; 0 to 50.")
+    clock_s: Number = Field(0.0, description="Error of the field clock; 0 to 600.")
+    cluster_mrad: Number = Field(
+        0.0, description="Error common to the mirror normals of a cluster; 0 to 50."
+    )
     dni_w_m2: Number = Field(
-        AimSettings.dni, description="The limit holds at this irradiance at least; 1 to 1500."
+        AimSettings.dni, description="The limit holds at least up to this irradiance; 1 to 1500."
     )
     ramp_kw_m2_min: Number = Field(
         0.0,
@@ -546,10 +560,10 @@ class AimsTable(StrictTable):
         "standby or a cloud, kW/m² a minute; 0: no ramp.",
     )
     moves_per_minute: Number = Field(
-        AimSettings.moves, description="Tracking heliostats that get another aim; 1 to 6000."
+        AimSettings.moves, description="Number of tracking heliostats given a new aim; 1 to 6000."
     )
     together: int = Field(
-        AimSettings.together, description="Heliostats that move at once; 1 to 1000."
+        AimSettings.together, description="Number of heliostats moving at the same time; 1 to 1000."
     )
     every_s: Number = Field(
         AimSettings.every, description="Time between two computations; 5 to 600."
@@ -577,16 +591,17 @@ class PlantDocument(StrictTable):
     )
     cameras: list[CameraTable] = Field(default_factory=list)
     keep_out: list[AnyVolume] = Field(
-        default_factory=list, description="Volumes where no beam may be."
+        default_factory=list, description="Volumes that no beam may enter."
     )
     eyes_m: dict[str, Vector] = Field(
-        default_factory=dict, description="Places from which people may look into beams at rest."
+        default_factory=dict,
+        description="Places from which people may look into beams of heliostats at rest.",
     )
     joint_visits: JointVisitsTable | None = Field(
-        None, description="Without: joint visits with the default settings."
+        None, description="If omitted, joint visits with the default settings."
     )
     receiver_visits: ReceiverVisitsTable | None = Field(
-        None, description="Without: no heliostat is measured on a receiver."
+        None, description="If omitted, no heliostat is measured on a receiver."
     )
     timetable: list[TimetableTable] = Field(
         default_factory=list, description="Calibrations at times of day and at intervals."
@@ -596,11 +611,11 @@ class PlantDocument(StrictTable):
         WithJsonSchema(
             {
                 **schema(CONDITIONS),
-                "description": "Numbers of the safety table that this plant sets, by condition.",
+                "description": "Values of the safety table that this plant sets, by condition.",
             }
         ),
     ] = Field(default_factory=dict)
     approval: ApprovalTable | None = Field(
-        None, description="Without: no change needs a second person."
+        None, description="If omitted, no change needs a second engineer."
     )
-    aims: AimsTable | None = Field(None, description="Without: strategy spread.")
+    aims: AimsTable | None = Field(None, description="If omitted, strategy spread.")

@@ -63,7 +63,7 @@ def set_surface(table: Any, changes: Mapping[str, str]) -> tuple[str, ...]:
         _move(table, lambda point: point + shift)
     if RENAMED in changes or set(changes) <= set(_SIZES) - {"width_m", "height_m"}:
         return ()
-    kept = "sightings that were taken on it before count as they were measured then"
+    kept = "earlier sightings on it keep the positions measured at that time"
     return (f"{table['name']}: {kept}; if it was moved, rename it too (name=…)",)
 
 
@@ -72,7 +72,7 @@ def _turn(table: Any, changes: Mapping[str, str]) -> None:
     new = _numbers(table, "facing_deg", changes.get("facing_deg", f"{facing!r}"), 1)[0]
     lean = _numbers(table, "tilt_deg", changes.get("tilt_deg", f"{tilt!r}"), 1)[0]
     if abs(lean) >= 90.0:
-        raise InputError(f"{table['name']}: tilt_deg={lean:g}: give less than 90° either way")
+        raise InputError(f"{table['name']}: tilt_deg={lean:g}: must be between -90° and 90°")
     R_enu_new, R_enu_old = _axes(new, lean), _axes(facing, tilt)
     middle, R = _center(table), R_enu_new @ R_enu_old.T
     if "corners_m" not in table and "normal" not in table and abs(lean) > 1e-9:
@@ -179,5 +179,5 @@ def _numbers(table: Any, name: str, text: str, count: int) -> list[float]:
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
         expected = "a number" if count == 1 else "three numbers in metres, east,north,up"
-        raise InputError(f"{table['name']}: {name}={text}: give {expected}")
+        raise InputError(f"{table['name']}: {name}={text}: write {expected}")
     return numbers

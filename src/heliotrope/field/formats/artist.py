@@ -78,8 +78,8 @@ def write_scenario(
             for name, group in heliostats.items():
                 if name not in known:
                     raise InputError(
-                        f"heliostat {name}: {file} has {len(known)} heliostats, and none of that "
-                        "name; make the scenario with it"
+                        f"heliostat {name}: {file} has {len(known)} heliostats, but none of that "
+                        "name; create the scenario with this heliostat"
                     )
                 mechanism = written(group, name)
                 foot = enu_to_geodetic(mechanism.position, origin)

@@ -130,10 +130,10 @@ def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, Float
         linked = root.get(f"{facet}/{name}", getlink=True)
         data = root[f"{facet}/{name}"] if isinstance(linked, h5py.HardLink) else None
         if not isinstance(data, h5py.Dataset) or data.external or data.is_virtual:
-            raise FormatError(file, f"{facet} has no {name} of its own")
+            raise FormatError(file, f"{facet} has no dataset {name}")
         if data.dtype.kind not in "fiu" or data.ndim != 2 or data.shape[1] != 3:
             raise FormatError(
-                file, f"{facet}/{name}: {data.dtype} of shape {data.shape}; give numbers (K, 3)"
+                file, f"{facet}/{name}: {data.dtype} of shape {data.shape}; expected numbers (K, 3)"
             )
         if 8 * data.size > EXPANDED:
             raise FormatError(
@@ -145,7 +145,11 @@ def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, Float
     points, normals = both
     if len(points) != len(normals) or not len(points):
         raise FormatError(
-            file, f"{facet}: {len(points)} points and {len(normals)} normals; give one for each"
+            file,
+            (
+                f"{facet}: {len(points)} points and {len(normals)} normals; there must be one "
+                "normal per point"
+            ),
         )
     good = np.isfinite(points).all(axis=-1) & np.isfinite(normals).all(axis=-1)
     return points[good], normals[good]
@@ -169,11 +173,11 @@ def _gridded(
         raise FormatError(
             file,
             f"facet{k + 1}: {int(inside.sum())} of {len(points)} points lie on facet {k} of the "
-            "plant file; give the file of this heliostat, in the axes of its properties",
+            "plant file; use the file of this heliostat, in the axes of its properties",
         )
     if (own[inside, 2] <= 0.0).any():
         raise FormatError(
-            file, f"facet{k + 1}: a normal looks backwards; it must look to the front"
+            file, f"facet{k + 1}: a normal points backwards; it must point to the front"
         )
     uv, own = uv[inside], own[inside]
     deviation = -own[:, :2] / own[:, 2:] - uv * curve[k]

@@ -114,7 +114,7 @@ class FetchSettings:
 
     def __post_init__(self) -> None:
         if not 1 <= self.workers <= 32:
-            raise InputError(f"workers {self.workers}: give 1 to 32")
+            raise InputError(f"workers {self.workers}: must be 1 to 32")
         if not self.timeout > 0.0 or not self.backoff >= 0.0 or self.retries < 0:
             raise InputError(
                 f"timeout {self.timeout} s must be above 0, backoff {self.backoff} s and retries "
@@ -188,7 +188,7 @@ def fetch_heliostats(
     names = [ids] if isinstance(ids, str) else list(dict.fromkeys(ids))
     for name in names:
         if not _HELIOSTAT.fullmatch(name):
-            raise InputError(f"heliostat {name!r}: give a name of letters and digits, such as AA39")
+            raise InputError(f"heliostat {name!r}: use a name of letters and digits, such as AA39")
     for what, chosen, known in (("kind", kinds, KINDS), ("image", images, IMAGES)):
         for choice in chosen:
             if choice not in known:
@@ -433,7 +433,7 @@ class _Run:
         try:
             job.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise FetchError(f"{job.path.parent}: cannot be made ({error.strerror})") from None
+            raise FetchError(f"{job.path.parent}: cannot be created ({error.strerror})") from None
         try:
             return download(job, self._channel)
         except FetchError as error:

@@ -258,7 +258,7 @@ def _axis(values: Values, element: XmlElement) -> DrivenAxis:
         raise values.error(
             element,
             f"<{element.tag}> rotationAngles {np.degrees(stops[0]):g}° to "
-            f"{np.degrees(stops[1]):g}°: the lower stop stands first; exchange them",
+            f"{np.degrees(stops[1]):g}°: the lower stop must come first; swap them",
         )
     return DrivenAxis(values.lengths(element, "translation", 3), normalize(along), stops)
 
@@ -350,7 +350,7 @@ def heliostats(document: Document) -> list[PlacedModel]:
     for kit in _scene(document, values, "HeliostatKit"):
         name = kit.path[-1] if kit.path else ""
         if not name:
-            raise values.error(kit.element, "a heliostat whose node has no name; give it one")
+            raise values.error(kit.element, "a heliostat node has no name; name it")
         if name in by_name:
             raise values.error(
                 kit.element, f"heliostat {name}: the name occurs twice; names are unique"
@@ -443,7 +443,11 @@ def to_plant(document: Document, site: Site) -> Plant:
         model = placed.model
         if not model.facets:
             raise FormatError(
-                path, f"HeliostatKit {model.name}: no <Facet>, so its mirror has no size; add one"
+                path,
+                (
+                    f"HeliostatKit {model.name}: no <Facet>, so the mirror has no size; add a "
+                    "<Facet>"
+                ),
             )
         upright = int(np.argmax(np.abs(model.primary.direction)))
         key = (upright, len(model.facets), len(model.axes))

@@ -222,8 +222,8 @@ def to_plant(table: FieldTable, site: Site, centroids: Centroids | None = None) 
     if centroids is not None and (table.facets != len(centroids)).any():
         i = int(np.flatnonzero(table.facets != len(centroids))[0])
         raise InputError(
-            f"heliostat {table.names[i]}: {table.facets[i]} facets, but there are "
-            f"{len(centroids)} centroids"
+            f"heliostat {table.names[i]}: {table.facets[i]} facets, but the centroid table has "
+            f"{len(centroids)}"
         )
     kinds = sorted(set(zip(table.rows.tolist(), table.columns.tolist(), strict=True)))
     groups = {}

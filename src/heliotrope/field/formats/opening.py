@@ -50,7 +50,7 @@ def open_plant(
     require("path", path, (str, Path), "the path of a file or folder")
     place = Path(path)
     if not str(path).strip():
-        raise InputError("path is empty; give the path of a file or folder")
+        raise InputError("path is empty; pass the path of a file or folder")
     if site is not None:
         require("site", site, Site, "Site(latitude_deg, longitude_deg, height)")
     try:
@@ -74,7 +74,7 @@ def _read(
         _refuse_unused(place, site=site, centroids=centroids, templates=templates)
         return paint.read_plant(place)
     if not place.exists():
-        raise FormatError(place, "there is no such file; give a plant file or a folder")
+        raise FormatError(place, "no such file; pass a plant file or a folder")
     suffix = place.suffix.lower()
     if suffix == ".xml":
         _refuse_unused(place, centroids=centroids, templates=templates)
@@ -110,14 +110,14 @@ def _of_solarpilot(
     mirror = solarpilot.Template(DEFAULT_MIRROR, DEFAULT_MIRROR)
     plant = solarpilot.to_plant(layout, site, dict.fromkeys(layout.template.tolist(), mirror))
     size = (
-        f"the layout gives none: {DEFAULT_MIRROR} m × {DEFAULT_MIRROR} m with the mirror in its "
-        "pivot is SolarPILOT's default; give templates"
+        f"the layout specifies none: {DEFAULT_MIRROR} m × {DEFAULT_MIRROR} m with the mirror in "
+        "its pivot is SolarPILOT's default; pass templates"
     )
     return plant.with_notes({"size of the mirrors": size})
 
 
 _GIVE = (
-    "so the sun above it is unknown; give the site (site=Site(latitude, longitude, height), "
+    "so the sun cannot be computed; specify the site (site=Site(latitude, longitude, height), "
     "--site LATITUDE,LONGITUDE,HEIGHT)"
 )
 
@@ -127,7 +127,8 @@ def _refuse_unused(place: Path, **arguments: object) -> None:
     for name, value in arguments.items():
         if value is not None:
             raise FormatError(
-                place, f"{name} is given, but files of this format have their own; leave it out"
+                place,
+                (f"{name} is specified, but files of this format contain their own; leave it out"),
             )
 
 

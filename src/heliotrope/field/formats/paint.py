@@ -328,7 +328,7 @@ def read_plant(folder: str | Path) -> Plant:
     place = Path(folder)
     if not place.is_dir():
         raise FormatError(
-            place, "this is not a folder; give one with properties and the tower's file"
+            place, "this is not a folder; use a folder with heliostat properties and the tower file"
         )
     tower = read_tower(find_tower(place))
     files = find_properties(place)

@@ -128,7 +128,7 @@ def edit(
         if before.get(name, "") != after.get(name, "")
     ]
     if not shown:
-        raise InputError(f"{who}: it has these values already; nothing was changed")
+        raise InputError(f"{who}: the values are already in use; nothing was changed")
     with files.trial() as findings:
         new = tuple(text for text in findings if text not in warned)
     if dry:
@@ -249,7 +249,7 @@ class _Files:
             try:
                 value = float(text) * factor
             except ValueError:
-                raise InputError(f"{who}: {name}={text}: give a number") from None
+                raise InputError(f"{who}: {name}={text}: enter a number") from None
             self._fill(who, column)
             cell = value if self.table.suffix == ".parquet" else repr(float(value))
             self.cells.loc[self._row(who), column] = cell
@@ -283,7 +283,7 @@ class _Files:
         prior = {name: sigma for name, (sigma, _) in _parameters(group).items()}.get(column)
         if not prior or abs(value) <= _STRANGE * prior:
             return []
-        times = f"{value:g} is {abs(value) / prior:.0f} times what installations leave"
+        times = f"{value:g} is {abs(value) / prior:.0f} times the usual installation error"
         return [f"{who}: {column} {times} (σ {prior:g}); is it in another unit?"]
 
     def _rename(self, old: str, new: str) -> None:

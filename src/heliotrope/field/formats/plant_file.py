@@ -262,7 +262,7 @@ def _target(table: TargetTable) -> Target:
     size = (table.center_m, table.width_m, table.height_m, table.facing_deg)
     if any(value is None for value in size):
         raise InputError(
-            f"target {table.name}: give corners_m, or center_m, width_m, height_m and facing_deg"
+            f"target {table.name}: specify corners_m, or center_m, width_m, height_m and facing_deg"
         )
     center = np.array(table.center_m)
     corners = rectangle(center, size[1] or 0.0, size[2] or 0.0, np.radians(size[3] or 0.0))
@@ -404,7 +404,7 @@ def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
     if np.linalg.norm(lines[nearest]) < reach:
         texts.append(
             f"{what}: its centre is {np.linalg.norm(lines[nearest]):.2f} m from heliostat "
-            f"{plant.names[nearest]}, so that they touch; correct its center_m"
+            f"{plant.names[nearest]}, so the two touch; correct its center_m"
         )
     if surface.center[2] < plant.position[:, 2].min():
         texts.append(
@@ -413,8 +413,9 @@ def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
         )
     if isinstance(surface, Target) and surface.upside_down:
         texts.append(
-            f"{what}: its upper corners lie below its lower ones, so photographs are read turned "
-            "by 180°; give upper left, upper right, lower right, lower left as seen from the front"
+            f"{what}: its upper corners lie below its lower ones, so photographs would be read "
+            "upside down; list upper left, upper right, lower right, lower left as seen from the "
+            "front"
         )
     return texts
 
@@ -422,7 +423,7 @@ def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
 def _coinciding(surfaces: Sequence[Target | Receiver]) -> list[str]:
     """Return a line on the surfaces that share a centre."""
     return [
-        f"{one.name} and {other.name} have one centre; correct one, or leave it out"
+        f"{one.name} and {other.name} have the same centre; correct one or remove it"
         for one, other in itertools.combinations(surfaces, 2)
         if np.linalg.norm(one.center - other.center) < 0.01
     ]

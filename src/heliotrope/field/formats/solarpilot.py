@@ -181,7 +181,7 @@ def read_layout(path: str | Path, site: Site | None = None) -> Layout:
         header, columns = _by_header(file, place, head)
     rows = rows_under(file, (place, header), places[first:], table[first:])
     if not len(rows):
-        raise FormatError(file, "there is no heliostat in it; one line each is needed")
+        raise FormatError(file, "there are no heliostats; write one line per heliostat")
     names = rows.names(columns["name"], "heliostat") if "name" in columns else ()
     rows.heliostat = names
     focus, cant, aim = (_group(rows, columns, group) for group in _GROUPS)
@@ -200,8 +200,8 @@ def read_layout(path: str | Path, site: Site | None = None) -> Layout:
     if first == 0 and len(layout) > 1 and len(set(layout.template)) == len(layout):
         raise FormatError(
             file,
-            "each row has another number in column 1, as ids have, but without a header it is the "
-            "template; begin the file with a line such as id,x,y,z",
+            "column 1 has a different number in each row, like ids, but without a header it is "
+            "read as the template; begin the file with a line such as id,x,y,z",
             place,
         )
     return layout
@@ -234,7 +234,7 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
     names, units = ([*row, *[""] * width][:width] for row in (head[0], (*head[1:2], [])[0]))
     if len(head) > 2 or not all(_UNIT.fullmatch(unit) for unit in units if unit):
         cell = next((cell for cells in head[1:] for cell in cells if _NUMBERED.match(cell)), "")
-        advice = f" ({cell!r:.30} has more than a number: give metres without their unit)"
+        advice = f" ({cell!r:.30} is not a plain number: write metres without the unit)"
         text = f"no number below the header{advice if cell else ''}; {_EXAMPLE}"
         raise FormatError(file, text, place)
     header: list[str] = []
@@ -252,23 +252,25 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
         expected = "deg" if meaning in _DEGREES[:2] else "m"
         stated = "" if unit is None else (unit[1] or unit[2] or "").lower()
         if meaning in (*_METRES, *_DEGREES) and stated not in ("", "°", "degrees", expected):
-            raise FormatError(file, f"column {cell} is in {stated}; give {expected}", place)
+            raise FormatError(file, f"column {cell} is in {stated}; use {expected}", place)
         by_meaning.setdefault(meaning, []).append((rank, header[-1]))
     unknown = {_form(name) for _, name in by_meaning.pop("", ())}
     if {"group", "eastm"} <= {_form(name) for name in names} | unknown:
         text = "this is the table of a plant file; open the plant file (.toml) that names it"
         raise FormatError(file, text, place)
     if unknown & {"unit", "units"}:
-        text = "a column of units is not read; give metres, or degrees and metres, and leave it out"
+        text = "unit columns are not read; use metres, or degrees and metres, and remove the column"
         raise FormatError(file, text, place)
     for meaning, all_ in by_meaning.items():
         all_.sort()
         if len(all_) > 1 and (meaning != "name" or all_[0][0] == all_[1][0]):
-            raise FormatError(file, f"two columns give {meaning}; keep one", place)
+            raise FormatError(file, f"two columns hold {meaning}; keep one", place)
     columns = {meaning: entries[0][1] for meaning, entries in by_meaning.items()}
     if not any(all(axis in columns for axis in axes) for axes in (_METRES, _DEGREES)):
         shown = ", ".join(name[:30] for name in names[:8])
-        raise FormatError(file, f"the header ({shown}) gives no positions; {_EXAMPLE}", place)
+        raise FormatError(
+            file, f"the header ({shown}) names no position columns; {_EXAMPLE}", place
+        )
     if all(axis in columns for axis in _METRES):
         # Positions in degrees beside them are not read.
         columns = {meaning: name for meaning, name in columns.items() if meaning not in _DEGREES}
@@ -295,7 +297,10 @@ def _templates(rows: Rows, column: str | None) -> npt.NDArray[np.int64]:
 def _flags(rows: Rows, column: str | None) -> npt.NDArray[np.bool_]:
     if column is None:
         return np.ones(len(rows), dtype=np.bool_)
-    advice = f"give 0 or 1; {len(rows.columns)} columns begin with template, enabled, in layout"
+    advice = (
+        f"write 0 or 1; with {len(rows.columns)} columns a row begins with template, enabled, in "
+        "layout"
+    )
     return rows.flags(column, advice)
 
 
@@ -305,7 +310,7 @@ def _location(rows: Rows, columns: dict[str, str], site: Site | None) -> FloatAr
         meanings = zip(_METRES, ("east_m", "north_m", "up_m"), strict=True)
         return np.stack([plausible(rows, columns[a], meaning) for a, meaning in meanings], axis=-1)
     if site is None:
-        raise FormatError(rows.path, "positions are in degrees; give the site", rows.header)
+        raise FormatError(rows.path, "positions are in degrees; specify the site", rows.header)
     latitude, longitude, altitude = (
         plausible(rows, columns[axis], meaning)
         for axis, meaning in zip(
@@ -394,12 +399,12 @@ def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> P
     """
     used = layout.enabled & layout.in_layout
     if not used.any():
-        raise InputError("layout: none of its heliostats is enabled and in the layout")
+        raise InputError("layout: no heliostat is both enabled and in the layout")
     for i in np.flatnonzero(used):
         if int(layout.template[i]) not in templates:
             known = ", ".join(str(number) for number in sorted(templates)) or "none"
             which = f"heliostat {layout.names[i]}: template {layout.template[i]}"
-            raise InputError(f"{which} is not among those given ({known})")
+            raise InputError(f"{which} is not among the specified templates ({known})")
     groups = {}
     for number in np.unique(layout.template[used]).tolist():
         rows = np.flatnonzero(used & (layout.template == number))

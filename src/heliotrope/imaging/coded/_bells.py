@@ -18,7 +18,7 @@ def bell(points: FloatArray, place: FloatArray, moments: FloatArray) -> FloatArr
 
 
 def slopes(points: FloatArray, place: FloatArray, moments: FloatArray) -> FloatArray:
-    """Return the change of a Gaussian of power 1 by a movement along each axis, (2, N)."""
+    """Return the change of a Gaussian of power 1 per movement along each axis, (2, N)."""
     s = (points - place) @ np.linalg.inv(moments)
     return np.asarray(s.T * bell(points, place, moments))
 
@@ -26,10 +26,10 @@ def slopes(points: FloatArray, place: FloatArray, moments: FloatArray) -> FloatA
 def slope_derivatives(
     points: FloatArray, place: FloatArray, moments: FloatArray, power: float
 ) -> FloatArray:
-    """Return derivatives of ``power`` times `slopes`, (6, 2, N).
+    """Return the derivatives of ``power`` times `slopes`, (6, 2, N).
 
-    By power, place (2) and second moments (right, cross, up). A second moment changes a Gaussian
-    by half of its second derivative.
+    Derivatives are with respect to power, position (2) and second moments (right, cross, up). The
+    derivative of a Gaussian with respect to a second moment is half its second spatial derivative.
     """
     q = np.linalg.inv(moments)
     s = ((points - place) @ q).T
@@ -48,9 +48,9 @@ def slope_derivatives(
 def moved(
     points: FloatArray, place: FloatArray, moments: FloatArray, moves: FloatArray
 ) -> FloatArray:
-    """Return a Gaussian of power 1 at K places, less the one that rests, (K, N).
+    """Return a Gaussian of power 1 at K positions minus the same Gaussian at rest, (K, N).
 
-    Codes have few values, and equal movements are drawn once.
+    Codes take few values, so equal movements are computed only once.
     """
     distinct, which = np.unique(moves, axis=0, return_inverse=True)
     rest = bell(points, place, moments)

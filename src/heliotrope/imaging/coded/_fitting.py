@@ -1,4 +1,4 @@
-"""Fits beams to the pictures of their movements."""
+"""Fits beams to the pictures that their movements produce."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from heliotrope.imaging.coded._tops import Top
 from heliotrope.imaging.coded.beams import ExpectedBeam
 from heliotrope.imaging.coded.stack import Light, Stack, light_of
 
-#: Least significance of a movement.
+#: Minimum significance of a movement.
 SIGNIFICANT = 8.0
 #: Codes that lost photographs must keep this share of their independence.
 _INDEPENDENT = 0.02
@@ -28,7 +28,7 @@ _STEPS = 6
 
 @dataclass(frozen=True)
 class Fit:
-    """A beam that moves by its code.
+    """A fitted beam that moves according to its code.
 
     Attributes
     ----------
@@ -39,12 +39,12 @@ class Fit:
     moments
         Second moments, m², (2, 2).
     covariance
-        Of the place, m², (2, 2).
+        Covariance of the position, m², (2, 2).
     power_sigma
         Standard deviation of ``power``.
     shown
-        Whether the surface shows where it is; False for one that lies beside the surface by more
-        than its radius, of which only a tail was fitted.
+        Whether the surface shows the beam's position; False if the beam lies more than its radius
+        off the surface, so that only a tail was fitted.
     """
 
     power: float
@@ -56,7 +56,7 @@ class Fit:
 
     @property
     def radius(self) -> float:
-        """The standard deviation of its light, both axes together, m."""
+        """Radius of the beam: standard deviation of its light over both axes, m."""
         return float(np.sqrt(0.5 * np.trace(self.moments)))
 
 
@@ -67,7 +67,7 @@ class Fitted:
     Attributes
     ----------
     fits
-        M; None if nothing follows the code.
+        One fit per heliostat, M; None if nothing follows the code.
     light
         Light of the photographs.
     mean
@@ -80,14 +80,14 @@ class Fitted:
 
 
 def axes_of(moves: FloatArray) -> npt.NDArray[np.intp]:
-    """Return the A axes, both or one, along which mirrors move, for moves (K, M, 2)."""
+    """Return the axes (A of them, one or two) along which heliostats move, for moves (K, M, 2)."""
     return np.flatnonzero(np.any(moves != 0.0, axis=(0, 1)))
 
 
 def code_of(moves: FloatArray) -> npt.NDArray[np.intp]:
-    """Return the first mirror with the same code as each mirror, (M,), for moves (K, M, 2).
+    """Return for each heliostat the first one with the same code, (M,), for moves (K, M, 2).
 
-    Mirrors share a code if their movements are in proportion, by one positive factor each axis.
+    Heliostats share a code if their movements are proportional, with one positive factor per axis.
     """
     moves = moves[..., axes_of(moves)]
     size = np.sqrt((moves**2).sum(axis=0))
@@ -99,9 +99,9 @@ def code_of(moves: FloatArray) -> npt.NDArray[np.intp]:
 def regression(moves: FloatArray, weights: FloatArray) -> FloatArray | None:
     """Return the rows (A M, K) that turn pixels' series into changes per metre of movement.
 
-    A is the number of axes along which mirrors move. The change of mirrors that share a code is the
-    same but for the size of their movements. None if other codes depend on each other over the
-    photographs that count.
+    A is the number of axes along which heliostats move. Heliostats that share a code change in the
+    same way, apart from the size of their movements. None if different codes are linearly dependent
+    over the photographs used.
     """
     if not moves.any():
         return None
@@ -132,10 +132,10 @@ def fitted(
     expected: Sequence[ExpectedBeam],
     tops: Sequence[Top],
 ) -> Fitted:
-    """Fit the beams of a stack by Gauss and Newton.
+    """Fit the beams of a stack by Gauss-Newton iteration.
 
-    The residual is exact: what the photographs show beyond beams that moved as ordered. Each
-    mirror is improved from its own pictures of that residual, one for each axis of its movement.
+    The residual is exact: it is what the photographs show beyond beams that moved as commanded.
+    Each beam is improved from its own pictures of that residual, one per axis of movement.
     """
     points = np.stack(np.meshgrid(*stack.axes), axis=-1)[stack.seen]
     fits: list[Fit | None] = [
@@ -178,7 +178,7 @@ def fitted(
 
 
 def _beside(points: FloatArray, place: FloatArray) -> FloatArray:
-    """Return how far a place is beyond points (N, 2) along each axis, m, (2,); 0 or less: not."""
+    """Return how far a position lies beyond points (N, 2) along each axis, m, (2,); ≤ 0: not."""
     return np.asarray(np.maximum(points.min(axis=0) - place, place - points.max(axis=0)))
 
 
@@ -190,7 +190,7 @@ def _window(points: FloatArray, fit: Fit) -> npt.NDArray[np.bool_]:
 def _improved(
     points: FloatArray, picture: FloatArray, fit: Fit, first: Fit, axes: npt.NDArray[np.intp]
 ) -> Fit:
-    """Return a fit improved by one step, which is bounded."""
+    """Return a fit improved by one bounded step."""
     if len(points) < 12:
         return fit
     terms = slope_derivatives(points, fit.place, fit.moments, fit.power)[:, axes].reshape(6, -1)
@@ -205,7 +205,7 @@ def _improved(
 
 
 def _bounded(moments: FloatArray, fit: Fit, first: Fit) -> FloatArray:
-    """Return moments that differ from the last and the first ones by no more than a factor."""
+    """Limit second moments to within a factor of the previous and of the initial moments."""
     for base, factor in ((fit.moments, _CHANGE**2), (first.moments, _WIDEST**2)):
         root = np.linalg.cholesky(base)
         inverse = np.linalg.inv(root)
@@ -223,13 +223,13 @@ def _measured(
     stack: Stack,
     axes: npt.NDArray[np.intp],
 ) -> Fit:
-    """Return a fit with its covariance, its place corrected by the moments of the residual.
+    """Return a fit with its covariance, its position corrected by the residual.
 
-    With x from the fitted place, ∫ x² Gₓ = ∫ 2 x y G_y = 2 p x̄ for any shape; 4 : 3 is the best
-    weight of the two in a round window with even noise. One picture alone gives either. The
-    correction counts as far as its own
-    noise allows. Noise is what each photograph's residual does to the place: neighbouring pixels
-    may err together, photographs may not.
+    With x measured from the fitted position, ∫ x² Gₓ = ∫ 2 x y G_y = 2 p x̄ for any beam shape;
+    weights of 4 : 3 are best for the two in a round window with uniform noise. A single picture
+    yields only one of them. The correction is weighted according to its own noise, which is the
+    effect of each photograph's residual on the position: errors may be correlated between
+    neighbouring pixels, but not between photographs.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The verdict of a stack on each heliostat."""
+"""Judges the beam of each heliostat from a stack."""
 
 from collections.abc import Sequence
 
@@ -46,7 +46,7 @@ def judged(
     expected, tops, fits
         M mirrors.
     still
-        Light at rest; None where other light hides it.
+        Static light; None where other light hides it.
     """
     usual = float(np.percentile([fit.power for fit in fits if fit is not None] or [0.0], 75.0))
     strong = [None if fit is None or fit.power < _WEAK * usual else fit for fit in fits]
@@ -89,12 +89,12 @@ def _judged(
 
 
 def _disagrees(gain: float, sigma: float) -> bool:
-    """Return whether light rests at a beam's place, or more light moves than the beam has."""
+    """Return whether a beam's position has static light, or more light moves than the beam has."""
     return bool(abs(gain - 1.0) > max(_GAIN, _GAIN_SIGMAS * sigma))
 
 
 def _stands(beam: ExpectedBeam, power: float, still: StillLight) -> bool:
-    """Return whether light rests where a mirror's beam is expected."""
+    """Return whether there is static light where a heliostat's beam is expected."""
     if power > _STANDS * still.usual:
         return True
     away = [_distance(place - beam.place, beam.covariance) for place in still.uncoded]
@@ -104,14 +104,14 @@ def _stands(beam: ExpectedBeam, power: float, still: StillLight) -> bool:
 def _gain(
     index: int, fit: Fit, beam: ExpectedBeam, still: StillLight | None
 ) -> tuple[float, float]:
-    """Return the moving light over the light at the place, and its standard deviation."""
+    """Return the ratio of moving light to all light at a position, and its standard deviation."""
     if still is None:
         light, share = beam.power, beam.power_sigma
     else:
         light = float(still.powers[index])
         share = float(still.sigmas[index]) / max(light, 1e-300)
     if not light > 0.0:
-        # Unknown without a picture of the empty surface; with one, nothing is there that moves.
+        # Unknown without a picture of the empty surface; with such a picture, nothing moves there.
         return (np.nan, np.nan) if still is None else (np.inf, 0.0)
     gain = fit.power / light
     return gain, gain * float(np.sqrt(share**2 + (fit.power_sigma / fit.power) ** 2 + _SHAPE**2))

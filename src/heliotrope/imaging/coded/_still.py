@@ -23,11 +23,11 @@ class StillLight:
     Attributes
     ----------
     powers, sigmas
-        Of the light at each mirror's place and their standard deviations, brightness m², (M,).
+        Power of the light at each beam's position, and its standard deviation, brightness m², (M,).
     usual
         Median power of the beams that move, brightness m².
     uncoded
-        Places of beams that belong to no mirror, m, (U, 2).
+        Positions of beams that belong to no heliostat, m, (U, 2).
     """
 
     powers: FloatArray
@@ -42,16 +42,16 @@ def still_light(
     places: Sequence[tuple[FloatArray, FloatArray]],
     moving: Sequence[float],
 ) -> StillLight:
-    """Take the mean picture (N,) apart into beams at known places, and others.
+    """Decompose the mean picture (N,) into beams at known positions, and others.
 
     Parameters
     ----------
     stack
-        Prepared; its seen pixels are the N.
+        The prepared stack, with N seen pixels.
     mean
         Light of all beams.
     places
-        Place and second moments of each mirror's beam.
+        Position and second moments of each heliostat's beam.
     moving
         Powers of the beams that move.
     """
@@ -69,7 +69,7 @@ def still_light(
         terms.append(bell(points, place, typical))
         powers, rest = _powers(terms, mean)
     design = np.stack(terms, axis=-1)
-    # What is left is the error of beams' shapes; it is smooth over a beam.
+    # The remainder is the error of the beam shapes, which is smooth over a beam.
     normal = np.linalg.pinv(design.T @ design)
     beam = 2.0 * np.pi * float(np.sqrt(np.linalg.det(typical))) / stack.step**2
     sigmas = np.sqrt(np.maximum(np.diag(normal), 0.0) * float(rest @ rest) / len(rest) * beam)
@@ -82,7 +82,8 @@ def still_light(
 def _powers(terms: list[FloatArray], mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return powers of 0 or more by least squares, and the residual.
 
-    A beam of which the surface shows next to nothing has no power: any power would explain it.
+    A beam that is almost entirely off the surface is assigned no power, because any power would
+    explain it.
     """
     from scipy.optimize import nnls
 
@@ -95,7 +96,7 @@ def _powers(terms: list[FloatArray], mean: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _strongest(stack: Stack, picture: FloatArray, moments: FloatArray) -> tuple[FloatArray, float]:
-    """Return the place and power of the beam that a matched filter finds in a picture (N,)."""
+    """Return the position and power of the beam that a matched filter finds in a picture (N,)."""
     from scipy.signal import fftconvolve
 
     reach = int(np.ceil(3.0 * np.sqrt(np.trace(moments)) / stack.step))

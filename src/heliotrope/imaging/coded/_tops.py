@@ -16,7 +16,7 @@ _APART = 3.0
 
 @dataclass(frozen=True)
 class Top:
-    """The strongest beam that moves by a code.
+    """The strongest beam that follows a code.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class Top:
     significance
         Power in robust standard deviations of the filter over the surface.
     second
-        Power of the next strongest one, as a share.
+        Power of the second strongest beam, as a fraction.
     """
 
     place: FloatArray
@@ -48,7 +48,7 @@ def find_top(
     Parameters
     ----------
     stack
-        Prepared; its seen pixels are the N.
+        The prepared stack, with N seen pixels.
     picture
         Change per metre of movement along each of the axes.
     moments
@@ -56,8 +56,8 @@ def find_top(
     axes
         The A axes of the movement.
     others
-        Places of beams that were taken away from the pictures: what is left near them is the error
-        of their shapes, and no beam.
+        Positions of beams that were subtracted from the pictures: the remainder near them is the
+        error of their shapes, not a beam.
     """
     from scipy.signal import fftconvolve
 
@@ -68,7 +68,7 @@ def find_top(
     template = slopes(points, np.zeros(2), moments)[axes].reshape(-1, *right.shape)
     full = np.zeros((len(axes), *stack.seen.shape))
     full[:, stack.seen] = picture
-    # A convolution turns the template, which is odd.
+    # A convolution flips the template, which is an odd function.
     score = -sum(fftconvolve(full[a], template[a], mode="same") for a in range(len(axes)))
     norm = (template**2).sum()
     power = np.asarray(score / norm)
@@ -81,7 +81,7 @@ def find_top(
     place = np.array([x[best[1]], y[best[0]]])
     away = np.hypot(x[None, :] - place[0], y[:, None] - place[1]) > _APART * spread
     beside = power[away & stack.seen]
-    # The filter's own noise, where this beam is not: half of the pixels lie within 0.674 σ.
+    # The filter's noise away from this beam: half of the pixels lie within 0.674 σ.
     noise = float(np.median(np.abs(beside))) / 0.674 if beside.size else np.inf
     top = float(power[best])
     second = float(power[away & stack.seen & free].max(initial=0.0))

@@ -1,4 +1,4 @@
-"""Beams of a stack: those expected, and those found."""
+"""Expected and found beams of a stack."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -7,13 +7,13 @@ from heliotrope.geometry import FloatArray
 
 
 class Verdict(Enum):
-    """The verdict of a stack on one heliostat."""
+    """The result of a stack for one heliostat."""
 
-    PROVEN = "follows its own code at its place"
+    PROVEN = "follows its own code at its expected place"
     STUCK = "its light does not move"
-    EXCHANGED = "the beam at its place follows another mirror's code"
-    ELSEWHERE = "its beam is far from where it is expected"
-    JOINED = "other light is joined with its beam"
+    EXCHANGED = "the beam at its expected place follows another heliostat's code"
+    ELSEWHERE = "its beam is far from the expected place"
+    JOINED = "its beam merges with other light"
     FAINT = "no light follows its code"
     CLOUD = "too few photographs in the sun"
 

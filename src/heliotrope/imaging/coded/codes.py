@@ -1,4 +1,4 @@
-"""Codes: small movements of many heliostats that no sum of other movements can reproduce."""
+"""Codes: small, linearly independent movements of many heliostats."""
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ def photographs_for(mirrors: int, along: int | None = None) -> int:
     the same axis; the row of ones stays unused.
     """
     if mirrors < 1:
-        raise InputError(f"codes: {mirrors} mirrors; give 1 or more")
+        raise InputError(f"codes: {mirrors} mirrors; must be 1 or more")
     rows = 2 * mirrors if along is None else mirrors
     return max(_FEWEST, 1 << rows.bit_length())
 
@@ -57,7 +57,7 @@ def coded_movements(
     count = least if photographs is None else photographs
     if count < least or count > _MOST or count & (count - 1):
         raise InputError(
-            f"codes: {count} photographs for {mirrors} mirrors; give a power of two from {least} "
+            f"codes: {count} photographs for {mirrors} mirrors; use a power of two from {least} "
             f"to {_MOST}"
         )
     # Neighbouring photographs differ in all codes, so that a cloud over a few of them, or a slow

@@ -116,11 +116,11 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
 def _tops(
     stack: Stack, pictures: FloatArray, moves: FloatArray, expected: Sequence[ExpectedBeam]
 ) -> list[Top]:
-    """Return the strongest beam that moves by each mirror's code.
+    """Return the strongest beam that follows each heliostat's code.
 
-    Of n mirrors that share a code the n strongest beams are found one after the other, each without
-    the light of those before it. Each mirror gets the one that is nearest to its place, such that
-    the sum of all distances is least.
+    For n heliostats that share a code, the n strongest beams are found one after another, each
+    after subtracting the previous ones. Beams are assigned to heliostats so that the sum of their
+    distances from the expected positions is smallest.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -155,12 +155,12 @@ def _check(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) ->
     if moves.shape != (len(stack.values), count, 2) or not np.isfinite(moves).all():
         raise InputError(
             f"separation: moves of shape {moves.shape} for {len(stack.values)} photographs of "
-            f"{count} mirrors; give finite displacements (photographs, mirrors, 2)"
+            f"{count} mirrors; pass finite displacements (photographs, mirrors, 2)"
         )
     if regression(moves, np.ones(len(moves))) is None:
         raise InputError(
-            f"separation: the codes of {count} mirrors over {len(moves)} photographs depend on "
-            "each other; take codes from coded_movements"
+            f"separation: the codes of {count} mirrors over {len(moves)} photographs are linearly "
+            "dependent; use codes from coded_movements"
         )
     code, places = code_of(moves), np.array([beam.place for beam in expected])
     away = distances(places, np.array([b.second_moments + b.covariance for b in expected]))
@@ -169,5 +169,5 @@ def _check(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) ->
         first, other = (expected[int(i)].heliostat for i in near[0])
         raise InputError(
             f"separation: {first} and {other} have the same code, {away[tuple(near[0])]:.1f} "
-            f"standard deviations apart; give them places {APART:g} apart, or codes of their own"
+            f"standard deviations apart; place them {APART:g} apart, or assign different codes"
         )

@@ -47,7 +47,9 @@ class Stack:
     def __post_init__(self) -> None:
         shape = self.values.shape
         if len(shape) != 3 or min(shape) < 2:
-            raise InputError(f"stack: values of shape {shape}; give (photographs, rows, columns)")
+            raise InputError(
+                f"stack: values of shape {shape}; expected (photographs, rows, columns)"
+            )
         for name, array, expected in (
             ("seen", self.seen, shape[1:]),
             ("empty", self.empty, shape[1:]),
@@ -55,7 +57,7 @@ class Stack:
             ("first", self.first, (2,)),
         ):
             if array is not None and np.shape(array) != expected:
-                raise InputError(f"stack: {name} has shape {np.shape(array)}; give {expected}")
+                raise InputError(f"stack: {name} has shape {np.shape(array)}; expected {expected}")
         if not (np.isfinite(self.step) and self.step > 0.0):
             raise InputError(f"stack: step {self.step} m must be above 0")
         if not np.isfinite(self.values[:, self.seen]).all():
@@ -73,7 +75,7 @@ class Stack:
         )
 
     def prepared(self) -> "Stack":
-        """Return the stack at one exposure, on a grid that is just fine enough for the beams."""
+        """Return the stack scaled to one exposure, on a grid just fine enough for the beams."""
         values = np.asarray(self.values, dtype=np.float64)
         if self.exposures is not None:
             values = values / np.asarray(self.exposures)[:, None, None]
@@ -110,12 +112,12 @@ def _binned(pictures: FloatArray, factor: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Light:
-    """Light of the coded beams in K photographs, as at the usual sun.
+    """Light of the coded beams in K photographs, scaled to the usual sunlight.
 
     Attributes
     ----------
     pictures
-        Brightness by beams over ``factors``, N seen pixels, (K, N).
+        Brightness due to beams divided by ``factors``, N seen pixels, (K, N).
     factors
         Light of the beams in each photograph, 1 at its median, (K,).
     weights
@@ -133,10 +135,10 @@ class Light:
 
 
 def light_of(values: FloatArray, empty: FloatArray | None, moved: FloatArray | None) -> Light:
-    """Return the light of beams in each photograph.
+    """Return the relative light of the beams in each photograph.
 
-    Each photograph is the empty surface times its daylight plus the beams times their light;
-    two factors for each photograph by least squares.
+    Each photograph is modelled as the empty surface times a daylight factor plus the beams times a
+    light factor; the two factors are fitted by least squares.
 
     Parameters
     ----------

@@ -52,18 +52,19 @@ def average(frames: Iterable[Frame], max_shift: float = 1.0) -> Frame:
         if (frame.pixels.shape, frame.pixels.dtype) != (first.pixels.shape, first.pixels.dtype):
             raise InputError(
                 f"{frame.name}: {frame.pixels.shape} of {frame.pixels.dtype} and {first.name}: "
-                f"{first.pixels.shape} of {first.pixels.dtype} differ; give frames of one kind"
+                f"{first.pixels.shape} of {first.pixels.dtype} differ; use frames of the same kind"
             )
         shift = find_shift(first, frame) if used and min(frame.size) >= 16 else None
         if shift is not None and math.hypot(*shift) > max_shift:
             raise InputError(
                 f"{frame.name}: the camera moved by {math.hypot(*shift):.2f} px since the first "
-                f"frame, the limit is {max_shift:g} px; hold it still or average fewer frames"
+                f"frame; the limit is {max_shift:g} px: keep the camera still or average fewer "
+                "frames"
             )
         total = total + frame.count * frame.pixels.astype(np.float64)
         used.append(replace(frame, pixels=frame.pixels[:1, :1]))
     if first is None:
-        raise InputError("no frame to average; the source gave none")
+        raise InputError("no frame to average; the source delivered none")
     counts = [frame.count for frame in used]
     passed = [(f.time - first.time).total_seconds() for f in used if f.time and first.time]
     time = None
@@ -126,7 +127,9 @@ def keep(frame: Frame, result: Mapping[str, Any], folder: str | Path) -> Path:
                     image.hardlink_to(draft)  # fails if it is there, where a rename would not
                     break
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); give a folder") from None
+        raise InputError(
+            f"{folder}: cannot be written ({error.strerror}); specify a writable folder"
+        ) from None
     finally:
         with suppress(OSError):
             draft.unlink()
@@ -141,5 +144,5 @@ def _plain(value: Any) -> Any:
     if isinstance(value, datetime | Path):
         return value.isoformat() if isinstance(value, datetime) else str(value)
     raise InputError(
-        f"a result of type {type(value).__name__} cannot be kept; give numbers or text"
+        f"a result of type {type(value).__name__} cannot be stored; use numbers or text"
     )

@@ -52,7 +52,7 @@ def open_source(
     scheme, _, rest = text.partition(":")
     scheme, path = scheme.lower(), Path(folder) / text
     if not text:
-        raise InputError("no source given; name a folder, a video, rtsp://…, http://… or usb:0")
+        raise InputError("no source specified; name a folder, a video, rtsp://…, http://… or usb:0")
     if scheme in PORTS and rest.startswith("//"):
         return (SnapshotSource if is_snapshot(text) else StreamSource)(text, limit=limit, stop=stop)
     if scheme == "usb" or re.fullmatch(r"/dev/video\d+", text):
@@ -67,6 +67,6 @@ def open_source(
         return FolderSource(path, watch=watch, limit=limit, stop=stop)
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return VideoSource(path, start=start, limit=limit, stop=stop)
-    what = "is neither" if path.exists() else "there is no such file: give"
+    what = "is neither" if path.exists() else "no such file: specify"
     kinds = ", ".join((*IMAGE_SUFFIXES, *VIDEO_SUFFIXES))
     raise InputError(f"source {path}: {what} a folder, an image or a video ({kinds})")

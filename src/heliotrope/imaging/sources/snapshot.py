@@ -1,4 +1,4 @@
-"""A network camera that answers each HTTP request with one photograph."""
+"""A network camera that replies to each HTTP request with one photograph."""
 
 import tempfile
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from heliotrope.imaging.sources.source import Source, hide_password
 if TYPE_CHECKING:
     import httpx
 
-#: Larger answers are not photographs, bytes.
+#: Maximum size of a reply, bytes; larger replies are not photographs.
 _LARGEST = 64 * 2**20
 
 
@@ -57,7 +57,7 @@ class SnapshotSource(Source):
         self.name = self.name or hide_password(self.url)
         if not is_snapshot(self.url):
             raise InputError(
-                f"source {self.name}: not the address of an image; give http://host/… ending in "
+                f"source {self.name}: not the address of an image; use http://host/… ending in "
                 f"{', '.join(IMAGE_SUFFIXES)}"
             )
 
@@ -67,7 +67,7 @@ class SnapshotSource(Source):
         Raises
         ------
         FetchError
-            If the camera does not answer, or not with an image.
+            If the camera does not reply, or does not reply with an image.
         FormatError
             If the image is broken.
         """
@@ -91,12 +91,12 @@ class SnapshotSource(Source):
             answer = client.get(self.url)
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             why = type(error).__name__
-            raise FetchError(f"source {self.name}: no answer ({why}); check the address") from None
+            raise FetchError(f"source {self.name}: no reply ({why}); check the address") from None
         span = datetime.now(UTC) - begun
         if answer.status_code != 200 or not 0 < len(answer.content) <= _LARGEST:
             raise FetchError(
-                f"source {self.name}: answer {answer.status_code} of {len(answer.content)} bytes; "
-                "check address, user and password"
+                f"source {self.name}: replied {answer.status_code} with {len(answer.content)} "
+                "bytes; check address, user and password"
             )
         file.write_bytes(answer.content)
         frame = read_image(file)

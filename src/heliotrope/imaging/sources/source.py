@@ -52,15 +52,15 @@ class Source(ABC):
         """Yield frames until stopped."""
 
     def _begin(self) -> None:  # noqa: B027 - some sources have nothing to open
-        """Open it, or raise."""
+        """Open the source, or raise an error."""
 
     def _end(self) -> None:  # noqa: B027
-        """Close it."""
+        """Close the source."""
 
 
 @dataclass
 class SimulatedSource(Source):
-    """Frames that ``function`` creates for the time of ``clock``, which is also theirs."""
+    """Frames that ``function`` creates for, and that carry, the current time of ``clock``."""
 
     function: Callable[[datetime], Frame]
     clock: Callable[[], datetime]

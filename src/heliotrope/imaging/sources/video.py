@@ -60,10 +60,12 @@ class VideoSource(Source):
         import cv2
 
         if not Path(self.path).is_file():
-            raise FormatError(self.path, "there is no such file; give a video")
+            raise FormatError(self.path, "no such file; specify a video")
         capture = _capture(str(self.path), cv2.CAP_FFMPEG)
         if capture is None:
-            raise FormatError(self.path, "no video that OpenCV can read; convert or copy it again")
+            raise FormatError(
+                self.path, "OpenCV cannot read this video; convert it or copy it again"
+            )
         return capture
 
     def _frames(self) -> Iterator[Frame]:
@@ -146,7 +148,7 @@ class CameraSource(Source):
 
     @abstractmethod
     def _open(self) -> Any:
-        """Return an open capture; raise FetchError or InputError if there is none to open."""
+        """Return an open capture; raise FetchError or InputError if it cannot be opened."""
 
     def _begin(self) -> None:
         capture = self._open()
@@ -203,7 +205,7 @@ class CameraSource(Source):
 
     def _frames(self) -> Iterator[Frame]:
         if self._thread is None:
-            raise InputError(f"source {self.name}: it is not open; use it in a with block")
+            raise InputError(f"source {self.name}: the source is not open; use it in a with block")
         while not self._over():
             with self._news:
                 self._news.wait_for(lambda: self._newest or self._error, 0.1)
@@ -236,7 +238,7 @@ class StreamSource(CameraSource):
             parts = urlsplit(self.url)
             self._place = (parts.hostname or "", parts.port or PORTS[parts.scheme.lower()])
         if not self._place[0]:
-            raise InputError(f"source {self.name}: give rtsp://host/… or http://host/…")
+            raise InputError(f"source {self.name}: use rtsp://host/… or http://host/…")
 
     def _open(self) -> Any:
         import cv2
@@ -246,7 +248,7 @@ class StreamSource(CameraSource):
         capture = _capture(self.url, cv2.CAP_FFMPEG, limits)
         if capture is not None:
             return capture
-        text = "it answers, but not with video; check the path, the user and the password"
+        text = "it responds, but not with video; check the path, the user and the password"
         try:  # OpenCV does not say why
             socket.create_connection(self._place, min(self.timeout, 5.0)).close()
         except OSError as error:
@@ -277,7 +279,9 @@ class UsbSource(CameraSource):
     def __post_init__(self) -> None:
         text = str(self.device).strip()
         if not re.fullmatch(r"\d{1,3}|/dev/video\d{1,3}", text):
-            raise InputError(f"source usb:{text}: give the number of a device, or /dev/video0")
+            raise InputError(
+                f"source usb:{text}: use a device number or a path such as /dev/video0"
+            )
         self.device = text if text.startswith("/") else f"/dev/video{text}"
         self.name = self.name or f"usb:{self.device}"
 
@@ -286,10 +290,13 @@ class UsbSource(CameraSource):
 
         if not Path(str(self.device)).exists():
             present = ", ".join(sorted(map(str, Path("/dev").glob("video*")))) or "none"
-            raise InputError(f"source {self.name}: there is no such device; present: {present}")
+            raise InputError(f"source {self.name}: no such device; available: {present}")
         capture = _capture(str(self.device), cv2.CAP_V4L2)
         if capture is None:
-            text = "cannot be opened: another program uses it, or you lack the right (group video)"
+            text = (
+                "cannot be opened: another program is using it, or you lack permission (group "
+                "video)"
+            )
             raise InputError(f"source {self.name}: {text}")
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         # Video4Linux counts exposures in 100 µs; entry 1 of its menu is "manual".

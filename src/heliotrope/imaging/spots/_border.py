@@ -12,7 +12,7 @@ from heliotrope.imaging.targets.rectify import Mask, Rectified
 _RAYS = 120
 #: Distance before the border over which the decline is measured, m.
 _SLOPE = 0.3
-#: Greatest decline, relative to a Gaussian of the beam's second moments.
+#: Maximum decline, relative to a Gaussian of the beam's second moments.
 _STEEPER = 3.0
 #: At the border: below the first share of its peak a beam ends, above the second it goes on.
 _ENDS, _GOES_ON = 0.05, 0.25
@@ -20,16 +20,17 @@ _ENDS, _GOES_ON = 0.05, 0.25
 
 @dataclass(frozen=True)
 class Beyond:
-    """Light beyond the border.
+    """Estimated light beyond the border.
 
     Attributes
     ----------
     share
-        Share of this light in all light of the beam.
+        This light as a fraction of all light of the beam.
     shift
         Shift of the centroid, m, (2,).
     most
-        Shift if the beam went on as a Gaussian however faint, m, (2,).
+        Upper bound of the shift: the shift if the beam continued as a Gaussian indefinitely, m,
+        (2,).
     """
 
     share: float
@@ -64,14 +65,14 @@ def beyond(
 
     Notes
     -----
-    Along a ray from the centroid the beam is taken as b exp((r0² − r²)/2σ²) beyond the border
-    at r0, where its brightness is b. σ is that of the second moments in this direction, or
-    less if the beam falls more steeply before the border. The light is then b σ² per radian,
-    and its first moment b (σ² r0 + σ³ √(π/2) erfcx(r0/√2σ)).
+    Along a ray from the centroid, the beam beyond the border at r0, where its brightness is b, is
+    assumed to be b exp((r0² − r²)/2σ²). σ follows from the second moments in this direction, and is
+    smaller if the beam falls more steeply just before the border. The light is then b σ² per
+    radian, and its first moment b (σ² r0 + σ³ √(π/2) erfcx(r0/√2σ)).
 
-    Beams of heliostats end where a Gaussian goes on. So the light beyond is weighted from 0,
-    where b is a twentieth of the peak, to 1, where it is a quarter. On 107 rendered beams that
-    lose up to a tenth of their light, a third of the shift remains.
+    Heliostat beams end where a Gaussian would continue, so the light beyond the border is weighted
+    from 0, where b is a twentieth of the peak, to 1, where b is a quarter of it. For 107 rendered
+    beams that lose up to a tenth of their light, a third of the shift remains.
     """
     from scipy.special import erfcx
 

@@ -16,13 +16,13 @@ from heliotrope.imaging.targets.rectify import Mask
 _ARM = 2.0
 #: Steps between the directions (rad) and offsets (cells) of lines that are tried.
 _TURN, _SHIFT = np.radians(5.0), 1.0
-#: Least visible length of a line, cells.
+#: Minimum visible length of a line, cells.
 _LENGTH = 12
-#: Least change of brightness: relative to the face, and to the median of all lines.
+#: Minimum change of brightness: relative to the face, and to the median of all lines.
 _CHANGE, _ABOVE = 0.02, 5.0
 #: At one end of a line at least, the change must agree with the rest to this share.
 _ALIKE = 0.25
-#: Greatest turn (rad), shift (cells) and relative widening of an edge in one step of the fit.
+#: Maximum turn (rad), shift (cells) and relative widening of an edge in one step of the fit.
 _STEP = np.array([0.06, 1.5, 0.5])
 
 
@@ -48,11 +48,11 @@ class Edge:
     height: float = 0.0
 
     def distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the distances of places beyond it, cells."""
+        """Return the signed distances of positions beyond the edge, cells."""
         return np.asarray(x * np.cos(self.angle) + y * np.sin(self.angle) - self.offset)
 
     def step(self, x: FloatArray, y: FloatArray, breadth: float | None = None) -> FloatArray:
-        """Return 0 on this side, 1 beyond, and a smooth step between."""
+        """Return a smooth step: 0 before the edge, 1 beyond it."""
         from scipy.special import ndtr
 
         soft = self.breadth if breadth is None else breadth
@@ -61,7 +61,7 @@ class Edge:
     def columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the step, the step along x and y, and its derivatives, (..., 6).
 
-        The derivatives are by angle, offset and the breadth's logarithm.
+        The derivatives are with respect to angle, offset and the logarithm of the breadth.
         """
         far = self.distance(x, y) / self.breadth
         bell = np.exp(-0.5 * far**2) / (np.sqrt(2.0 * np.pi) * self.breadth)
@@ -94,7 +94,7 @@ class Edge:
         )
 
     def crosses(self, odd: Mask, paint: Mask, near: float = 6.0) -> bool:
-        """Return whether unexplained places lie near both of its ends at the face's border."""
+        """Return whether unexplained pixels lie at the face's border near both ends of the edge."""
         x, y = places((odd.shape[0], odd.shape[1]))
         ends = border(paint) & (np.abs(self.distance(x, y)) < near + self.breadth)
         along = y * np.cos(self.angle) - x * np.sin(self.angle)
@@ -105,7 +105,7 @@ class Edge:
 
 
 def border(paint: Mask) -> Mask:
-    """Return the outermost three rows and columns of the paint."""
+    """Return a mask of the outermost three rows and columns of the paint."""
     rows, columns = np.flatnonzero(paint.any(axis=1)), np.flatnonzero(paint.any(axis=0))
     rim = paint.copy()
     rim[rows[0] + 3 : rows[-1] - 2, columns[0] + 3 : columns[-1] - 2] = False
@@ -129,7 +129,7 @@ def places(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
 def find_edges(soft: FloatArray, paint: Mask, most: int = 3) -> list[Edge]:
     """Return straight lines with a uniform change of brightness across them, the best first.
 
-    The change is uniform along a shadow's edge: its quartiles agree. The flank of a beam is
+    Along a shadow's edge the change is uniform, so its quartiles agree; the flank of a beam is
     curved and ends.
 
     Parameters
@@ -137,7 +137,7 @@ def find_edges(soft: FloatArray, paint: Mask, most: int = 3) -> list[Edge]:
     soft
         Brightness, (H, W).
     paint
-        Where it is that of bare paint.
+        Mask of bare paint.
     most
         Greatest number of lines.
     """
@@ -173,8 +173,8 @@ def _changes(
 ) -> FloatArray:
     """Return the changes of brightness across lines, (A, O); 0 where they are not uniform.
 
-    The score is the middle of the shortest range that holds half of a line's changes, minus
-    the range, reduced for short lines.
+    The score is the midpoint of the shortest range containing half of a line's changes, minus the
+    width of that range, and is reduced for short lines.
     """
     difference = _differences(soft, paint, angles, offsets, apart)
     known = np.isfinite(difference)

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: the local maximum of a picture from which each pixel descends."""
+"""Compiled: assigns each pixel of a picture to the local maximum from which it descends."""
 
 import numpy as np
 from numba import njit
@@ -10,7 +10,7 @@ from heliotrope.jit import INNER, OPTIONS
 
 @njit(**INNER)
 def _root(parent, number):
-    """Return the top into which a top was merged."""
+    """Follow merges and return the final top of a given top."""
     while parent[number] != number:
         parent[number] = parent[parent[number]]
         number = parent[number]
@@ -19,12 +19,12 @@ def _root(parent, number):
 
 @njit(**OPTIONS)
 def number_tops(values, inside, foot, seed, dip, least, owner):
-    """Number the tops of a picture in ``owner`` (H, W), and return how many there are.
+    """Label the local maxima (tops) of a picture in ``owner`` (H, W), and return their number.
 
-    Pixels are taken in the order of brightness. A pixel without a neighbour starts a new top.
-    Where two tops meet, the lower one is merged into the higher one, unless it is as high as
-    ``seed`` and brightness has fallen from it by the share ``dip`` and by ``least``. Other pixels
-    join the top of their brightest neighbour.
+    Pixels are processed in order of decreasing brightness. A pixel without labelled neighbours
+    starts a new top. Where two tops meet, the lower one is merged into the higher one, unless it is
+    at least as high as ``seed`` and brightness has dropped from it by the fraction ``dip`` and by
+    ``least``. Other pixels join the top of their brightest neighbour.
 
     Parameters
     ----------

@@ -42,13 +42,13 @@ _SOFT = 2.0
 _BORDER = 4
 #: Bounds, relative to the brightness, on the three deviations beyond which a place is unexplained.
 _ODD = (0.015, 0.03)
-#: Least gain in explained paint by an edge, and least height of the edge in its deviations.
+#: Minimum gain in explained paint by an edge, and least height of the edge in its deviations.
 _GAIN, _CERTAIN = 0.02, 4.5
 #: Paint is as expected within this many deviations, or this share of the brightness.
 _PLAIN, _PLAIN_PART = 4.0, 0.02
 #: Deviations over less than this belong to the paint, m.
 BROAD = 0.3
-#: Least share of the paint that the fit keeps.
+#: Minimum share of the paint that the fit keeps.
 _FEWEST = 0.06
 #: Iterations of the fit in which the edge of a shadow is moved.
 _SETTLING = 6
@@ -121,8 +121,8 @@ def from_difference(picture: Rectified, without: Rectified) -> Background:
     """
     if without.shape != picture.shape or not np.allclose(without.first, picture.first):
         raise InputError(
-            f"the empty frame shows another face ({without.shape} px) than the frame with the "
-            f"beam ({picture.shape} px); give two frames of the same target"
+            f"the empty frame shows a target area of {without.shape} px, the frame with the beam "
+            f"one of {picture.shape} px; use two frames of the same target"
         )
     return _fit(picture, without.values, (1, 1), "difference")
 
@@ -247,7 +247,7 @@ class EmptyTarget:
         if self.targets and set(self.targets) != set(names):
             raise InputError(
                 f"the model is of {', '.join(self.targets)}, the frame shows {', '.join(names)}; "
-                "give the model of this target"
+                "use the model of this target"
             )
         if picture.shape != self.reflectance.shape:
             raise InputError(
@@ -280,7 +280,7 @@ def of_face(
     models: Iterable[EmptyTarget] = (),
     empty: Rectified | None = None,
 ) -> Background:
-    """Return the background of a face by the chosen method.
+    """Estimate the background of a face with the chosen method.
 
     Parameters
     ----------
@@ -289,7 +289,7 @@ def of_face(
     method
         "frame", "model", "difference", or "auto" for the best that is available.
     models
-        Models of empty faces; the one that fits is taken.
+        Models of empty faces; the matching one is used.
     empty
         The same face without beams.
 
@@ -304,7 +304,7 @@ def of_face(
         method = "difference" if empty is not None else "model" if ready else "frame"
     if method == "difference":
         if empty is None:
-            raise InputError("background by difference needs a frame without the beam; give one")
+            raise InputError("background by difference needs a frame without the beam; pass one")
         return from_difference(picture, empty)
     if method == "model":
         if model is None:
@@ -327,7 +327,7 @@ def beams(picture: Rectified, background: Background) -> Mask:
 
 
 def unexplained(picture: Rectified, background: Background, spots: Sequence[Mask]) -> float:
-    """Return the share of paint beside the spots that is brighter or darker than it should be.
+    """Return the fraction of paint beside the spots that is brighter or darker than expected.
 
     Causes are shadows, stray light and obstacles. Only areas broader than `BROAD` metres
     count, so that single pixels, joints and stains do not.
@@ -354,7 +354,7 @@ def smooth(picture: Rectified, values: Image, sigma: float) -> Image:
     Parameters
     ----------
     picture
-        Its marks and edges are left out.
+        The face; its marks and edges are excluded.
     values
         (H, W).
     sigma
@@ -377,7 +377,7 @@ def _orders(picture: Rectified) -> tuple[int, int]:
 
 
 def _terms(orders: tuple[int, int]) -> list[tuple[int, int, float]]:
-    """Return the fitted products of polynomials: order across, order up, and total order."""
+    """Return the orders of the fitted polynomial products: across, up, and total."""
     top = min(order for order in orders if order > 0)
     terms = []
     for i in range(orders[0] + 1):
@@ -407,7 +407,7 @@ def _ridge(
     scale: float = 1.0,
     turns: int = 8,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return the parameters of greatest posterior probability and their covariance.
+    """Return the parameters of maximum posterior probability and their covariance.
 
     The first ``evenness`` parameters describe smooth light. Its smoothness differs from frame to
     frame, so their prior deviations are scaled to the values found (expectation maximisation of
@@ -526,10 +526,10 @@ def _grid(picture: Rectified, pattern: Image, orders: tuple[int, int]) -> _Grid:
 
 
 def _better(other: _Fit, fit: _Fit, grid: _Grid) -> bool:
-    """Return whether a fit with an edge is better than one without, or with another.
+    """Return whether a fit with an edge is better than a fit without it or with a different edge.
 
-    It must explain more of the paint to the same accuracy, and the height of its edge must be
-    significant in paint without beams.
+    The better fit must explain more of the paint to the same accuracy, and the height of its edge
+    must be significant in paint without beams.
     """
     limit = _HOT * min(fit.spread, other.spread)
     explained = [
@@ -546,7 +546,7 @@ def _better(other: _Fit, fit: _Fit, grid: _Grid) -> bool:
 
 
 def _odd(fit: _Fit, grid: _Grid) -> Mask:
-    """Return where smooth light does not explain the paint, ignoring single places."""
+    """Return a mask of paint that smooth light does not explain, ignoring single pixels."""
     import cv2
 
     limit = float(np.clip(_HOT * fit.spread, _ODD[0] * grid.level, _ODD[1] * grid.level))
@@ -555,7 +555,7 @@ def _odd(fit: _Fit, grid: _Grid) -> Mask:
 
 
 def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
-    """Fit, leave out places that stand out with their surroundings, and repeat to convergence."""
+    """Fit, exclude outliers with their surroundings, and repeat until convergence."""
     import cv2
 
     paint, soft, basis, prior = grid.paint, grid.soft, grid.basis, grid.prior
@@ -595,7 +595,7 @@ def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
 def _upscaled(
     shape: tuple[int, int], orders: tuple[int, int], numbers: FloatArray, edge: Edge | None
 ) -> FloatArray:
-    """Return the light on the whole grid, in which the fit's grid lies evenly."""
+    """Evaluate the fitted light on the whole grid, of which the fit grid is a regular subset."""
     rows = len(np.arange(_STRIDE // 2, shape[0], _STRIDE))
     columns = len(np.arange(_STRIDE // 2, shape[1], _STRIDE))
 
@@ -614,7 +614,7 @@ def _upscaled(
         return light
     u = (np.arange(shape[1]) - _STRIDE // 2) / _STRIDE - 0.5 * (columns - 1)
     v = (np.arange(shape[0]) - _STRIDE // 2) / _STRIDE - 0.5 * (rows - 1)
-    # The fit saw a blurred face.
+    # The fit used a blurred face.
     sharp = float(np.sqrt(max(edge.breadth**2 - (_SOFT / _STRIDE) ** 2, 0.1**2)))
     step = edge.step(u[None, :], v[:, None], sharp)
     height, right, down = numbers[len(terms) : len(terms) + 3]
@@ -623,11 +623,11 @@ def _upscaled(
 
 
 def _patch(residuals: FloatArray, held: Mask) -> float:
-    """Return the number of grid places over which residuals are correlated.
+    """Return the number of grid points over which residuals are correlated.
 
-    This is the integral of the correlation, which for an irregular region is that of its values
-    over that of its mask, both by Fourier transforms; it ends where the correlation first
-    falls to 0.
+    This is the integral of the autocorrelation up to its first zero. For an irregular region, the
+    autocorrelation is that of the values divided by that of the mask, both computed with Fourier
+    transforms.
     """
     count = float(held.sum())
     if count < 10.0:

@@ -65,10 +65,10 @@ Centroid = Callable[[BeamPicture], tuple[npt.ArrayLike, npt.ArrayLike]]
 def with_centroid(
     placed: PlacedSpot, target: Target, picture: Rectified, background: Background, own: Centroid
 ) -> PlacedSpot:
-    """Return a spot at the place that an own centroid gives, with its covariance.
+    """Return a spot moved to the position and covariance that a user-defined centroid returns.
 
-    The covariance of the view is added, as to the program's own centroid; the shape of the spot
-    stays, and with it the checks of its quality.
+    The covariance of the view is added, as for the built-in centroid. The shape of the spot, and
+    therefore its quality checks, remain unchanged.
 
     Parameters
     ----------
@@ -77,12 +77,12 @@ def with_centroid(
     picture, background
         Its face.
     own
-        The own centroid.
+        The user-defined centroid function.
 
     Raises
     ------
     InputError
-        If the own centroid gives no place on the target or no covariance.
+        If the function does not return a position on the target and a covariance.
     """
     across, upwards = np.meshgrid(*picture.axes)
     points = picture.face.point(np.stack([across, upwards], axis=-1))
@@ -107,24 +107,25 @@ def with_centroid(
     if moved.target is None or moved.target.name != target.name:
         raise InputError(
             f"own centroid: place {plane.tolist()} m is not on target {target.name}, "
-            f"{target.width:.4g} × {target.height:.4g} m; give metres right of and above its centre"
+            f"{target.width:.4g} × {target.height:.4g} m; return metres right of and above its "
+            "centre"
         )
     return replace(moved, flux=placed.flux)
 
 
 def _checked(result: object, target: Target) -> tuple[FloatArray, FloatArray]:
-    """Return place and covariance as arrays."""
+    """Return position and covariance as arrays."""
     if not (isinstance(result, tuple | list) and len(result) == 2):
         raise InputError(
-            f"own centroid: it gave {kind_of(result)} for target {target.name}; return a place "
-            "(2,) in metres and its covariance (2, 2) in m²"
+            f"own centroid: it returned {kind_of(result)} for target {target.name}; return a "
+            "place (2,) in metres and its covariance (2, 2) in m²"
         )
     try:
         plane, covariance = as_float(result[0]), as_float(result[1])
     except (TypeError, ValueError):
         raise InputError(
-            f"own centroid: place or covariance on target {target.name} is no array of numbers; "
-            "return a place (2,) in metres and its covariance (2, 2) in m²"
+            f"own centroid: place or covariance on target {target.name} is not an array of "
+            "numbers; return a place (2,) in metres and its covariance (2, 2) in m²"
         ) from None
     if plane.shape != (2,) or not np.isfinite(plane).all():
         raise InputError(

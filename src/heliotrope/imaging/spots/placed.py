@@ -74,7 +74,7 @@ def place(picture: Rectified, spot: Spot, gathered: float = float("nan")) -> Pla
     if target is None:
         axes, plane = face.axes, spot.centroid
     else:
-        # The targets of a face lie a few millimetres off its plane, and turned by as little.
+        # The targets of a face may be a few millimetres off its plane, and slightly rotated.
         axes, plane = target.axes, target.plane_coordinates(point)
         point = target.point(plane)
     return PlacedSpot(

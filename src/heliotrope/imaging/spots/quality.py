@@ -192,7 +192,7 @@ def judge(
         ("cut at the edge", first.cut, limits.cut, "light beyond the border moves it by {:.2f} m"),
         ("saturated", first.clipped, limits.clipped, "{:.0%} of its light is clipped"),
         ("covered", first.covered, limits.covered, "marks cover {:.0%} of it"),
-        ("uncertain", deviation, limits.deviation, "its centroid is certain only to {:.3f} m"),
+        ("uncertain", deviation, limits.deviation, "its centroid is uncertain by {:.3f} m"),
     ]
     for name, value, limit, text in checks:
         if not value <= limit and name not in {r.name for r in reasons}:
@@ -211,14 +211,17 @@ def judge(
     sizes = {"long": expectation.length, "wide": expectation.width}
     for (word, size), axis in zip(sizes.items(), first.axes, strict=False):
         if axis / size > most:
-            text = f"it is {axis / size:.1f} times as {word} as expected: moved, or two beams"
+            text = (
+                f"it is {axis / size:.1f} times as {word} as expected: the beam moved, or there "
+                "are two"
+            )
             reasons.append(Reason("smeared", float(axis / size), most, text))
             break
     return reasons
 
 
 def _of_power(spot: Spot, flux: float, limits: Limits, expectation: Expectation) -> list[Reason]:
-    """Judge the power of a spot: less than expected is a cloud, more is another beam."""
+    """Judge the power of a spot: too little suggests a cloud, too much a second beam."""
     share = flux / expectation.flux
     if not np.isfinite(share):
         share = spot.power / expectation.power

@@ -11,7 +11,7 @@ from heliotrope.imaging.spots._top_kernels import number_tops
 from heliotrope.imaging.spots.background import Background, smooth
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 
-#: Least peak of a beam: in deviations of the background's residuals, and relative to it.
+#: Minimum peak of a beam: in deviations of the background's residuals, and relative to it.
 _SEED, _SEED_PART = 8.0, 0.06
 #: A beam ends where it falls below this many deviations,
 _FOOT = 5.0
@@ -141,7 +141,7 @@ def find_spots(picture: Rectified, background: Background) -> list[Spot]:
 
 
 def _core(soft: Image, owned: Mask, foot: float) -> Mask:
-    """Return the pixels above the foot that are connected to a beam's top."""
+    """Return a mask of the pixels above the foot that are connected to a beam's top."""
     import cv2
 
     height = float(soft[owned].max())
@@ -149,8 +149,8 @@ def _core(soft: Image, owned: Mask, foot: float) -> Mask:
     above = owned & (soft > max(foot, _FOOT_PART * height))
     _, labels = cv2.connectedComponents(above.astype(np.uint8), connectivity=4)
     core = labels == labels[top]
-    # The upper half gives the width of the beam; anything connected through a narrower neck is
-    # something else.
+    # The upper half defines the width of the beam; anything connected through a narrower neck is a
+    # separate object.
     _, labels = cv2.connectedComponents((core & (soft > 0.5 * height)).astype(np.uint8))
     half = labels == labels[top]
     breadth = min(cv2.minAreaRect(np.argwhere(half).astype(np.float32))[1])
@@ -307,7 +307,8 @@ def _from_background(
 def pixel_variance(picture: Rectified, background: Background) -> float:
     """Return the variance of a pixel's light, as if pixels were independent of each other.
 
-    Residuals of the background's fit are correlated over patches, and count for as many pixels.
+    Residuals of the background fit are correlated over patches, so each counts for all pixels of a
+    patch.
     """
     patch = max(background.patch / picture.step**2, 1.0)
     return patch * background.deviation**2 + background.noise**2

@@ -38,12 +38,12 @@ def sample_plane(
     step: float,
     out: Image,
 ) -> None:
-    """Write the mean over each pixel of a field on the plane into ``out``.
+    """Average a field on the plane over each pixel, into ``out``.
 
     Parameters
     ----------
     u, v
-        Place on the plane at which each pixel's centre looks, m, (H, W).
+        Position on the plane seen by each pixel's centre, m, (H, W).
     share
         0 where a pixel does not see the plane, (H, W).
     grid, origin, step
@@ -92,7 +92,7 @@ def _sample(u, v, share, grid, x0, y0, per, out):
 
 @njit(**OPTIONS)
 def ambient_field(u, v, share, terms, out):
-    """Write the relative ambient light of each pixel, gradient times shadow, (H, W).
+    """Compute the relative ambient light of each pixel, gradient times shadow, (H, W).
 
     ``terms`` are the gradient right and up (1/m), then for the edge of the shadow a point (m), the
     unit normal into the shadow, the breadth of the ramp (m) and the light left in the shadow
@@ -109,7 +109,7 @@ def ambient_field(u, v, share, terms, out):
             value = max(0.0, 1.0 + gx * x + gy * y)
             if remaining != 1.0:
                 k = j + 1 if j + 1 < width else j - 1
-                # Averaged over a pixel, a hard edge is a ramp of one pixel's breadth.
+                # Averaged over a pixel, a hard edge becomes a ramp one pixel wide.
                 breadth = max(soft, math.hypot(u[i, k] - x, v[i, k] - y))
                 depth = min(max(((x - px) * nx + (y - py) * ny) / breadth + 0.5, 0.0), 1.0)
                 value *= 1.0 + (remaining - 1.0) * depth
@@ -118,20 +118,20 @@ def ambient_field(u, v, share, terms, out):
 
 @njit(**OPTIONS)
 def expose(level, noise, read_noise, per_electron, offset, curve, steps, out):
-    """Write the readings of a sensor, and return how many are clipped.
+    """Simulate the readings of a sensor, and return how many are clipped.
 
     Parameters
     ----------
     level
-        Expected readings, of the full scale, (N,).
+        Expected readings, as fractions of full scale, (N,).
     noise
         Standard normal numbers, (N,).
     read_noise
         Electrons.
     per_electron, offset
-        Shares of the full scale.
+        Fractions of full scale.
     curve
-        Encoding of shares of the full scale from 0 to 1, in equal steps; empty: linear.
+        Encoding table for fractions of full scale from 0 to 1, in equal steps; empty: linear.
     steps
         Greatest reading: 255 or 4095.
     out
@@ -140,7 +140,7 @@ def expose(level, noise, read_noise, per_electron, offset, curve, steps, out):
     clipped = 0
     for i in range(len(level)):
         mean = max((float(level[i]) - offset) / per_electron, 0.0)
-        # The Poisson distribution, as a normal one of the same variance.
+        # The Poisson distribution, approximated by a normal distribution of the same variance.
         share = (
             offset + (mean + math.sqrt(mean + read_noise * read_noise) * noise[i]) * per_electron
         )

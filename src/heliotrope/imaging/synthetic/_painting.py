@@ -1,4 +1,4 @@
-"""The constant part of frames: what each pixel looks at, and the paint that it sees there."""
+"""The constant part of frames: the point that each pixel sees, and the paint at that point."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -28,7 +28,7 @@ _FINE, _TILE = 5, 64
 
 @dataclass(frozen=True)
 class Plane:
-    """A target's plane as a camera sees it: places (m), visible share and reflectance, (H, W)."""
+    """A target's plane in the frame: positions (m), visible fraction, reflectance, (H, W)."""
 
     u: Image
     v: Image
@@ -38,7 +38,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class PaintedScene:
-    """The part without light and beams: planes, and the sky's share and relative light."""
+    """The part independent of light and beams: planes, and the sky's fraction and light."""
 
     planes: tuple[Plane, ...]
     sky: Image
@@ -46,7 +46,7 @@ class PaintedScene:
 
 @dataclass(frozen=True)
 class SceneKey:
-    """A camera and targets, compared by their effect on the picture."""
+    """A camera and targets as a cache key, compared by their effect on the picture."""
 
     key: tuple[object, ...]
     camera: Camera = field(compare=False)
@@ -97,7 +97,7 @@ def _painted(view: SceneKey, paint: Paint, around: Surroundings, blur: float) ->
 def _areas(
     view: SceneKey, wall: tuple[float, float, float, float], blur: float
 ) -> tuple[list[Image], list[Image], Image]:
-    """Return the shares of pixels covered by targets, their walls, and the sky, (H, W) each."""
+    """Return the pixel fractions covered by targets, their walls and the sky, (H, W) each."""
     camera, shape = view.camera, view.camera.size[::-1]
     free = np.ones(shape, dtype=np.float32)
     areas: list[Image] = []
@@ -109,7 +109,7 @@ def _areas(
         areas.append(np.minimum(soft_coverage([border], shape, blur), free))
         free -= areas[-1]
     for target in view.targets:
-        # A wall gets the share that everything in front of it leaves.
+        # A wall gets the fraction left by everything in front of it.
         outline = _projected(camera, target, _wall(target, wall))
         behind = soft_coverage([outline], shape, blur) - (1.0 - free)
         walls.append(np.maximum(behind, np.float32(0.0)))
@@ -123,16 +123,17 @@ def _check_seen(camera: Camera, target: Target) -> None:
     front = (camera.position - target.center) @ target.normal
     if front <= 0.0 or not np.isfinite(pixels).all():
         raise InputError(
-            f"camera {camera.name}: it does not see the front of target {target.name}; place it "
-            "in front of the target, facing it"
+            f"camera {camera.name}: it cannot see the front of target {target.name}; place it in "
+            "front of the target, facing it"
         )
 
 
 def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: float) -> Image:
-    """Return the share of each pixel that polygons cover under a Gaussian blur, (H, W).
+    """Return the fraction of each pixel that polygons cover after a Gaussian blur, (H, W).
 
-    A lens blurs before pixels sample. Blurring pixels afterwards would move edges by up to 0.02 px,
-    depending on their phase. Polygons (K, 2) and ``blur``, a standard deviation, are in pixels.
+    A lens blurs the image before pixels sample it; blurring pixels afterwards would move edges by
+    up to 0.02 px, depending on their subpixel position. Polygons (K, 2) and ``blur``, a standard
+    deviation, are in pixels.
     """
     import cv2
 
@@ -161,7 +162,7 @@ def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: floa
 
 @lru_cache(maxsize=4)
 def _plane_map(view: SceneKey) -> tuple[Image, Image]:
-    """Return the places of pixels, metres right of and above the target's centre, (H, W) each."""
+    """Return the positions that pixels see, metres right of and above the centre, (H, W) each."""
     from scipy.interpolate import RectBivariateSpline
 
     camera, target = view.camera, view.targets[0]
@@ -186,7 +187,7 @@ def _plane_map(view: SceneKey) -> tuple[Image, Image]:
 
 
 def _projected(camera: Camera, target: Target, polygon: FloatArray) -> FloatArray:
-    """Return the pixels (L, 2) of a polygon (K, 2) in the plane, m, as the lens shows it."""
+    """Return a polygon (K, 2) in the plane, m, as pixels (L, 2), bent by the lens."""
     ends = np.roll(polygon, -1, axis=0)
     rough = project(camera, target.point(np.stack([polygon, ends])))
     if not np.isfinite(rough).all():
@@ -212,7 +213,7 @@ def _wall(target: Target, wall: tuple[float, float, float, float]) -> FloatArray
 def _texture(
     rng: np.random.Generator, low: FloatArray, high: FloatArray, coarse: float, amplitude: float
 ) -> tuple[FloatArray, float]:
-    """Return smooth noise around 1 over a rectangle, of grain ``coarse`` (m), and its step."""
+    """Return smooth noise around 1 over a rectangle, of grain size ``coarse`` (m), and its step."""
     from scipy.ndimage import zoom
 
     columns, rows = (np.ceil((high - low) / coarse).astype(int) + 4).tolist()

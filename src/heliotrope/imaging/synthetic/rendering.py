@@ -70,7 +70,7 @@ class BeamTruth:
         Centre of the energy on the plane, including light beyond the border: metres to the right of
         and above the target centre (2,), ENU metres (3,), and the pixel of that point (2,).
     centroid_on_target, pixel_on_target
-        The same for the energy on the target; NaN if no energy falls on it.
+        The same for the energy that falls on the target; NaN if none does.
     share_on_target
         Fraction of the energy on the target.
     share_clipped
@@ -220,7 +220,7 @@ def _add_ambient(scene: Scene, plane: Plane, image: Image) -> None:
 def _beam_image(
     scene: Scene, plane: Plane, index: int, thrown: Thrown
 ) -> tuple[slice, slice, Image]:
-    """Return the rows and columns that a beam reaches, and its reflected light there, W/m²."""
+    """Return the rows and columns that a beam illuminates, and its reflected light there, W/m²."""
     width, height = scene.camera.size
     outline = thrown.beam.corners
     ends = np.roll(outline, -1, axis=0)
@@ -319,10 +319,10 @@ def _add_ghost(level: Image, lens: LensEffects) -> None:
 
 
 def _expose(sensor: Sensor, level: Image, seed: int) -> tuple[Pixels, float]:
-    """Return pixels, and the share of clipped readings."""
+    """Return the pixels, and the fraction of clipped readings."""
     if seed < 0:
         raise InputError(f"render: seed {seed} must be 0 or more")
-    # NumPy's fastest generator; the noise keeps no secrets.
+    # NumPy's fastest generator; the noise needs no cryptographic strength.
     rng = np.random.Generator(np.random.SFC64(seed))
     noise = rng.standard_normal(level.size, dtype=np.float32)
     out: Pixels = np.empty(level.shape, np.uint8 if sensor.bits == 8 else np.uint16)
@@ -409,7 +409,7 @@ def _mark_truth(
     tints: tuple[tuple[float, ...], tuple[float, ...]],
 ) -> MarkTruth:
     sensor = scene.sensor
-    # The darkest channel is the last to lose its contrast.
+    # The darkest channel loses its contrast last.
     light = sensor.scale * np.min([a * ambient + b * flux for a, b in zip(*tints, strict=True)], 0)
     white, dark = (
         np.minimum(sensor.offset + r * light, 1.0)

@@ -151,7 +151,8 @@ class LensEffects:
     def __post_init__(self) -> None:
         if not 0.0 <= self.defocus <= 50.0 or not np.hypot(*self.shake) <= 100.0:
             raise InputError(
-                f"lens: defocus {self.defocus} px, shake {self.shake} px; give 0 to 50, at most 100"
+                f"lens: defocus {self.defocus} px, shake {self.shake} px; must be 0 to 50 and at "
+                "most 100"
             )
         _share("lens: veil", self.veil)
         if not (self.ghost >= 0.0 and self.ghost_radius > 0.0 and np.isfinite(self.ghost_at).all()):
@@ -179,7 +180,7 @@ class Sensor:
     Attributes
     ----------
     electrons
-        At full scale and gain 1.
+        Electrons at full scale and gain 1.
     sensitivity
         Electrons per second and W/m² on white; 6000 and 1 ms fill the scale at 1667 W/m².
     exposure
@@ -218,7 +219,7 @@ class Sensor:
         if not 0.0 <= self.offset < 1.0:
             raise InputError(f"sensor: offset {self.offset} must be from 0 to below 1")
         if self.bits not in (8, 12):
-            raise InputError(f"sensor: {self.bits} bits; give 8 or 12")
+            raise InputError(f"sensor: {self.bits} bits; must be 8 or 12")
 
     @property
     def scale(self) -> float:
@@ -291,7 +292,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         if not self.targets:
-            raise InputError("scene: no target; give at least one")
+            raise InputError("scene: no target; pass at least one")
         names = [target.name for target in self.targets]
         if len(set(names)) < len(names):
             raise InputError(f"scene: targets {', '.join(names)}: a name occurs twice")

@@ -22,31 +22,31 @@ Pictures = Mapping[str, FloatArray]
 SURVEY = 0.005
 #: Standard deviation of a tag's corners relative to each other, m.
 PRINT = 0.001
-#: Least correlation of a mark; least share of the variance that its drawing explains (without and
+#: Minimum correlation of a mark; least share of the variance that its drawing explains (without and
 #: with a code that was read); greatest brightness over its surroundings.
 LIKE, EXPLAINED, EXPLAINED_READ, CONTRAST = 0.45, 0.65, 0.3, 0.93
 #: A mark this many standard deviations from the place given by the others is not used.
 STRAY = 5.0
-#: Greatest distortion of one mark against its drawing, of the size of all marks, and of the marks
+#: Maximum distortion of one mark against its drawing, of the size of all marks, and of the marks
 #: against each other. Measured: 0.03 in photographs, 0.2 in clutter.
 MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.12, 0.08
-#: Greatest common stretch or skew of all marks. Measured: 0.01.
+#: Maximum common stretch or skew of all marks. Measured: 0.01.
 ASKEW = 0.04
 #: Limits for each mark where there are no more marks than unknowns of a view.
 ALIKE_EACH, EXPLAINED_EACH = 0.12, 0.75
-#: Greatest residual of a view: share of the face's extent, plus pixels.
+#: Maximum residual of a view: share of the face's extent, plus pixels.
 MISFIT, MISFIT_PIXELS = 0.005, 1.0
-#: Greatest standard deviation of a target's centre, as a share of its extent.
+#: Maximum standard deviation of a target's centre, as a share of its extent.
 VAGUE = 0.005
-#: Greatest distance of a target's centre from the middle of the marks seen, in their standard
+#: Maximum distance of a target's centre from the middle of the marks seen, in their standard
 #: deviations; beyond, lens and perspective are guesses.
 FAR = 4.0
-#: Least share of the paint between marks that is lighter than the nearest mark.
+#: Minimum share of the paint between marks that is lighter than the nearest mark.
 LIGHTER = 0.8
-#: Least ratio of the scales of a face, and greatest ratio of the scales of its near and far side.
+#: Minimum ratio of the scales of a face, and greatest ratio of the scales of its near and far side.
 FLATTEST, NEAREST = 0.2, 3.0
-#: Fewest points of a view, with and without prior knowledge of their places; least share of the
-#: points in the frame, likewise.
+#: Minimum number of points of a view, with and without prior knowledge of their positions; minimum
+#: fraction of the points in the frame, likewise.
 FEWEST, ALONE, SHARE, SHARE_ALONE = 3, 4, 0.5, 0.7
 
 
@@ -62,12 +62,12 @@ def face_marks(face: Face) -> tuple[list[Mark], FloatArray]:
 
 
 def one_mark(a: Mark, b: Mark) -> bool:
-    """Return whether marks of two targets are one mark on their common edge."""
+    """Return whether two targets share a mark on their common edge."""
     return a.kind == b.kind and float(np.linalg.norm(a.point - b.point)) < 0.05
 
 
 class FrameSearch:
-    """One frame, with intermediate results that all faces share."""
+    """One frame, with intermediate results shared by all faces."""
 
     def __init__(self, frame: Frame, camera: Camera | None, pictures: Pictures) -> None:
         self.grey = np.ascontiguousarray(frame.grey)
@@ -84,7 +84,7 @@ class FrameSearch:
         """The frame in 8 bits."""
         if self.grey.dtype == np.uint8:
             return self.grey
-        # Sensors leave bits empty, and a beam outshines everything else: let the brightest
+        # Sensors leave bits unused and a beam outshines everything else, so let the brightest
         # thousandth clip.
         top = max(float(np.percentile(self.grey[::4, ::4], 99.9)), 1.0)
         scaled = self.grey.astype(np.float32) * np.float32(255.0 / top)
@@ -121,11 +121,11 @@ class Attempt:
     Attributes
     ----------
     view
-        None if no view can be trusted.
+        The view; None if no view is reliable.
     observed
-        Pixel and covariance of recognised marks, by index.
+        Pixels and covariances of recognised marks, by index.
     used
-        Marks that fit together.
+        Marks that are mutually consistent.
     reasons
         Why other marks are not used.
     text
@@ -133,9 +133,9 @@ class Attempt:
     looks
         Measurements of each mark.
     known
-        Whether the face's rough place was known before the search.
+        Whether the approximate position of the face was known before the search.
     vague
-        Why the places of some targets remain unknown, by name.
+        Why the positions of some targets remain unknown, by target name.
     """
 
     view: FaceView | None
@@ -265,7 +265,7 @@ class Search:
     def _fit(
         self, observed: _Observed, known: FloatArray | None
     ) -> tuple[FaceView | None, list[int]]:
-        """Fit a view to the observed marks, leaving out strays, the worst first."""
+        """Fit a view to the observed marks, removing outliers one at a time, the worst first."""
         used = list(observed.places)
         while True:
             points = self._points(used, observed, known)
@@ -293,7 +293,7 @@ class Search:
     def _points(
         self, used: list[int], observed: _Observed, known: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return points, pixels, covariance: four corners of a tag, four points for three marks."""
+        """Return points, pixels and covariance of a tag or of three marks, four points each."""
         plane, pixels, covariance = [], [], []
         per_metre = self._per_metre(used, observed)
         for k in used:
@@ -302,7 +302,7 @@ class Search:
             if mark.kind == "tag":
                 plane += list(self.plane[k] + _square(mark))
                 pixels += list(observed.corners[k])
-                # Its corners share the errors of survey and place.
+                # The corners of a tag share its survey and position errors.
                 own = (per_metre * PRINT) ** 2 + 2.0 * np.trace(spread)
                 covariance.append(np.kron(np.ones((4, 4)), common) + own * np.eye(8))
             else:
@@ -326,7 +326,7 @@ class Search:
     def _fourth(
         self, used: list[int], points: FloatArray, places: FloatArray, known: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, float] | None:
-        """Return a fourth point for three, its pixel and its standard deviation, px.
+        """Return a fourth point besides three marks, its pixel and standard deviation, px.
 
         Three marks give an affine map. If the rough places of the marks are known, the map
         corrects them. Otherwise perspective is unknown, up to that of the lens (or of a lens
@@ -377,7 +377,7 @@ class Search:
         return f"only {len(used)} of its {total} marks were seen: {names}; {needed} are needed"
 
     def _problem(self, view: FaceView, used: list[int], observed: _Observed, known: bool) -> str:
-        """Return the reason not to trust a view; empty if there is none."""
+        """Return the reason why a view is not reliable; empty if it is."""
         needed = self._needed(view, known)
         if self._points_of(used) < needed:
             return self._too_few(used, needed)
@@ -385,11 +385,9 @@ class Search:
         per_metre = np.sqrt(np.abs(np.linalg.det(scale)))
         limit = MISFIT * self.extent * float(per_metre.mean()) + MISFIT_PIXELS
         if not view.residual <= limit:
-            return (
-                f"its marks do not fit together: {view.residual:.1f} px RMS, limit {limit:.1f} px"
-            )
+            return f"its marks are inconsistent: {view.residual:.1f} px RMS, limit {limit:.1f} px"
         if self._impossible(view):
-            return "no camera can see a plane with its marks in these places"
+            return "no camera position explains these mark positions"
         return self._misshapen(used, observed, known) or self._dark(view, used, observed)
 
     def _points_of(self, used: list[int]) -> int:
@@ -402,7 +400,7 @@ class Search:
         return max(least, int(np.ceil(share * len(self.expected(view)))))
 
     def expected(self, view: FaceView) -> list[int]:
-        """Return the marks that the frame should show."""
+        """Return the marks that should be visible in the frame."""
         return self.within(view.to_pixels(self.plane))
 
     def within(self, pixels: FloatArray) -> list[int]:
@@ -421,7 +419,7 @@ class Search:
         return bool(np.abs(depth).max() > NEAREST * np.abs(depth).min())
 
     def _misshapen(self, used: list[int], observed: _Observed, known: bool) -> str:
-        """Return the fault in the marks' sizes and shapes; empty if there is none."""
+        """Return what is wrong with the sizes and shapes of the marks; empty if nothing is."""
         drawn = [k for k in used if k in observed.looks and self.marks[k].kind != "picture"]
         if not drawn:
             return ""
@@ -430,14 +428,14 @@ class Search:
         size = 0.5 * float(np.trace(middle))
         if abs(size) > WRONG_SIZE:
             return (
-                f"its marks appear {1.0 + size:.2f} times as large as they should be: another "
-                "target, or wrong sizes of the marks"
+                f"its marks appear {1.0 + size:.2f} times as large as they should be: a different "
+                "target, or wrong mark sizes"
             )
         common = float(np.abs(middle - size * np.eye(2)).max())
         if len(drawn) >= FEWEST and common > ASKEW:
             return (
-                f"its marks are all stretched or skewed by {common:.0%}: another target, or wrong "
-                "places of the marks"
+                f"its marks are all stretched or skewed by {common:.0%}: a different target, or "
+                "wrong mark positions"
             )
         unlike = np.abs(shapes - size * np.eye(2)).max(axis=(1, 2))
         explained = min(
@@ -445,13 +443,16 @@ class Search:
         )
         few = len(used) <= ALONE and not known
         if float(np.median(unlike)) > ALIKE or (few and float(unlike.max()) > ALIKE_EACH):
-            return f"shapes that lie like its marks differ from them by up to {unlike.max():.0%}"
+            return f"shapes arranged like its marks differ from them by up to {unlike.max():.0%}"
         if few and explained < EXPLAINED_EACH:
-            return f"other shapes lie where its marks should: one is explained to {explained:.0%}"
+            return (
+                "there are other shapes where its marks should be: one is explained only to "
+                f"{explained:.0%}"
+            )
         return ""
 
     def _dark(self, view: FaceView, used: list[int], observed: _Observed) -> str:
-        """Return the reason why the space between marks is not bright paint; empty if it is."""
+        """Return why the area between marks does not look like bright paint; empty if it does."""
         flat = ("corner", "tee", "square", "disc")
         shown = [k for k in used if k in observed.looks and self.marks[k].kind in flat]
         if not shown:
@@ -478,7 +479,7 @@ class Search:
     def _levels(
         self, view: FaceView, shown: list[int], observed: _Observed
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the brightness of marks and of their surroundings, (K,) each."""
+        """Return the brightness of the marks and of their surroundings, (K,) each."""
         inner = []
         for k in shown:
             mark = self.marks[k]
@@ -521,7 +522,7 @@ class Search:
                 reasons[target.name] = f"all marks seen lie on one side of it: {names}"
             elif not deviation <= limit:
                 reasons[target.name] = (
-                    f"the marks seen determine its place only to {deviation:.3f} m; "
+                    f"the visible marks determine its position only to {deviation:.3f} m; "
                     f"{limit:.3f} m is needed"
                 )
         return reasons
@@ -535,9 +536,9 @@ class Search:
 
 
 def _problem(refined: Refined | None, mark: Mark, read: bool) -> str:
-    """Return the reason why a match is not the mark; empty if it is.
+    """Return why a match is not the mark; empty if it is the mark.
 
-    A tag whose code was ``read`` may be explained less well: its cells may be small.
+    A tag whose code was ``read`` may fit less well, because its cells may be small.
     """
     if refined is None:
         return "outside the frame or too small"

@@ -22,14 +22,14 @@ from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.targets.teaching import places_of, shown_pixels
 
-#: Longest answer, bytes; a point takes a few hundred.
+#: Maximum size of a reply, bytes; a point takes a few hundred bytes.
 _LONGEST = 1 << 20
 Pixel = tuple[float, float]
 
 
 @dataclass
 class _State:
-    """The question, and the answer."""
+    """The points requested from the user, and the reply."""
 
     token: str
     nonce: str
@@ -63,7 +63,7 @@ class _Handler(BaseHTTPRequestHandler):
         return cast("_Server", self.server).port
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the base's name
-        """Keep quiet: the terminal belongs to the command."""
+        """Log nothing: the terminal belongs to the command."""
 
     def _allowed(self) -> str | None:
         """Return the path after the random word; None if the request is not for this page."""
@@ -125,14 +125,14 @@ class _Handler(BaseHTTPRequestHandler):
     def _read(self) -> dict[str, Pixel]:
         length = self.headers.get("Content-Length", "")
         if not length.isascii() or not length.isdigit() or int(length) > _LONGEST:
-            raise InputError(f"the answer's length {length!r} is not a number up to {_LONGEST}")
+            raise InputError(f"the reply's length {length!r} is not a number up to {_LONGEST}")
         try:
             document = json.loads(self.rfile.read(int(length)))
         except ValueError:
-            raise InputError("the answer is not JSON") from None
+            raise InputError("the reply is not JSON") from None
         points = document.get("points") if isinstance(document, dict) else None
         if not isinstance(points, dict):
-            raise InputError('the answer has no "points"')
+            raise InputError('the reply has no "points"')
         return {name: self._point(name, value) for name, value in points.items()}
 
     def _point(self, name: str, value: object) -> Pixel:
@@ -144,7 +144,7 @@ class _Handler(BaseHTTPRequestHandler):
             and len(value) == 2
             and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
         ):
-            raise InputError(f"point {name}: give two numbers, pixels right and down")
+            raise InputError(f"point {name}: enter two numbers, pixels right and down")
         x, y = (float(v) for v in value)
         # NaN fails too.
         if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
@@ -161,7 +161,7 @@ def ask(
     fewest: int = 4,
     aspect: float = 1.0,
 ) -> dict[str, Pixel]:
-    """Return the pixels that a person clicked, by name.
+    """Return the pixels that the user clicked, by point name.
 
     Parameters
     ----------
@@ -175,17 +175,16 @@ def ask(
     title
         Title of the page.
     announce
-        Called with the page's address once it can be opened; this function waits for the
-        answer.
+        Called with the page's address once it can be opened; this function waits for the reply.
     fewest
-        Least number of points in an answer, those given included.
+        Minimum number of points in a reply, including those already known.
     aspect
         Width of the target over its height, for the page's sketch of it.
 
     Raises
     ------
     InputError
-        If the person cancels.
+        If the user cancels.
     """
     import cv2
 
@@ -208,7 +207,7 @@ def ask(
             server.shutdown()
             thread.join()
     if state.answer is None:
-        raise InputError(f"{title}: cancelled in the browser; nothing is written")
+        raise InputError(f"{title}: cancelled in the browser; nothing was written")
     return state.answer
 
 
@@ -219,14 +218,14 @@ def click_points(
     title: str,
     announce: Callable[[str], None],
 ) -> dict[str, Pixel]:
-    """Ask a person in a browser for the points of a target that are not given.
+    """Ask the user in a browser for the points of a target that were not specified.
 
-    ``announce`` is called with the page's address, on this machine alone.
+    ``announce`` is called with the page's address, which is reachable only from this computer.
 
     Raises
     ------
     InputError
-        If the person cancels.
+        If the user cancels.
     """
     places, aspect = places_of(target)
     asked = {name: place for name, place in places.items() if name not in known}
@@ -306,7 +305,7 @@ _HTML = r"""<!doctype html>
     <button id="cancel">Cancel</button><button id="done">Done</button>
   </div>
   <div id="said" role="status"></div>
-  <small>Wheel: closer. Drag: move. Space: put the point in the middle. Arrows: nudge the last point
+  <small>Wheel: zoom. Drag: move. Space: put the point in the centre. Arrows: nudge the last point
   by a quarter of a pixel, with Shift by 4, with Ctrl by 40. S: skip, Backspace: undo,
   Enter: done.</small>
 </aside>
@@ -336,10 +335,10 @@ const send = async (place, body) => {
     if (!reply.ok) { byId("said").textContent = text; return; }
     close();
     document.querySelector("aside").textContent =
-      place === "cancel" ? "Cancelled; nothing is written. This page can be closed."
-        : "Thank you. The command goes on; this page can be closed.";
+      place === "cancel" ? "Cancelled; nothing was written. This page can be closed."
+        : "Thank you. The command continues; this page can be closed.";
   } catch (error) {
-    byId("said").textContent = "The command no longer listens; start it again.";
+    byId("said").textContent = "The command is no longer running; start it again.";
   }
 };
 const done = () => {

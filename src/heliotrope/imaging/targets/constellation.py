@@ -16,13 +16,13 @@ Places = npt.NDArray[np.intp]
 _LOOSE = 0.25
 #: A candidate this near to a mark's place, in sizes of the mark, is the mark.
 _TIGHT = 0.5
-#: Greatest ratio of second moments to the predicted ones, for one mark.
+#: Maximum ratio of second moments to the predicted ones, for one mark.
 _SPREAD = 2.6
 #: The same for all marks together, and between the axes. Measured: 1.1 at most.
 _SIZED, _ASKEW = 1.6, 1.4
 #: A camera is upright if the face's upward direction is this near the expected one, rad.
 _UPRIGHT = 0.3
-#: Least correlation of a candidate at a mark's place.
+#: Minimum correlation of a candidate at a mark's place.
 _RESEMBLES = 0.55
 #: Numbers of guesses weighed and followed.
 _GUESSES, _FOLLOWED = 1200, 10
@@ -67,7 +67,7 @@ class Match:
     H_pixel_plane
         Homography from plane metres to pixels, (3, 3); affine if fewer than five match.
     score
-        Number of marks; then uprightness of the view, then likeness of the shapes.
+        Number of marks, then uprightness of the view, then similarity of the shapes.
     """
 
     marks: Places
@@ -98,15 +98,15 @@ def constellation(
 def match(
     candidates: Candidates, marks: Constellation, up: FloatArray, upright: bool
 ) -> Match | None:
-    """Return the assignment that explains most marks, or None if no three agree.
+    """Return the assignment that explains the most marks, or None if no three are consistent.
 
-    Each candidate, taken for each mark that it may be, predicts the places of all marks.
-    Candidates found there give an affine map, then a homography.
+    Each candidate, assumed to be each mark that it may be, predicts the positions of all marks.
+    Candidates found at these positions yield an affine map, then a homography.
 
     Parameters
     ----------
     candidates
-        Candidates of a frame.
+        Candidates found in a frame.
     marks
         The marks.
     up
@@ -195,7 +195,7 @@ def _gather(
 def _settle(
     candidates: Candidates, marks: Constellation, taken: Places, up: FloatArray
 ) -> Match | None:
-    """Fit and gather in turn until nothing changes."""
+    """Alternate between fitting and gathering candidates until nothing changes."""
     H = np.eye(3)
     for _ in range(5):
         held = np.flatnonzero(taken >= 0)
@@ -233,7 +233,7 @@ def _in_shape(
 ) -> bool:
     """Return whether sizes of marks agree with the distances between them.
 
-    They disagree for another target with other distances: no map fits both.
+    They disagree for a different target with other distances, because no map fits both.
     """
     back = np.linalg.inv(scales(H, marks.middle[held]))
     observed = (back @ candidates.covariance[taken] @ np.swapaxes(back, 1, 2)).sum(axis=0)

@@ -19,7 +19,7 @@ from heliotrope.imaging.frame import Image
 from heliotrope.imaging.targets.marks import polygons, tag_dictionary
 from heliotrope.optics.coverage import coverage
 
-#: Least correlation of a candidate's shape with a drawing.
+#: Minimum correlation of a candidate's shape with a drawing.
 _ALIKE = 0.72
 #: Rotations within this of the best are kept too.
 _NEARLY = 0.08
@@ -49,7 +49,7 @@ class Drawing:
     size
         Size of the mark, m.
     turning
-        Whether a turn changes its look; false for a disc.
+        Whether rotation changes its appearance; false for a disc.
     """
 
     middle: FloatArray
@@ -342,14 +342,14 @@ def tag_number(mark: Mark) -> tuple[int, int]:
 def find_pictures(
     grey: Image, marks: Sequence[Mark], pictures: Mapping[str, FloatArray]
 ) -> Candidates:
-    """Return places of taught pictures in an upright frame, at fourteen sizes.
+    """Search an upright frame for taught pictures at fourteen scales.
 
     Parameters
     ----------
     grey
         A frame, (H, W), 8 bit.
     marks
-        All of kind picture; drawing k belongs to mark k.
+        Marks, all of kind "picture"; entry k of the result belongs to mark k.
     pictures
         Pictures by the codes of the marks.
     """

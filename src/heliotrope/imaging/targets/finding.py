@@ -177,7 +177,7 @@ class _Face:
         self.text = ""
 
     def look(self, turned: bool) -> None:
-        """Try one way of looking after another until the face is found."""
+        """Make one attempt after another until the face is found."""
         if not self._known_enough():
             return
         for attempt in self._turned() if turned else self._upright():
@@ -271,7 +271,7 @@ class _Face:
         return replace(settled, view=None, text=text) if text else settled
 
     def _elsewhere(self, attempt: Attempt, view: FaceView) -> str:
-        """Return the reason why the view may show another target; empty if it cannot."""
+        """Return why the view may show a different target; empty if it cannot."""
         search = self.search
         marks, plane, targets = search.marks, search.plane, search.face.targets
         near = 0.05 * search.extent
@@ -287,15 +287,15 @@ class _Face:
                     for k in attempt.used
                 ):
                     continue
-                # Marks missing from their places speak against the other target.
+                # Marks missing from their positions are evidence against the other target.
                 missing = len(search.within(view.to_pixels(plane - shift))) - len(attempt.used)
                 if missing <= unseen + 1:
                     names = f"{targets[a].name} or {targets[b].name}"
-                    return f"this may be {names}; name the targets that the camera sees"
+                    return f"this may be {names}; specify which targets the camera sees"
         return ""
 
     def _settled(self, attempt: Attempt, view: FaceView) -> Attempt:
-        """Return the attempt, among turns with like marks, that shows most or is more upright."""
+        """Return the attempt with most marks, or most upright, among similar rotations."""
         search, up = self.search, self._up()
         middle = search.plane.mean(axis=0)
         scale = view.scale(middle)
@@ -307,7 +307,7 @@ class _Face:
         best, least = attempt, lean(np.eye(2))
         whole = len(attempt.used) == len(search.expected(view))
         for turn, share in symmetries(search.marks, search.plane):
-            # If all marks look as they should, a turn with unlike marks is out of the question.
+            # If all marks look as they should, a rotation with dissimilar marks is excluded.
             more_upright = lean(turn) < least - 0.01
             if whole if share < 1.0 else not more_upright:
                 continue
@@ -319,7 +319,7 @@ class _Face:
         return best
 
     def _outlined(self, reduction: int, ratio: float, upright: bool) -> Iterator[Attempt]:
-        """Yield an attempt from dark shapes that look and lie like the marks."""
+        """Yield an attempt from dark shapes that look like the marks and are arranged like them."""
         search = self.search
         kept = [k for k, m in enumerate(search.marks) if m.kind not in ("tag", "picture")]
         if len(kept) < FEWEST:
@@ -368,9 +368,10 @@ class _Face:
         )
         if turn:
             text = (
-                f"the frame is {turn} against the pose of camera {camera.name}; undo that in the "
-                "camera or in what stores its frames (if the camera itself was turned: delete its "
-                "position_m and rotation from the plant file and calibrate it again)"
+                f"the frame is {turn} against the pose of camera {camera.name}; correct this in "
+                "the camera or in the program that stores its frames (if the camera itself was "
+                "rotated: delete its position_m and rotation from the plant file and calibrate "
+                "it again)"
             )
             self.best = replace(self.best, view=None, text=text)
 
@@ -407,7 +408,7 @@ def _rank(attempt: Attempt) -> tuple[bool, int]:
 def turn_of(observed: FloatArray, expected: FloatArray, camera: Camera, look: FrameSearch) -> str:
     """Return the turn of the frame that explains the observed marks; empty if none is needed.
 
-    Marks are compared as sets: those of a turned frame may look like each other's.
+    Marks are compared as sets, because in a turned frame marks may look like one another.
 
     Parameters
     ----------
@@ -438,7 +439,7 @@ def turn_of(observed: FloatArray, expected: FloatArray, camera: Camera, look: Fr
 def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArray, float]]:
     """Return quarter turns (2, 2) about their middle that map marks onto places of marks.
 
-    Each comes with the share of marks, half or more, that then also look the same.
+    Each is returned with the fraction of marks, half or more, that then also look the same.
 
     Parameters
     ----------
@@ -471,7 +472,7 @@ def without_orientation(targets: Sequence[Target]) -> tuple[str, ...]:
 
 
 def _is_mirrored_alike(marks: Sequence[Mark], plane: FloatArray, axis: int) -> bool:
-    """Return whether marks look the same with right and left (0) or top and bottom (1) exchanged.
+    """Return whether marks look the same with left and right (0) or top and bottom (1) swapped.
 
     A drawing has an axis of its own: a corner's points down to the right, a tee's down.
     """
@@ -485,7 +486,7 @@ def _is_mirrored_alike(marks: Sequence[Mark], plane: FloatArray, axis: int) -> b
 def _share_alike(
     marks: Sequence[Mark], plane: FloatArray, moved: FloatArray, turns: Sequence[float]
 ) -> float:
-    """Return the share of marks that look like another after a linear map about their middle.
+    """Return the fraction of marks that look like another mark after a map about their centre.
 
     Parameters
     ----------
@@ -510,7 +511,7 @@ def _share_alike(
 
 
 def _alike(a: Mark, b: Mark, turn: float) -> bool:
-    """Return whether a mark of another turn (rad) looks like another."""
+    """Return whether a mark with a different rotation (rad) looks like another mark."""
     if a.kind in ("tag", "picture") or (a.kind, a.size, a.stroke) != (b.kind, b.size, b.stroke):
         return False
     if a.kind == "disc":
@@ -536,7 +537,7 @@ def _one_place_each(searches: Sequence[_Face]) -> None:
             lost = [f"the frame shows {name} there" for name in reversed(names)]
             if abs(clear) < _CLEARER:
                 lost = [
-                    f"the frame may show {name} there; name the targets that the camera sees"
+                    f"the frame may show {name} there; specify which targets the camera sees"
                     for name in reversed(names)
                 ]
             if clear < _CLEARER:

@@ -88,8 +88,8 @@ def tag_dictionary(mark: Mark) -> tuple[int, int]:
     known = sorted(n[5:] for n in dir(cv2.aruco) if n.startswith("DICT_"))
     if not match or match[1] not in known:
         raise InputError(
-            f"mark {mark.name}: code {mark.code!r} names no tag; write 4X4_50:7, with a "
-            f"dictionary of {', '.join(known)}"
+            f"mark {mark.name}: code {mark.code!r} is not a tag; write for example 4X4_50:7, with "
+            f"a dictionary from {', '.join(known)}"
         )
     return int(getattr(cv2.aruco, f"DICT_{match[1]}")), int(match[2])
 

@@ -33,7 +33,7 @@ _FLOOR = 0.1
 _SOFT = 0.8
 #: Blur of the samples, so that they can be interpolated.
 _SMOOTH = 0.7
-#: Greatest number of Gauss-Newton steps (two or three suffice from a tenth of a stroke), and the
+#: Maximum number of Gauss-Newton steps (two or three suffice from a tenth of a stroke), and the
 #: step, in samples, below which the fit has converged.
 _STEPS, _STILL = 6, 0.01
 #: Margin around a drawing, in its own size.
@@ -44,7 +44,7 @@ _CLEAR = 0.8
 
 @dataclass(frozen=True)
 class Refined:
-    """The refined place of a mark.
+    """The refined position of a mark.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ def refine(
     picture: FloatArray | None = None,
     within: FloatArray | None = None,
 ) -> Refined | None:
-    """Return the exact place of a mark near a given place.
+    """Return the exact position of a mark near an approximate position.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def refine(
     mark
         The mark.
     pixel
-        Rough place of its point, (2,).
+        Approximate position of its point, (2,).
     scale
         d(pixel)/d(plane) there, px/m, (2, 2). Its errors, over half the size of the mark,
         are errors of the point.
@@ -163,7 +163,7 @@ def locate(
     search: float,
     picture: FloatArray | None = None,
 ) -> tuple[FloatArray, float, float] | None:
-    """Return the rough place of a mark, (2,), its standard deviation, px, and the correlation.
+    """Return a mark's approximate position, (2,), its standard deviation, px, and correlation.
 
     Parameters are those of `refine`.
     """
@@ -196,7 +196,7 @@ def locate(
 
 
 def _peak(values: Image, at: int) -> float:
-    """Return where the parabola through a maximum and its neighbours peaks."""
+    """Return the peak of the parabola through a maximum and its neighbours."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, middle, after = (float(v) for v in values[at - 1 : at + 2])
@@ -333,7 +333,7 @@ def _paint(template: _Template, within: FloatArray | None) -> Values:
 
 
 def _relit(samples: Image, stroke: float) -> Image:
-    """Return samples divided by the light on them, which is their closing without strokes."""
+    """Return samples divided by the light on them: their closing, which removes strokes."""
     import cv2
 
     broad = 2 * int(0.65 * stroke + 1.5) + 1
@@ -349,7 +349,7 @@ def _adjust(
     paint: Values,
     relit: bool,
 ) -> Refined | None:
-    """Fit the place by Gauss-Newton, solving for all other unknowns at each step."""
+    """Fit the position by Gauss-Newton iteration, solving for all other unknowns at each step."""
     import cv2
 
     basis, step, shape = template.basis, template.step, template.values.shape
@@ -443,10 +443,10 @@ def _judged(
 def _softer(
     template: _Template, samples: Values, weight: Values, contrast: float, blur: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Return contrast and blur of a pale mark, under stray light or only out of focus.
+    """Return contrast and blur of a pale mark, which is under stray light or out of focus.
 
-    The model's terms for blur hold while it is small against the stroke. Beyond, drawings of
-    several blurs each way are compared, and the one that explains most decides.
+    The blur terms of the model are valid while the blur is small compared with the stroke. For
+    larger blur, drawings with several blurs along each axis are compared, and the best fit is used.
     """
     import cv2
 

@@ -31,9 +31,9 @@ KINDS = ("corner", "tee", "square", "disc", "picture")
 SHARE = 0.12
 #: Sides of a taught picture, px.
 SMALLEST, LARGEST = 12, 512
-#: Greatest error of a point given by hand, px.
+#: Maximum error of a point given by hand, px.
 REACH = 12.0
-#: Least share of the variance that a drawing explains; greatest brightness over its surroundings.
+#: Minimum share of the variance that a drawing explains; greatest brightness over its surroundings.
 EXPLAINED, CONTRAST = 0.5, 0.93
 #: A picture that can be located no better than this, px, shows only an edge or nothing.
 VAGUE = 0.5
@@ -64,7 +64,7 @@ class Wish:
             raise InputError(f"a {self.kind} needs its size in metres (--size)")
         for what, value in (("size", self.size), ("stroke", self.stroke)):
             if value is not None and not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{what} {value} m; give metres above 0")
+                raise InputError(f"{what} {value} m; must be above 0")
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def known_points(target: Target) -> dict[str, FloatArray]:
     for name, point in target.markers.items():
         points.setdefault(name, as_float(point))
     for name, point in zip(CORNERS, target.corners, strict=True):
-        # A surveyed corner may stand under a name of its own.
+        # A surveyed corner may be listed under its own name.
         if not any(np.linalg.norm(point - other) < 1e-3 for other in points.values()):
             points.setdefault(name, point)
     return points
@@ -146,7 +146,7 @@ def places_of(target: Target) -> tuple[dict[str, Pixel], float]:
 
 
 def shown_pixels(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Return a frame as bright as possible: in a faint one points are hard to click."""
+    """Return the frame brightened: in a dark frame, points are hard to click."""
     pixels = frame.pixels.astype(np.float32)
     top = max(float(np.percentile(pixels, 99.9)), 1.0)
     return np.asarray(np.clip(pixels * (255.0 / top), 0.0, 255.0), dtype=np.uint8)
@@ -197,7 +197,7 @@ def teach(
         target.
     """
     if not (np.isfinite(sigma) and sigma > 0.0):
-        raise InputError(f"sigma {sigma} px; give a standard deviation above 0")
+        raise InputError(f"sigma {sigma} px; must be above 0")
     surface = plant.target(target)
     named = _check_points(surface, frame, given)
     for name in set(wishes or {}) - set(named):
@@ -206,7 +206,7 @@ def teach(
     if known is not None and known.size != frame.size:
         raise InputError(
             f"camera {camera}: its frames have {known.size[0]} × {known.size[1]} px, the picture "
-            f"{frame.size[0]} × {frame.size[1]} px; give a picture of that camera as it is"
+            f"{frame.size[0]} × {frame.size[1]} px; use an unscaled picture from that camera"
         )
     plane = surface.plane_coordinates(np.array(list(named.values())))
     pixels = np.array([given[name] for name in named], dtype=np.float64)
@@ -267,7 +267,7 @@ def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | Non
         try:
             table = str(read_toml(place, "a plant file").get("heliostats", ""))
         except FormatError:
-            raise FormatError(place, "not a plant file; write to another place") from None
+            raise FormatError(place, "not a plant file; choose another output file") from None
     codes = {m.code for t in plant.targets for m in t.marks if m.kind == "picture"}
     for code in codes if folder is not None else ():
         source = Path(folder or "") / code
@@ -341,21 +341,23 @@ def _homography(
 
     what = f"target {target.name}: the points {', '.join(names)}"
     if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 0.02 * np.ptp(plane):
-        raise InputError(f"{what} lie on one line; give some that span an area")
+        raise InputError(f"{what} lie on one line; use points that span an area")
     # None, where there is no solution, becomes a NaN.
     H = as_float(cv2.findHomography(plane, pixels)[0])
     if not np.isfinite(H).all():
-        raise InputError(f"{what} cannot be a view of it; are names swapped?")
+        raise InputError(f"{what} cannot be a view of this target; check for swapped names")
     depth = np.column_stack([plane, np.ones(len(plane))]) @ H[2]
     turned = [float(np.linalg.det(_scale(H, p))) for p in plane]
     # Rows run downwards, so the determinant of a front view is negative.
     if (depth * depth[0] > 0.0).all() and min(turned) > 0.0:
-        raise InputError(f"{what} are mirrored in the picture; are left and right swapped?")
+        raise InputError(
+            f"{what} are mirrored in the picture; check whether left and right are swapped"
+        )
     miss = _mapped(H, plane) - pixels
     if not ((depth * depth[0] > 0.0).all() and max(turned) < 0.0) or (
         np.sqrt(np.mean(miss**2)) > 0.05 * np.ptp(pixels, axis=0).max()
     ):
-        raise InputError(f"{what} are not arranged as on the target; are two swapped?")
+        raise InputError(f"{what} are not arranged as on the target; check for swapped names")
     return H
 
 
@@ -439,7 +441,7 @@ def _picture(
     offset = (np.arange(count) - count // 2) * (size / count)
     right, up = np.meshgrid(offset, -offset)
     grid = place + np.stack([right, up], axis=-1).reshape(-1, 2)
-    # The point is where the hand put it; the view gives the plane around it.
+    # The point stays where the user put it; the view defines the plane around it.
     spots = _mapped(H, grid) + taught.pixel - _mapped(H, place[None])[0]
     width, height = frame.size
     if (spots.min(axis=0) < -0.5).any() or (spots.max(axis=0) > [width - 0.5, height - 0.5]).any():
@@ -460,7 +462,7 @@ def _picture(
 
 def _nothing(taught: TaughtPoint, why: str) -> TaughtPoint:
     before = f"{taught.note}; " if taught.note else ""
-    return replace(taught, note=f"{before}{why}: the point locates the camera only")
+    return replace(taught, note=f"{before}{why}; the point is used only to locate the camera")
 
 
 def _vagueness(picture: npt.NDArray[np.uint8]) -> float:
@@ -538,7 +540,7 @@ def _with_marks(plant: Plant, target: Target, marks: Sequence[Mark], camera: Cam
 
 
 def with_camera(plant: Plant, camera: Camera) -> Plant:
-    """Return the plant with a camera added, or replaced if one has its name."""
+    """Return the plant with a camera added, replacing any camera of the same name."""
     names = [c.name for c in plant.cameras]
     if camera.name not in names:
         return replace(plant, cameras=(*plant.cameras, camera))
@@ -591,7 +593,7 @@ def see_marks(
     if not targets:
         raise InputError(
             "no target of this camera has marks; teach them first (heliotrope camera teach), or "
-            "give a chessboard"
+            "use a chessboard"
         )
     pictures = read_pictures(folder, targets)
     points, pixels, covariances, names, reasons = [], [], [], [], []
@@ -627,7 +629,7 @@ def see_marks(
 def fit_marks(
     size: tuple[int, int], marks: SeenMarks, known: Camera | None, name: str, anew: bool
 ) -> CameraFit:
-    """Return the camera that saw marks; a known lens is kept unless ``anew``."""
+    """Return the camera fitted to its marks; a known lens is kept unless ``anew`` is set."""
     if known is None or anew:
         return calibrate_marks(size, marks.points, marks.pixels, marks.covariances, name)
     parts = marks.points, marks.pixels, marks.covariances

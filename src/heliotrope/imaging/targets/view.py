@@ -14,7 +14,7 @@ from heliotrope.geometry import FloatArray
 #: Standard deviation of k1 of an unknown lens, at a focal length of the frame's longer side.
 #: Photographic lenses stay below.
 LENS_DEVIATION = 0.1
-#: Least error of a located camera as a whole, and of single points by its lens, px.
+#: Minimum error of a located camera as a whole, and of single points by its lens, px.
 _TURNED, _FITTED = 0.33, 0.1
 
 
@@ -245,10 +245,10 @@ def fit_view(
 
 
 def posed_view(camera: Camera, target: Target) -> FaceView:
-    """Return the view of a surface without marks, by the camera's place alone.
+    """Return the view of a surface without marks, from the camera pose alone.
 
-    Its covariance is that of a camera that is turned as a whole by its ``deviation``, at least by
-    a third of a pixel.
+    Its covariance is that of rotating the whole camera by its ``deviation``, at least a third of a
+    pixel.
 
     Raises
     ------
@@ -261,7 +261,9 @@ def posed_view(camera: Camera, target: Target) -> FaceView:
     plane = low + plane * (high - low)
     pixels = project(camera, face.point(plane))
     if not np.isfinite(pixels).all():
-        raise InputError(f"camera {camera.name}: {target.name} is not in front of it; turn it")
+        raise InputError(
+            f"camera {camera.name}: {target.name} is not in front of it; turn the camera"
+        )
     turned = max(camera.deviation, _TURNED) ** 2 * np.tile(np.eye(2), (len(plane), len(plane)))
     return fit_view(
         face, plane, pixels, turned + _FITTED**2 * np.eye(2 * len(plane)), camera, lens_known=True
@@ -288,12 +290,12 @@ def _apply(H: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _scales(face: Face) -> FloatArray:
-    """Return divisors that bring plane coordinates to order one."""
+    """Return divisors that scale plane coordinates to order one."""
     return np.array([1.0, 1.0, 0.0]) * 0.5 * float(np.ptp(face.span, axis=0).max()) + [0, 0, 1]
 
 
 def _numbers(face: Face, H: FloatArray, lens: Camera) -> FloatArray:
-    """Return the nine unknowns: H of scaled coordinates with its last number 1, and k1."""
+    """Return the nine unknowns: H of scaled coordinates, its last element set to 1, and k1."""
     scaled = (H / H[2, 2]) * _scales(face)
     return np.append(scaled.ravel()[:8], lens.distortion[0])
 
@@ -306,7 +308,7 @@ def _unpack(face: Face, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _predict(face: Face, lens: Camera, numbers: FloatArray, plane: FloatArray) -> FloatArray:
-    """Return pixels (..., N, 2) of places (N, 2) for unknowns (..., 9)."""
+    """Return pixels (..., N, 2) of positions (N, 2) for unknowns (..., 9)."""
     H, k1 = _unpack(face, numbers)
     homogeneous = np.column_stack([plane, np.ones(len(plane))])
     image = homogeneous @ np.swapaxes(H, -1, -2)
