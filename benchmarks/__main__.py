@@ -19,8 +19,8 @@ NAMES = (
     "tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames", "clusters",
     "control", "plant", "airborne", "console", "day", "learning", "signing",
     "splits", "coded", "production", "commission", "drifting", "obstruction", "floor",
-    "prototype", "heliopoint", "spots", "first_run", "flux",
-    "aiming", "clouds",
+    "prototype", "heliopoint", "spots", "first_run", "flux", "flux_rays",
+    "aiming",
 )  # fmt: skip
 #: Width of a table that goes to a file or a pipe, characters.
 WIDTH = 180

@@ -10,8 +10,10 @@ from scipy.ndimage import gaussian_filter
 
 from heliotrope.errors import InputError
 from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.mesh import cavity_wall
 from heliotrope.field.mirror_surface import MirrorSurface
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver
 from heliotrope.field.tower import Tower
 from heliotrope.geometry import bisector, direction, normalize
 from heliotrope.mechanism.kinds import azimuth_elevation
@@ -19,7 +21,7 @@ from heliotrope.optics import FieldFlux, SunShape
 from heliotrope.optics.plant_scene import scene_of
 from heliotrope.optics.rays import trace
 from heliotrope.optics.scene import FacetTable, Mirrors, Scene
-from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate
+from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, surface_of
 from heliotrope.sun import Site
 from support import dunhuang
 
@@ -213,3 +215,17 @@ def test_a_map_of_slopes_gives_the_image_of_its_rays() -> None:
     other = scene_of(Plant("p", site, {"g": plain}), SUN, MIDDLE, receivers=(fine,))
     apart = np.sqrt(np.mean((FieldFlux(other, air="none").maps[0] - traced.flux[0]) ** 2))
     assert apart / traced.flux[0].max() > 0.05
+
+
+def test_the_power_of_a_cavity_is_what_passes_its_aperture() -> None:
+    """Whether or not the wall behind it catches it, as the engine counts it."""
+    receiver = Receiver(
+        "cavity", "cavity", MIDDLE, NORTH, 4.0, 4.0, mesh=cavity_wall(3.0, 2.5, 3.0)
+    )
+    given = scene([[0.0, 120.0, 0.0], [9.0, 120.0, 0.0]], surface_of(receiver))
+    traced, found = trace(given, 2e5, air="none"), FieldFlux(given, air="none")
+    assert traced.power[0] == pytest.approx(found.powers[0], rel=4e-3)
+    area = given.surfaces[0].cells.area
+    caught = traced.flux[0] @ area
+    assert 0.2 * traced.power[0] < caught < 0.8 * traced.power[0]
+    assert found.maps[0] @ area == pytest.approx(caught, rel=0.02)

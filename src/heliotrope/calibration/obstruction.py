@@ -188,5 +188,4 @@ def _facets(heliostats: Heliostats, i: int, focal: float) -> Facets:
     known = heliostats.facets
     if known is None:
         return equal_facets(float(heliostats.width[i]), float(heliostats.height[i]), (2, 2), focal)
-    row = slice(i, i + 1)
-    return Facets(known.center[row], known.half_width[row], known.half_height[row])
+    return known.take(np.array([i]))

@@ -168,7 +168,8 @@ class _Tracer:
         shaded, blocked
             (R,).
         surface, cell
-            What it meets if it is not blocked; −1: nothing, (R,).
+            What it meets if it is not blocked; −1: nothing, (R,). A ray that passes the aperture
+            of a cavity meets the cavity, whether or not it then meets a cell.
         """
         m, k, rng, count = self.scene.mirrors, self.mirror[rows], self.rng, len(rows)
         place = (2.0 * rng.random((count, 2)) - 1.0) * self.half[rows]
@@ -209,24 +210,27 @@ class _Tracer:
         surface = np.full(len(point), -1)
         cell, nearest = np.full(len(point), -1), np.full(len(point), np.inf)
         for j, each in enumerate(self.scene.surfaces):
-            where, distance = self._cell(each, point, ray)
-            first = (where >= 0) & (distance < nearest)
+            where, distance, hit = self._cell(each, point, ray)
+            first = hit & (distance < nearest)
             surface[first], cell[first], nearest[first] = j, where[first], distance[first]
         return surface, cell, nearest
 
-    def _cell(self, surface: Surface, point: FloatArray, ray: FloatArray) -> tuple[Any, FloatArray]:
-        """Return the cell that each ray meets from its lit side, or −1, and how far it is."""
-        if isinstance(surface, Plate):
-            return _on_plate(surface, point, ray)
-        if isinstance(surface, Cylinder):
-            return _on_cylinder(surface, point, ray)
+    def _cell(
+        self, surface: Surface, point: FloatArray, ray: FloatArray
+    ) -> tuple[Any, FloatArray, Any]:
+        """Return the cell that each ray meets from its lit side, or −1, how far, and if it hits."""
+        if isinstance(surface, Plate | Cylinder):
+            on = _on_plate if isinstance(surface, Plate) else _on_cylinder
+            cell, distance = on(surface, point, ray)  # type: ignore[arg-type]
+            return cell, distance, cell >= 0
         inner = surface if isinstance(surface, Mesh) else surface.inner
         found = self.meshes[id(inner)].run(_single(point - self.origin), _single(ray), output=True)
         cell, distance = found["primID"], as_float(found["tfar"])
-        front = _dot(inner.cells.normal[cell], ray) < 0.0
-        if isinstance(surface, Cavity):
-            front &= _on_plate(surface.aperture, point, ray)[0] >= 0
-        return np.where((cell >= 0) & front, cell, -1), distance
+        front = (cell >= 0) & (_dot(inner.cells.normal[cell], ray) < 0.0)
+        if isinstance(surface, Mesh):
+            return np.where(front, cell, -1), distance, front
+        seen, before = _on_plate(surface.aperture, point, ray)
+        return np.where(front & (seen >= 0), cell, -1), before, seen >= 0
 
 
 def _on_plate(plate: Plate, point: FloatArray, ray: FloatArray) -> tuple[Any, FloatArray]:
@@ -269,6 +273,7 @@ class _Tally:
         self.scene, self.unit = scene, unit
         self.sums = np.zeros((5, len(scene.mirrors)))
         self.cells = [np.zeros((2, len(s.cells.area))) for s in scene.surfaces]
+        self.caught = np.zeros((len(scene.surfaces), 2))
 
     def add(
         self, mirror: Any, weight: FloatArray, shaded: Any, blocked: Any, surface: Any, cell: Any
@@ -279,21 +284,25 @@ class _Tally:
             self.sums[row] += np.bincount(mirror, share, minlength=self.sums.shape[1])
         for j, sums in enumerate(self.cells):
             here = lit & (surface == j)
+            on = here & (cell >= 0)
             for row in (0, 1):
-                got = weight[here] ** (row + 1)
-                sums[row] += np.bincount(cell[here], got, minlength=sums.shape[1])
+                self.caught[j, row] += float((weight[here] ** (row + 1)).sum())
+                got = weight[on] ** (row + 1)
+                sums[row] += np.bincount(cell[on], got, minlength=sums.shape[1])
 
     def result(self) -> RayTrace:
         count, unshaded, unblocked, lit, caught = self.sums
         flux, error, power, spread = [], [], [], []
-        for surface, (first, second) in zip(self.scene.surfaces, self.cells, strict=True):
+        for surface, (first, second), whole in zip(
+            self.scene.surfaces, self.cells, self.caught, strict=True
+        ):
             cells = surface.cells
             flux.append((self.unit * first / cells.area).reshape(cells.shape))
             error.append((self.unit * np.sqrt(second) / cells.area).reshape(cells.shape))
-            power.append(self.unit * first.sum())
+            power.append(self.unit * whole[0])
             # Of all rays a share lands: the error is that of a binomial distribution.
-            share = first.sum() / max(count.sum(), 1.0)
-            spread.append(self.unit * np.sqrt(second.sum() * max(1.0 - share, 0.0)))
+            share = whole[0] / max(count.sum(), 1.0)
+            spread.append(self.unit * np.sqrt(whole[1] * max(1.0 - share, 0.0)))
         with np.errstate(invalid="ignore", divide="ignore"):
             return RayTrace(
                 tuple(flux),
