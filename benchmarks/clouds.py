@@ -3,8 +3,8 @@
 The whole program runs in virtual time: plant, clusters and true mirrors, which stand as designed.
 The irradiance is that of 18 October 2018 at Tucson, Arizona, minute by minute (measured_day.csv):
 the station UAT of NREL's MIDC, from `midc_raw_20181018.txt`, which pvlib's wheels contained up to
-0.10 and the present ones do not. That day has one thin cloud, 16:49 to 16:54. The clouds of `CLOUDS` are ours:
-each covers the whole field at once.
+0.10 and the present ones do not. That day has one thin cloud, 16:49 to 16:54. The clouds of
+`CLOUDS` are ours: each covers the whole field at once.
 
 Printed for each case: the greatest true flux over the limit, the share of the steady power 60 s
 after the sun is back, and how much is kept of the energy that a field loses which goes to standby
@@ -82,6 +82,7 @@ class Sky:
         self.lie = 1.0
 
     def minutes(self) -> float:
+        """Return the time since the start."""
         return (self._clock.monotonic() - self._begun) / 60.0
 
     def clear(self, minutes: float) -> float:
@@ -90,11 +91,13 @@ class Sky:
         return float(np.interp(60 * at.hour + at.minute + at.second / 60, self._minute, self._dni))
 
     def dni(self) -> float:
+        """Return the irradiance now, W/m²."""
         now = self.minutes()
         shares = [share for begin, end, share in CLOUDS if begin <= now < end]
         return self.clear(now) * min(shares, default=1.0)
 
     async def news(self) -> Readings:
+        """Yield both readings each second."""
         now = self._clock.monotonic()
         if now - self._read < 1.0:
             return Readings()
@@ -147,7 +150,9 @@ async def live_through(count: int, minutes: float, case: str) -> tuple[Seen, flo
     """Return what was seen, the limit, and the greatest flux of a cell, W/m²."""
     clock = VirtualClock(asyncio.get_running_loop().time, BEGIN)
     design, limit = design_of(count)
-    world = World(design, clock, WorldOptions(rendered=False, installed=lambda mechanism: mechanism))
+    world = World(
+        design, clock, WorldOptions(rendered=False, installed=lambda mechanism: mechanism)
+    )
     sky, seen = Sky(clock), Seen()
     # A lost cluster must not make automatic control wait for a person.
     work = AutomaticSettings(
@@ -243,4 +248,3 @@ def run(quick: bool, heliostats: int = 300, minutes: float = 50.0) -> Result:
         for row in rows
     )
     return Result(rows, headline, within_budget=None if quick else good)
-

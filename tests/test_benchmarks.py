@@ -118,8 +118,8 @@ COLUMNS = {
 }  # fmt: skip
 #: A browser with fifty viewers, plants, days and many pictures take their time.
 SLOW = {
-    "clouds", "coded", "commission", "console", "control", "day", "drifting", "first_run", "flux", "imaging",
-    "obstruction", "production", "prototype", "spots",
+    "clouds", "coded", "commission", "console", "control", "day", "drifting", "first_run", "flux",
+    "imaging", "obstruction", "production", "prototype", "spots",
 }  # fmt: skip
 RESULT = {
     "name", "headline", "within_budget", "quick", "seconds", "others_cores", "machine", "rows",

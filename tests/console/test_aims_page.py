@@ -36,9 +36,7 @@ def limited(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @NEEDS_BROWSER
-def test_the_page_shows_limit_flux_and_who_moved(
-    limited: None, enter: Callable[..., Any]
-) -> None:
+def test_the_page_shows_limit_flux_and_who_moved(limited: None, enter: Callable[..., Any]) -> None:
     page = enter("viewer", viewport={"width": 820, "height": 900})
     page.click(".hx-tabs >> text=Plant")
     page.get_by_text("Flux limit", exact=True).wait_for()
