@@ -43,6 +43,7 @@ from heliotrope.plant.io.sensors import Readings
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.safety import FLUX_READING
 from heliotrope.sun import Site
+from heliotrope.twin.field import Field
 from heliotrope.twin.live import CYCLE, World, WorldOptions
 
 DAY = Path(__file__).parent / "measured_day.csv"
@@ -171,6 +172,7 @@ async def live_through(count: int, minutes: float, case: str) -> tuple[Seen, flo
             if case.startswith("sensor") and now >= first[0]:
                 sky.lie = 5.0 if case == "sensor too high" else 0.2
             if case == "a cluster is lost" and now >= second[0] and lost.any():
+                assert isinstance(world.field, Field)
                 world.field.cut(np.flatnonzero(lost))
                 lost[:] = False
             engine = FieldFlux(true_scene(live, world))
@@ -216,7 +218,12 @@ def judged(seen: Seen, minutes: float) -> dict[str, float]:
 
 def run(quick: bool, heliostats: int = 300, minutes: float = 50.0) -> Result:
     """Live through the clouds; see the module's docstring."""
-    cases = ("as it should be", "a cluster is lost", "sensor too high", "sensor too low")
+    cases: tuple[str, ...] = (
+        "as it should be",
+        "a cluster is lost",
+        "sensor too high",
+        "sensor too low",
+    )
     if quick:
         heliostats, minutes, cases = 12, 16.0, cases[:1]
     rows: list[Row] = []
