@@ -57,7 +57,8 @@ class Beyond:
     ----------
     factor
         Ratio of the measured flux to the predicted one in the cells where it is above the limit,
-        1 elsewhere, in the order of the limit's cells, (rows, columns).
+        1 elsewhere, in the order of the limit's cells, (rows, columns); of a measured mean the same
+        in all cells.
     excess
         Greatest ratio of the measured flux to the limit, less 1.
     """
@@ -179,7 +180,11 @@ class FluxCheck:
         hot = (seen > allowed) & (ratio > 1.0) & (ratio <= TRUST)
         if not hot.any():
             return None
-        return Beyond(as_float(np.where(hot, ratio, 1.0)), float((seen / allowed)[hot].max()) - 1.0)
+        # A mean does not say which cells are too hot.
+        factor = (
+            np.where(hot, ratio, 1.0) if measured.ndim else np.full(hot.shape, ratio[hot].max())
+        )
+        return Beyond(as_float(factor), float((seen / allowed)[hot].max()) - 1.0)
 
     async def look(self) -> None:
         """Compare, and raise or end the alarm.
