@@ -58,9 +58,9 @@ class JudgedFit:
     fitted
         Fit of batch shape (1,).
     nominal
-        The mechanism from which it starts, batch shape (1,).
+        The mechanism from which the fit starts, batch shape (1,).
     sightings
-        The sightings, photographs first, without the errors that flights share.
+        The sightings, photographs first; the estimated shared errors of the flights are removed.
     before, after
         Beam errors under the present and the fitted mechanism, weighted by the sightings, rad RMS.
         A fit that follows the drift need not explain the past; only the last day's photographs

@@ -204,7 +204,7 @@ class Damage:
             _strangers(pod, pod.boards.index(board), fault)
 
     def _exchanges(self, fault: Fault, now: float) -> None:
-        """Put a spare board in, which was another mirror's and was at stow there."""
+        """Fit a spare board that was last used at stow on another heliostat."""
         of, target = self._of, fault.target
         board, pod = of.boards[target], of.pod_of(fault)
         if target in self._own:
