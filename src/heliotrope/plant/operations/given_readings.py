@@ -44,7 +44,9 @@ class GivenReadings:
 
         Parameters
         ----------
-        person User whose program supplies the reading. name
+        person
+            User whose program supplies the reading.
+        name
             Reading of the safety table.
         value
             Value in the unit of its row.

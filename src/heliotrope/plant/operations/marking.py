@@ -196,7 +196,8 @@ class Marking:
                 text = "corners marked earlier are ignored because the plant file has changed since"
                 self._log.event("calibration", target.name, text)
                 continue
-            # Other pictures lie next to the plant's own file, and the cameras already have them.
+            # Pictures of other marks are next to the plant's own file, and the cameras already have
+            # them.
             here = [m for m in target.marks if m.code and (file.parent / m.code).is_file()]
             pictures = read_pictures(file.parent, [replace(target, marks=tuple(here))])
             new = kept.camera(camera.name)
