@@ -12,7 +12,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import BusFrame
 
-#: Longest wait for a recording, s, which takes five seconds and is sent in the sixth.
+#: Longest wait for a recording, s, which takes five seconds and is sent within another second.
 PATIENCE = 20.0
 _HEAD = struct.calcsize(BUS_ENTRY)
 

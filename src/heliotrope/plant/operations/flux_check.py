@@ -35,8 +35,8 @@ from heliotrope.plant.operations.views import PredictedView
 from heliotrope.safety import FLUX_READING, alarms
 from heliotrope.safety.proof import FLUX_AGE
 
-#: Standard deviation of the predicted flux as a whole, relative, and of a cell, relative to the
-#: peak.
+#: Standard deviation of the whole predicted flux, as a fraction, and of a cell, as a fraction of
+#: the peak.
 SCALE, SHAPE = 0.10, 0.05
 #: Standard deviation of a measurement: of its value, and of the nominal flux.
 READ, FLOOR = 0.02, 0.005

@@ -30,8 +30,8 @@ Pointing = Callable[[Person, int, Mapping[str, FloatArray]], Ticket]
 _ORDER, _HOME = 60.0, 120.0
 #: A goal that has just moved with the sun leaves an axis at most this far from it, rad.
 _STEP = 1e-3
-#: When all but this fraction are at their aims, the others are allowed the same time again plus
-#: this time, s.
+#: When all but this fraction of heliostats are at their aims, the others are allowed as long again
+#: plus this time, s.
 _FEW, _LATE = 0.1, 10.0
 #: Interval between checks of the field, s.
 _LOOK = 0.25
