@@ -520,7 +520,7 @@ REFUSED: list[tuple[list[str], str]] = [
     (["--campaign", "--worth", "2"], "--worth '2': give a number from 0 to 1"),
     (["--picture", "a.bmp"], "use one of .png"),
     (["--csv", "nowhere/x.csv"], "there is no folder nowhere"),
-    (["--sightings", "no.csv"], "there is no such file"),
+    (["--sightings", "no.csv"], "no such file"),
     (["--sigma-mrad", "nan"], "--sigma-mrad 'nan': give a number from 0.001"),
     (["--from", "2026-09-02T20:00Z", "--to", "2026-09-02T22:00Z"], "no measurement is possible"),
     (

@@ -489,7 +489,7 @@ def test_an_unusable_table_is_refused(old: str, new: str, says: str, tmp_path: P
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("s.csv", None, "there is no such file; give the path of a table of sightings"),
+        ("s.csv", None, "no such file; give the path of a table of sightings"),
         ("s.csv", b"", "the file is empty"),
         ("s.csv", b"\n\n \n", "the file has no rows"),
         ("s.csv", b"\x7fELF\0\0", "the file is binary"),
@@ -500,7 +500,7 @@ def test_an_unusable_table_is_refused(old: str, new: str, says: str, tmp_path: P
             "there is no column heliostat; add it. There are Jülich",
         ),
         ("s.txt", b"x", "the name ends in '.txt'; sightings are .csv or .parquet"),
-        ("s.parquet", None, "there is no such file"),
+        ("s.parquet", None, "no such file"),
         ("s.parquet", b"", "the file is empty"),
         ("s.parquet", b"PAR1" + bytes(200), "not a Parquet table"),
     ],

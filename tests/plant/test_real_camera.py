@@ -193,7 +193,7 @@ def test_a_time_that_is_too_unsure_is_a_reason(plant: Plant, frame: Frame) -> No
     [
         ("", "does not say where its frames come from; add source"),
         ("night.avi", "is a recording; specify a source of live frames"),
-        ("nowhere", "there is no such file"),
+        ("nowhere", "no such file"),
         ("ftp://a/b", "not over ftp"),
     ],
 )
