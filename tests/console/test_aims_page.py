@@ -81,8 +81,10 @@ def test_ctl_prints_what_the_page_shows(limited: None, ctl: Callable[..., str]) 
         "aims by last good aims",
         "limit 570 kW/m², flux including errors up to 551 kW/m², 3.3 % left, 17 cells at the limit",
         "161 kW of 166 kW",
-        "5 heliostats have an aim, 1 are off the receiver because of the limit, 2 still have to "
-        "move",
+        (
+            "5 heliostats have an aim, 1 are off the receiver because of the limit, "
+            "2 still have to move"
+        ),
         "2 moved 12 s ago: P0001A, P0002A",
     ]
     told = json.loads(ctl("--json"))
