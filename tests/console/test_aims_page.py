@@ -78,7 +78,7 @@ def test_ctl_prints_what_the_page_shows(limited: None, ctl: Callable[..., str]) 
     lines = ctl().splitlines()
     assert lines == [
         "no answer within 60 s",
-        "aims by last good aims",
+        "source of the aims: last good aims",
         "limit 570 kW/m², flux including errors up to 551 kW/m², 3.3 % left, 17 cells at the limit",
         "161 kW of 166 kW",
         (
