@@ -13,7 +13,7 @@ const canCommand = () => me.role !== "viewer";
 const severe = { emergency: "bad", alarm: "bad", warning: "warn", fault: "bad" };
 
 // Names, units, their number in one of the reading's, and digits.
-const SENSORS = { dni: [word("Direct sunlight"), "W/m²", 1, 0], receiver_flux_nominal: [word("Flux on the receiver, of the full field's"), "%", 100, 0],
+const SENSORS = { dni: [word("Direct sunlight"), "W/m²", 1, 0], receiver_flux_nominal: [word("Flux on the receiver (share of the full field's)"), "%", 100, 0],
   wind_gust: [word("Wind gust (3 s)"), "m/s", 1, 1], wind_mean: [word("Mean wind (10 min)"), "m/s", 1, 1], temperature: [word("Air"), "°C", 1, 0] };
 
 export function plant(box) {
@@ -36,7 +36,7 @@ export function plant(box) {
     })), facts([[t("Clusters heard"), t("{n} of {all}", { n: count(head.clusters_alive), all: count(store.field.clusters.length) })],
       [t("Waiting to join the receiver"), count(head.waiting)],
       [t("Calibrated"), t("{n} of {all}", { n: count(head.calibration.done), all: count(most) })],
-      [t("Median error"), `${mrad(head.calibration.quality?.median)} mrad`]]));
+      [t("Median error"), head.calibration.quality ? `${mrad(head.calibration.quality.median)} mrad` : "–"]]));
     light.replaceChildren(facts([[t("Azimuth"), `${degrees(head.sun.azimuth, 1)}°`], [t("Elevation"), `${degrees(head.sun.elevation, 1)}°`],
       [t("Shadow of the tower"), head.sun.elevation > 0.02 ? t("{length} m to {azimuth}°", { length: number(store.field.tower[2] / Math.tan(head.sun.elevation), 0), azimuth: degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0) }) : t("none: the sun is down")]]));
     const readings = Object.entries(head.readings);
@@ -332,7 +332,7 @@ export function calibration(box) {
         truth ? [key(t("true (twin), median"), colourOf("SEARCHING")), key(t("90th percentile"), colourOf("SEARCHING"), true)] : ""),
       h("h3", {}, t("Error of all heliostats over the year (mrad), UTC")), outlookView(view, ahead, key),
       h("h3", {}, t("Last measurements")),
-      table([[t("Time"), (r) => clock(r.at)], [t("Heliostat"), (r) => r.heliostat], [t("Target"), (r) => r.target, "more"],
+      !view.results.length ? h("p", { className: "hx-hint" }, t("None yet.")) : table([[t("Time"), (r) => clock(r.at)], [t("Heliostat"), (r) => r.heliostat], [t("Target"), (r) => r.target, "more"],
         [t("Before"), (r) => mrad(r.before), "num"], [t("After"), (r) => mrad(r.after), "num"], [t("Predicted"), (r) => mrad(r.predicted), "num"],
         ...(truth ? [[t("True before → after"), (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"]] : []),
         ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
@@ -354,10 +354,11 @@ export function clusters(box) {
     const rank = (r) => (r.alive ? (r.live < r.heliostats ? 1 : 2) : 0);
     rows.sort((a, b) => rank(a) - rank(b) || a.name.localeCompare(b.name));
     body.replaceChildren(facts([[t("Heard"), t("{n} of {all}", { n: count(rows.filter((r) => r.alive).length), all: count(rows.length) })]]),
-      table([[t("Cluster"), (r) => r.name], ["", (r) => h("span", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? t("● healthy") : t("▲ degraded")) : t("✕ silent"))],
+      table([[t("Cluster"), (r) => [h("b", {}, r.name), h("div", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? t("● healthy") : t("▲ degraded")) : t("✕ silent")),
+        h("div", { className: "hx-hint" }, [r.acts.join(", "), r.problem].filter(Boolean).join("; "))]],
         [t("Heliostats"), (r) => `${r.live}/${r.heliostats}`, "num"], [t("Heard"), (r) => (r.age === null ? t("never") : `${number(r.age, 1)} s`), "num"],
         [t("Poll (ms)"), (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "num"], [t("Answered"), (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
-        [t("Lease (s)"), (r) => number(r.lease_left, 1), "num"], [t("Clock"), (r) => r.time_quality], [t("Settings"), (r) => r.settings || t("not known")], ["", (r) => [r.acts.join(", "), r.problem].filter(Boolean).join("; ")]],
+        [t("Lease (s)"), (r) => number(r.lease_left, 1), "num"], [t("Clock"), (r) => r.time_quality], [t("Settings"), (r) => r.settings || t("not known")]],
       rows, (r) => { const place = store.field.clusters.indexOf(r.name); store.select(store.field.cluster.flatMap((c, row) => (c === place ? [row] : [])), -1); }));
   }, { every: 3 });
 }
@@ -388,7 +389,7 @@ export function alarms(box) {
     body.replaceChildren(h("div", { className: "hx-row" }, h("b", {}, t("{open} not acknowledged, {active} active", { open: count(open.length), active: count(rows.filter((r) => r.active).length) })),
       canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(open), t("acknowledge all")) }, t("Acknowledge all")) : ""),
     rows.length ? table([["", (r) => h("span", { className: r.active ? (severe[r.severity] ?? "warn") : "" }, r.active ? (severe[r.severity] === "bad" ? "✕" : "▲") : "○")],
-      [t("Time"), (r) => clock(r.at)], [t("What"), (r) => h("div", {}, h("b", {}, r.condition, r.subject ? " · " : ""), r.subject ? several(r.rows.map((one) => one.subject), r.like, shown) : "", h("div", { className: "hx-hint" }, r.said))],
+      [t("Time"), (r) => clock(r.at)], [t("What"), (r) => h("div", {}, h("b", {}, r.condition, r.subject ? " · " : ""), r.subject ? several(r.rows.map((one) => one.subject), r.like, shown) : "", h("div", { className: "hx-hint" }, r.said.replace(`${r.condition}: `, "")))],
       ["", (r) => (r.active ? t("active") : t("over"))],
       ["", (r) => (r.acknowledged_by ? `✓ ${r.acknowledged_by}` : canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(r.rows), t("acknowledge")) }, t("Acknowledge")) : t("not acknowledged"))],
       ["×", (r) => r.rows.reduce((sum, one) => sum + one.count, 0), "num"]], alike(rows)) : h("p", { className: "hx-hint" }, t("No alarms.")));

@@ -12,7 +12,7 @@ document.documentElement.classList.toggle("light", localStorage.getItem("heliotr
 const [form, tools] = [document.querySelector("form"), document.querySelector("form + div")], said = document.querySelector("[role=status]");
 const charts = document.querySelector("#charts"), events = document.querySelector("#events"), synced = uPlot.sync("trends");
 // A quantity is a kind of figure, and after a dot what it is of: a receiver, a state, a sensor.
-const named = (quantity) => { const [kind, of] = quantity.replaceAll("_", " ").split(/\.(.*)/); return of ? `${t(kind)}: ${kind === "state" ? t(of) : of}` : t(kind); };
+const named = (quantity) => { const [kind, of] = quantity.replaceAll("_", " ").split(/\.(.*)/), text = of ? `${t(kind)}: ${kind === "state" ? t(of) : of}` : t(kind); return text[0].toUpperCase() + text.slice(1); };
 const titleOf = (key) => { const [name, whose] = key.split("@"); return whose ? `${named(name)}, ${whose}` : named(name); };
 const tell = (text, bad) => { said.textContent = text; said.classList.toggle("bad", Boolean(bad)); };
 const asked = new URLSearchParams(location.search);
@@ -44,11 +44,14 @@ tools.append(button(t("Day"), () => lately(1)), button(t("Week"), () => lately(7
   h("span", { className: "hx-hint" }, t("Drag over a chart to zoom in; the wheel zooms; a double click shows the last day.")));
 
 const COLOURS = { alarm: "--bad", command: "--blue", note: "--good", event: "--soft" };
+// Beneath the lines. Marks that would stand closer than GAP are drawn as one, alarms before others.
+const GAP = 3;
 function drawMarks(plot) {
-  const { ctx, bbox } = plot;
-  for (const one of marks.slice(0, 400)) {
-    const x = plot.valToPos(one.at, "x", true);
-    if (x < bbox.left || x > bbox.left + bbox.width) continue;
+  const { ctx, bbox } = plot, taken = new Set(), alarm = (one) => Number(one.kind === "alarm");
+  for (const one of marks.toSorted((a, b) => alarm(b) - alarm(a))) {
+    const x = plot.valToPos(one.at, "x", true), place = Math.round(x / GAP);
+    if (x < bbox.left || x > bbox.left + bbox.width || taken.has(place)) continue;
+    taken.add(place);
     ctx.strokeStyle = css(COLOURS[one.kind] ?? "--soft"); ctx.lineWidth = 1; ctx.globalAlpha = 0.7;
     ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke(); ctx.globalAlpha = 1;
   }
@@ -63,7 +66,7 @@ function draw(one) {
   const plot = new uPlot({ width: box.clientWidth - 22, height: 200, cursor: { sync: { key: synced.key }, drag: { x: true, y: false, setScale: false } }, tzDate: (at) => uPlot.tzDate(new Date(at * 1e3), "UTC"),
     scales: { x: { min: since, max: until } }, axes: [{ ...axis, values: times }, { ...axis, size: 64, values: (_, splits) => splits.map(plain) }], legend: { live: true },
     series: [{ label: "UTC", value: (_, at) => moment(at) }, { label: t("mean"), value: amount, stroke: blue, width: 1.6, points: { show: few } }, { label: t("low"), value: amount, stroke: "transparent", points: { show: false } }, { label: t("high"), value: amount, stroke: "transparent", points: { show: false } }],
-    bands: [{ series: [3, 2], fill: `${blue}30` }], hooks: { draw: [drawMarks], setSelect: [(made) => { const { left, width } = made.select; if (width > 4) { [since, until] = [made.posToVal(left, "x"), made.posToVal(left + width, "x")]; load(); } }] } },
+    bands: [{ series: [3, 2], fill: `${blue}30` }], hooks: { drawAxes: [drawMarks], setSelect: [(made) => { const { left, width } = made.select; if (width > 4) { [since, until] = [made.posToVal(left, "x"), made.posToVal(left + width, "x")]; load(); } }] } },
   [one.at, one.mean, one.low, one.high], box);
   plot.over.addEventListener("wheel", (event) => { event.preventDefault(); const at = plot.posToVal(event.offsetX, "x"), size = event.deltaY > 0 ? 1.4 : 1 / 1.4; [since, until] = [at - (at - since) * size, at + (until - at) * size]; soon(); }, { passive: false });
   plot.over.addEventListener("dblclick", () => lately(1));
@@ -95,5 +98,6 @@ async function load(days = 1) {
   } catch (error) { if (mine === latest) tell(error.message, true); }
 }
 if (!chosen.length && known.length) chosen = [known.find((one) => one.name.startsWith("power."))?.name ?? known[0].name];
+if (chosen.length) { [quantity.value] = chosen[0].split("@"); mark(); }
 new ResizeObserver(() => { if (charts.clientWidth !== charts.dataset.wide) { charts.dataset.wide = charts.clientWidth; if (shown.length) { charts.replaceChildren(); shown.forEach(draw); } } }).observe(document.body);
 await load();
