@@ -1,6 +1,6 @@
 // Trends of any quantity over days beside their events: drag to zoom, wheel, buttons to move, export.
 import { api } from "./live.js";
-import { clock, h, moment, saveCsv, table } from "./dom.js";
+import { clock, h, moment, saveCsv, several, table } from "./dom.js";
 import { monthDay, plain, t } from "./words.js";
 
 const { uPlot } = window, DAY = 86400, MOST = 6;
@@ -73,6 +73,7 @@ function draw(one) {
   plot.root.setAttribute("role", "img"); plot.root.setAttribute("aria-label", one.title);
 }
 
+const unfolded = new Set();
 let waits = 0;
 const soon = () => { clearTimeout(waits); waits = setTimeout(() => load(), 150); };
 // The last asked for wins: an earlier answer that comes late is left.
@@ -94,7 +95,7 @@ async function load(days = 1) {
     history.replaceState(null, "", `?${new URLSearchParams([...chosen.map((key) => ["q", key]), ["since", since.toFixed(0)], ["until", until.toFixed(0)]])}`);
     charts.replaceChildren(...(chosen.length ? [] : [h("p", { className: "hx-hint" }, t("Choose a quantity and press Add."))]));
     found.forEach(draw);
-    events.replaceChildren(entries.length ? table([[t("Time"), (r) => moment(r.at)], [t("Kind"), (r) => t(r.kind)], [t("What"), (r) => (r.kind === "event" ? t(r.what) : r.what)], ["", (r) => r.text]], entries.slice(0, 100)) : h("p", { className: "hx-hint" }, t("None.")));
+    events.replaceChildren(entries.length ? table([[t("Time"), (r) => moment(r.at)], [t("Kind"), (r) => t(r.kind)], [t("What"), (r) => (r.kind === "event" ? t(r.what) : r.what)], ["", (r) => (r.heliostats.length ? [several(r.heliostats, `${r.at}${r.what}`, unfolded), " ", r.text] : r.text)]], entries.slice(0, 100)) : h("p", { className: "hx-hint" }, t("None.")));
   } catch (error) { if (mine === latest) tell(error.message, true); }
 }
 if (!chosen.length && known.length) chosen = [known.find((one) => one.name.startsWith("power."))?.name ?? known[0].name];
