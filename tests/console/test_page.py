@@ -491,6 +491,12 @@ def test_the_table_draws_only_rows_in_view(enter: Callable[..., Any], width: int
     page.evaluate("document.querySelector('.hx-grid').scrollTop = 1e6")
     until(page, "document.querySelector('.hx-grid-body .hx-grid-row').offsetTop > 1000")
     assert rows.count() < 100
+    # By small steps, up and down, each row is there once, in order.
+    for step in (-90, -50, 60, 30):
+        page.evaluate("step => { document.querySelector('.hx-grid').scrollTop += step; }", step)
+        page.wait_for_timeout(50)
+        tops = rows.evaluate_all("all => all.map((one) => one.offsetTop)")
+        assert tops == list(range(tops[0], tops[0] + 27 * len(tops), 27))
 
 
 def test_the_page_waits_for_a_plant_that_does_not_answer_yet(enter: Callable[[str], Any]) -> None:
