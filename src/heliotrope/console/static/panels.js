@@ -352,8 +352,8 @@ export function clusters(box) {
       table([[t("Cluster"), (r) => [h("b", {}, r.name), h("div", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? t("● healthy") : t("▲ degraded")) : t("✕ silent")),
         h("div", { className: "hx-hint" }, [r.acts.join(", "), r.problem].filter(Boolean).join("; "))]],
         [t("Heliostats"), (r) => `${r.live}/${r.heliostats}`, "num"], [t("Heard"), (r) => (r.age === null ? t("never") : `${number(r.age, 1)} s`), "num"],
-        [t("Poll (ms)"), (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "num most"], [t("Answered"), (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
-        [t("Lease (s)"), (r) => number(r.lease_left, 1), "num most"], [t("Clock"), (r) => r.time_quality], [t("Settings"), (r) => r.settings || t("not known")]],
+        [t("Poll (ms)"), (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "most"], [t("Answered"), (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
+        [t("Lease (s)"), (r) => number(r.lease_left, 1), "most"], [t("Clock"), (r) => r.time_quality], [t("Settings"), (r) => r.settings || t("not known")]],
       rows, (r) => { const place = store.field.clusters.indexOf(r.name); store.select(store.field.cluster.flatMap((c, row) => (c === place ? [row] : [])), -1); }));
   }, { every: 3 });
 }
