@@ -388,7 +388,7 @@ ARGUMENTS: list[tuple[list[str], str]] = [
     (["evaluate", "PAINT", "--prior", "tilt_north"], "write NAME=VALUE"),
     (["evaluate", "PAINT", "--prior", "tilt_north=-1"], "above 0"),
     (["calibrate", "PAINT", "--prior", "lean=0.01"], "lean"),
-    (["evaluate", "PAINT", "--scheduler", "nowhere:1"], "no answer"),
+    (["evaluate", "PAINT", "--scheduler", "nowhere:1"], "no reply"),
     (["evaluate", "PAINT", "--sightings", "NOWHERE"], "sightings are .csv or"),
     (["calibrate", "EMPTY"], "is missing in this folder"),
     (["calibrate", "PAINT", "--model", "malan9"], "there is no model 'malan9'"),
