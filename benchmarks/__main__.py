@@ -19,7 +19,7 @@ NAMES = (
     "tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames", "clusters",
     "control", "plant", "airborne", "console", "day", "learning", "signing",
     "splits", "coded", "production", "commission", "drifting", "obstruction", "floor",
-    "prototype", "heliopoint", "spots", "first_run", "flux", "flux_rays",
+    "prototype", "heliopoint", "spots", "first_run", "flux", "flux_rays", "clouds",
     "aiming",
 )  # fmt: skip
 #: Width of a table that goes to a file or a pipe, characters.

@@ -3,7 +3,8 @@
 The plant (twin, all clusters) is one process and the console another, as under ``heliotrope run``;
 the viewers are a third, Chromium others. All share the machine: with two cores that is the hardest
 part. First the page is alone with the plant: the time until it is ready, and the frames per second
-that it draws while the map is panned. Then all viewers connect, and EMERGENCY is clicked in the
+that it draws while the map is panned and while its table of all heliostats is scrolled, and the
+bytes a second that it receives. Then all viewers connect, and EMERGENCY is clicked in the
 page: the time until the last local controller has heard DEFOCUS on its bus, and until the plant has
 the acknowledgement of each.
 """
@@ -28,12 +29,27 @@ ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
 NAME, PASSWORD = "engineer", "a long enough password"
 VIEWERS, OPERATORS = 50, 5
 READY_S, FRAMES, EMERGENCY_S, MESSAGES = 3.0, 20.0, 1.0, 1.0
+#: Bytes a second that a viewer may receive.
+BYTES = 10_000.0
 #: Pans the map a little in each frame for some milliseconds; returns the frames per second.
 PAN = """span => new Promise(done => { const map = window.heliotropeMap; let frames = 0, begin = 0;
   const turn = now => { begin ||= now;
     if (now - begin >= span) return done(1e3 * frames / (now - begin));
     frames += 1; map.pan(frames % 120 < 60 ? 3 : -3, 1 - 2 * (frames % 2));
     requestAnimationFrame(turn); };
+  requestAnimationFrame(turn); })"""
+#: Scrolls the table a little in each frame for some milliseconds; returns the frames per second,
+#: the median time in which it draws and lays out its rows, ms, and how many rows it holds.
+SCROLL = """span => new Promise(done => { const grid = document.querySelector('.hx-grid');
+  let frames = 0, begin = 0;
+  const draw = (_, k) => { const at = performance.now(); grid.scrollTop = 97 * k;
+    grid.dispatchEvent(new Event('scroll')); grid.getBoundingClientRect();
+    return performance.now() - at; };
+  const turn = now => { begin ||= now;
+    if (now - begin >= span) return done([1e3 * frames / (now - begin),
+      Array.from({ length: 21 }, draw).sort((a, b) => a - b)[10],
+      grid.querySelectorAll('.hx-grid-body > *').length]);
+    frames += 1; grid.scrollTop = 97 * frames % grid.scrollHeight; requestAnimationFrame(turn); };
   requestAnimationFrame(turn); })"""
 #: Requests of the page's tabs besides the stream, and their intervals, s; one tab is open.
 ASKED = {"receivers/receiver/flux": 10.0, "clusters": 3.0, "calibration": 3.0, "alarms": 4.0}
@@ -286,12 +302,38 @@ def _page(playwright: Any, address: str, span: float) -> tuple[Any, Row]:
             page.wait_for_timeout(50)
         ready.append(page.evaluate(marks) / 1e3)
     frames = page.evaluate(PAN, 1e3 * span)
+    page.click("[data-tab=heliostats]")
+    page.wait_for_selector(".hx-grid-body > *")
+    scrolled, row_ms, rows = page.evaluate(SCROLL, 1e3 * span)
+    page.click("[data-tab=plant]")
+    stream, answers = _received(page, 2.0 * span)
     row: Row = {
         "page_first_ready_s": ready[0],
         "page_ready_s": float(np.median(ready[1:])),
         "frames_panning": frames,
+        "frames_scrolling_table": scrolled,
+        "table_draw_ms": row_ms,
+        "table_rows_drawn": rows,
+        "stream_bytes_a_second": stream,
+        "answer_bytes_a_second": answers,
     }
     return page, row
+
+
+def _received(page: Any, span: float) -> tuple[float, float]:
+    """Return the bytes a second of the page's stream, and of the answers to its requests."""
+    session = page.context.new_cdp_session(page)
+    session.send("Network.enable")
+    stream: list[int] = []
+    answers: list[float] = []
+    session.on(  # a binary message is given as base64
+        "Network.webSocketFrameReceived",
+        lambda event: stream.append(3 * len(event["response"]["payloadData"]) // 4),
+    )
+    session.on("Network.loadingFinished", lambda event: answers.append(event["encodedDataLength"]))
+    page.wait_for_timeout(1e3 * span)
+    session.detach()
+    return sum(stream) / span, sum(answers) / span
 
 
 def _load(plant: Connection, people: Connection, page: Any, span: float) -> Row:
@@ -361,6 +403,10 @@ def run(quick: bool) -> Result:
         "frames": FRAMES / float(row["frames_panning"] or 1e-9),
         "messages": MESSAGES / float(row["messages_a_second_least"] or 1e-9),
         "emergency_heard": float(row["emergency_heard_s"] or 0.0) / EMERGENCY_S,
+        "bytes": (
+            float(row["stream_bytes_a_second"] or 0.0) + float(row["answer_bytes_a_second"] or 0.0)
+        )
+        / BYTES,
     }
     row |= {f"of_limit_{name}": share for name, share in shares.items()}
     return Result(
@@ -374,6 +420,7 @@ def run(quick: bool) -> Result:
             "limit_frames": FRAMES,
             "limit_messages": MESSAGES,
             "limit_emergency_s": EMERGENCY_S,
+            "limit_bytes_a_second": BYTES,
         },
         None if quick else all(share <= 1.05 for share in shares.values()),
     )

@@ -92,7 +92,6 @@ def run(quick: bool) -> Result:
             sun = direction(np.radians(noon + away), np.radians(elevation))
             row = compare(plant, light, sun, FEW if quick else RAYS)
             rows.append({"field": name, "elevation_deg": elevation, **row})
-            print(rows[-1], flush=True)
     power = max(abs(float(row["power_percent"] or 0.0)) for row in rows)
     cells = max(float(row["cells_percent"] or 0.0) for row in rows)
     kept = all(_kept(row) for row in rows)

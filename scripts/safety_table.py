@@ -23,17 +23,17 @@ heliostat's maker and the receiver limits by those of the receiver's maker, in t
 
 ## Rules for every row
 
-- A reading that is missing, not a number, or from the future does not count. The last good
-  reading counts until it is older than *stale after*; from then on the worst case counts. An age
-  or a silence grows by itself.
+- A reading that is missing, not a number, or from the future does not count. The last good reading
+  counts until it is older than *stale after*; from then on the worst case counts. A row on an age
+  or on silence keeps counting without new readings.
 - A row trips when its value has been at the limit or beyond it for the *delay*. It releases when
-  fresh readings have been on the safe side of the release limit for the time given. Between the
-  two limits it stays as it is. A stream of readings that stands still releases nothing.
+  fresh readings have been on the safe side of the release limit for the time given. Between the two
+  limits it stays as it is. If readings stop arriving, nothing is released.
 - A row that *latches* stays until its cause has gone and a person with the given role, or a
   higher one, acknowledges it. An acknowledgement before that is refused.
-- The strongest action wins, in the order of the list below. DEFOCUS and STOW pre-empt every
-  motion. The release of a row moves no heliostat: returning to the receiver needs a fresh command
-  under the command authority.
+- The strongest action wins, in the order of the list below. DEFOCUS and STOW pre-empt every motion.
+  Releasing a row does not move any heliostat: returning to the receiver needs a fresh command under
+  the command authority.
 - The *budget* runs from the fault to the finished action and includes the detection.
 """
 

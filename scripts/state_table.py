@@ -130,7 +130,9 @@ def _generated() -> str:
     parts.append("### Motions\n")
     rows = [f"| {name} | {text} |" for name, text in names.MOTIONS.items()]
     parts.append("\n".join(["| motion | meaning |", "|---|---|", *rows]))
-    parts.append("### All transitions\n\nWhat is not here is refused, and changes nothing.\n")
+    parts.append(
+        "### All transitions\n\nAny event not listed here is refused and changes nothing.\n"
+    )
     parts.append(table())
     parts.append("### Bits of the flags, and faults, in STATUS\n")
     rows = [f"| {i} | {name} |" for i, name in enumerate(names.FLAGS)]

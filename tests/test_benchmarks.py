@@ -105,6 +105,10 @@ COLUMNS = {
         "field", "mirrors", "figure", "sun_deg", "cold_ms", "limit_ms", "moved_ms",
         "moved_limit_ms", "cold_processor_ms", "grown_mb",
     },
+    "flux_rays": {
+        "field", "elevation_deg", "power_mw", "power_percent", "power_noise_percent",
+        "efficiency_percent", "cells_percent", "cells_noise_percent", "seconds", "rays_seconds",
+    },
     "aiming": {
         "field", "mirrors", "limit_of_peak", "cold_s", "cold_processor_s", "gap_percent",
         "excess_percent", "warm_s", "warm_processor_s", "warm_gap_percent", "power_mw",

@@ -212,7 +212,7 @@ def test_a_mechanism_has_a_slider_of_time() -> None:
         (lambda ax: plot.day(TIMES, np.zeros(3), ax=ax), "tracked: a numpy ndarray"),
         (lambda ax: plot.day(TIMES, ax=ax), "give a day of track_day alone"),
         (lambda ax: plot.residuals([1.0], np.zeros((2, 2)), ax=ax), r"x: shape \(1,\) for 2"),
-        (lambda ax: plot.residuals([1.0], [1.0], ax=ax), r"beam: shape \(1,\); give right and up"),
+        (lambda ax: plot.residuals([1.0], [1.0], ax=ax), r"beam: got the shape \(1,\); expected"),
         (lambda ax: plot.ellipses(np.zeros((3, 2)), np.eye(3), ax=ax), r"covariance: shape \(3"),
         (
             lambda ax: plot.ellipses(

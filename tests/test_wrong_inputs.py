@@ -207,7 +207,7 @@ TRACKING = [
 
 SIGHTINGS = [
     Wrong(lambda: row(heliostat=-1), "heliostat", "-1", "use integers from 0"),
-    Wrong(lambda: row(heliostat=0.5), "heliostat", "0.5", "whole numbers"),
+    Wrong(lambda: row(heliostat=0.5), "heliostat", "0.5", "integers"),
     Wrong(lambda: row(heliostat=[0, 0]), "heliostat", "(2,)", "(3,)"),
     Wrong(lambda: row(counts=np.zeros((2, 3, 2)), source=np.ones((4, 3))), "source", "(4, 3)", "(2, 3, 3)"),
     Wrong(lambda: row(counts=[(0.0, NAN)]), "counts", "nan", "leave the row out"),
@@ -272,7 +272,7 @@ FIELD = [
     Wrong(lambda: ht.open(Path("nowhere.toml")), "nowhere.toml", "no such file", "", FormatError),
     Wrong(lambda: Sphere("tower", ORIGIN, 0.0), "radius", "0.0 m", "above 0"),
     Wrong(lambda: Box("hall", ORIGIN, (1.0, 1.0)), "size", "(2,)", "3 numbers"),
-    Wrong(lambda: Cylinder("mast", ORIGIN, ORIGIN, 1.0), "mast", "coincide", "two points"),
+    Wrong(lambda: Cylinder("mast", ORIGIN, ORIGIN, 1.0), "mast", "coincide", "two different points"),
     Wrong(lambda: flux(aim=[AIM, AIM]), "aim", "(2, 3)", "expected (3,) or"),
     Wrong(lambda: flux(reflectivity=1.2), "reflectivity", "1.2", "from 0 to 1"),
     Wrong(lambda: flux(sun=(1.0, 0.0)), "sun", "(2,)", "3 numbers"),

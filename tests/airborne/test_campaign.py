@@ -110,7 +110,7 @@ def test_stations_of_a_plan(tmp_path) -> None:
     with pytest.raises(UnknownNameError, match="heliostat"):
         read_stations(path, MIRRORS.names[:5])
     path.write_text(json.dumps({"format": "another"}))
-    with pytest.raises(FormatError, match="'another' is not known"):
+    with pytest.raises(FormatError, match="'another' is unknown"):
         read_stations(path, MIRRORS.names)
 
 
@@ -216,7 +216,7 @@ def test_what_is_wrong_with_a_flight_does_not_stop_the_others(flown: Path, tmp_p
         ("C1-2", "DJI_0003.JPG", "nothing: "),
         ("C1-2", "DJI_0004.JPG", "overexposed: 100 % of the photograph is clipped"),
         ("C1-1", "DJI_0009.JPG", "640 × 300 px, but most photographs have 640 × 480 px"),
-        ("C1-7", "camera.toml", "there is no such file"),
+        ("C1-7", "camera.toml", "no such file"),
         ("away", "DJI_0001.JPG", "wrong_field: no mirror of the field can be in view"),
         ("dark", "no reflection"),
         ("other", "there is no heliostat", "Z9"),

@@ -80,7 +80,7 @@ def _less(root: h5py.File) -> None:
         (_bent, "facet2: a normal points backwards"),
         (_elsewhere, "facet2: 0 of 4000 points lie on facet 1"),
         (_short, "facet1: 4000 points and 3 normals"),
-        (_linked, "facet1 has no surface_points of its own"),
+        (_linked, "facet1 has no dataset surface_points"),
         (_flat, "facet3/surface_points: float64 of shape"),
         (_less, "a map of 3 facets, but the mirror has 4"),
     ],

@@ -164,7 +164,7 @@ def test_false_targets_are_left_out(case: Case) -> None:
 
 
 def test_too_few_photographs_or_targets_are_refused(case: Case) -> None:
-    with pytest.raises(InputError, match="7 photographs show coded targets, 8 are needed"):
+    with pytest.raises(InputError, match="7 photographs show coded targets; 8 are needed"):
         locate(case.photos[:7], case.seen[:7], case.camera)
     few = [
         SeenTargets(s.number[k], s.corners[k], s.sigma[k])

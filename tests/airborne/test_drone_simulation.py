@@ -78,7 +78,7 @@ def test_outline_is_that_of_the_outer_facets() -> None:
 
 
 def test_point_that_cannot_be_looked_at() -> None:
-    with pytest.raises(InputError, match="cannot face"):
+    with pytest.raises(InputError, match="cannot turn to"):
         look_counts(field(), [0.0, 40.0, -500.0])
 
 

@@ -133,7 +133,7 @@ def test_the_file_for_a_plant_splits_what_mirrors_share_from_what_is_their_own(
     [
         ({"format": "heliotrope-plant"}, "format: Input should be 'heliotrope-flight'"),
         ({"rows": []}, "rows: List should have at least 1 item"),
-        ({"covariance": [[1.0, 0.0]]}, "give 1 by 1 values"),
+        ({"covariance": [[1.0, 0.0]]}, "write 1 by 1 values"),
         ({"covariance": [[-1.0]]}, "not symmetric and positive definite"),
     ],
 )

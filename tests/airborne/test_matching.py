@@ -124,7 +124,7 @@ def test_places_that_give_no_attitude_are_refused(case: Case) -> None:
         return lines[0]
 
     one = ("DJI_0001.JPG", "H00", "middle", 100.0, 100.0)
-    assert "1 place is named, 2 are needed" in problem([one])
+    assert "1 place is named; 2 are needed" in problem([one])
     assert "all its places coincide" in problem([one, one])
     assert "heliostat X was not commanded" in problem([one, ("DJI_0001.JPG", "X", "middle", 1, 1)])
 
@@ -148,7 +148,7 @@ def test_tables_are_read_row_by_row(case: Case, tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.pixel, [[1, 2], [5, 6]])
     assert len(lines) == 3
     assert "line 5" in lines[0]
-    assert "'top' is none of upper left" in lines[1]
+    assert "'top' is not one of upper left" in lines[1]
     assert "is not a finite number; give pixels" in lines[2]
     path.write_text(HEAD + "b,,middle,3,4\n")
     with pytest.raises(FormatError, match="no row names a heliostat"):

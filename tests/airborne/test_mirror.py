@@ -253,7 +253,7 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
         ("no.npz", "it should be a slope map: an .npz file written by NumPy"),
         ("part.csv", "1 rows for 4 × 91 × 91 cells"),
         ("half.csv", "are not whole numbers"),
-        ("missing.npz", "there is no such file"),
+        ("missing.npz", "no such file"),
     ):
         with pytest.raises(FormatError, match=text):
             read_slopes(tmp_path / name, 4)

@@ -112,7 +112,7 @@ def test_table_beside_goes_first(tmp_path) -> None:
     assert again.time == datetime(2026, 6, 21, 10, 0, tzinfo=UTC)
     assert again.sigma_position.tolist() == [0.02] * 3
     assert len(problems) == 1
-    assert "b.jpg: photos.csv lists it, but there is no such file" in problems[0]
+    assert "b.jpg: photos.csv lists it, but no such file" in problems[0]
 
 
 def test_bad_photographs_get_one_line_each(tmp_path) -> None:
@@ -195,5 +195,5 @@ def test_impossible_cameras_are_refused() -> None:
         LedCamera((100, 100), np.eye(3), np.zeros(5), np.array([0.0, 9.0, 0.0]))
     with pytest.raises(InputError, match="not a right-handed rotation"):
         Photo("x", None, np.zeros(3), np.diag([1.0, 1.0, -1.0]))
-    with pytest.raises(InputError, match="has no zone"):
+    with pytest.raises(InputError, match="has no time zone"):
         Photo("x", datetime(2026, 1, 1), np.zeros(3), np.eye(3))  # noqa: DTZ001

@@ -61,7 +61,7 @@ def test_refusals() -> None:
         clusters(np.empty((0, 3)))
     with pytest.raises(InputError, match="cluster size 0 m: must be a length above 0"):
         clusters(radial(10), size=0.0)
-    with pytest.raises(InputError, match="one and the same position"):
+    with pytest.raises(InputError, match="most heliostats have the same position"):
         clusters(np.zeros((5, 3)))
 
 

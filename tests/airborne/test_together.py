@@ -147,5 +147,5 @@ def test_sightings_of_a_heliostat_that_is_not_there_are_refused() -> None:
     true = installed(6)
     drone, ground = flown(true, np.zeros(2), 3, 6), aimed(true, 3, 6)
     other = kinds.Sightings(**{**vars(drone), "heliostat": np.full(3, 4)})
-    with pytest.raises(InputError, match="heliostat row 4"):
+    with pytest.raises(InputError, match="heliostat index 4"):
         fit_together(NOMINAL[None], ground, other, "malan8")

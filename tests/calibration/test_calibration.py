@@ -194,7 +194,7 @@ def test_guards(change: dict, text: str) -> None:
         ({"source": [[0.0, 0.0, 0.0]]}, "source: .*length 0"),
         ({"destination": [[np.inf, 0.0, 0.0]]}, "sighting 0: destination"),
         ({"sigma": 0.0}, "sigma 0.0 rad must be 1e-06 to 0.2 rad"),
-        ({"heliostat": [-1]}, "heliostat -1 is not a row"),
+        ({"heliostat": [-1]}, "heliostat -1 is not a heliostat index"),
     ],
 )
 def test_sighting_guards(change: dict, text: str) -> None:
@@ -211,7 +211,7 @@ def test_sighting_guards(change: dict, text: str) -> None:
 def test_a_sighting_of_an_unknown_heliostat_is_refused() -> None:
     nominal = _field(2)
     seen = _seen(_field(3), _field(3), 1e-4)
-    with pytest.raises(InputError, match="heliostat row 2; there are 2"):
+    with pytest.raises(InputError, match="heliostat index 2, but there are 2"):
         fit(nominal, seen, "guo6")
 
 

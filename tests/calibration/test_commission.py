@@ -215,7 +215,7 @@ def test_tables_and_page_hold_every_visit(
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"shots": 0}, "0 photographs of a mirror"),
+        ({"shots": 0}, "0 photographs per heliostat"),
         ({"clear": 0.0}, "clear 0.0 must be above 0 and at most 1"),
         ({"worth": 1.0}, "worth 1.0: must be a fraction"),
         ({"sigma": 0.0}, "sigma 0.0 must be above 0"),

@@ -53,7 +53,7 @@ def test_opencsp_gets_the_position_and_the_rest_is_named(tmp_path: Path) -> None
     with pytest.raises(InputError, match=f"heliostat {name}: .*no heliostat of that name"):
         ht.write_opencsp(tmp_path / "none.csv", other, plant, learned)
     assert not (tmp_path / "none.csv").exists()
-    with pytest.raises(InputError, match=f"heliostat {name}: .*two_jacks; write_plant writes"):
+    with pytest.raises(InputError, match=f"heliostat {name}: .*two_jacks; use write_plant"):
         ht.write_paint(tmp_path / "paint", plant, learned)
     assert not (tmp_path / "paint").exists()
 

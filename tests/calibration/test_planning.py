@@ -328,7 +328,7 @@ def test_the_expected_error_comes_true(possible: CandidateSightings, year: Float
 def test_refusals(possible: CandidateSightings, year: FloatArray) -> None:
     information = precision(FIELD, NAMES)[0]
     own = possible.of(0)
-    with pytest.raises(InputError, match="give 1 or more"):
+    with pytest.raises(InputError, match="must be 1 or more"):
         plan_sightings(own, 0, information, year[0])
     with pytest.raises(InputError, match="no candidate"):
         plan_sightings(own.take([]), 3, information, year[0])
@@ -349,7 +349,7 @@ def test_refusals(possible: CandidateSightings, year: FloatArray) -> None:
         precision(FIELD, NAMES, made)
     with pytest.raises(InputError, match="end must be after"):
         time_grid(START, START, 60.0)
-    with pytest.raises(InputError, match="more than 200,000"):
+    with pytest.raises(InputError, match="exceed 200,000"):
         time_grid(START, START + 30 * DAY, 1.0)
     with pytest.raises(InputError, match="max_incidence"):
         SightingLimits(max_incidence=2.0)
@@ -510,7 +510,7 @@ REFUSED: list[tuple[list[str], str]] = [
     (["--days", "99999"], "--days '99999': give a number from 0.01 to 3,660"),
     (["--days", "1", "--to", "2027-01-01T00:00Z"], "not both"),
     (["--to", "2020-01-01T00:00Z"], "is not after --from"),
-    (["--every", "1s"], "more than 200,000"),
+    (["--every", "1s"], "exceed 200,000"),
     (["--every", "often"], "write it as 30s"),
     (["--target", "x"], "there is no target 'x'"),
     (["--model", "jacks"], "tilt_up"),
@@ -520,7 +520,7 @@ REFUSED: list[tuple[list[str], str]] = [
     (["--campaign", "--worth", "2"], "--worth '2': give a number from 0 to 1"),
     (["--picture", "a.bmp"], "use one of .png"),
     (["--csv", "nowhere/x.csv"], "there is no folder nowhere"),
-    (["--sightings", "no.csv"], "there is no such file"),
+    (["--sightings", "no.csv"], "no such file"),
     (["--sigma-mrad", "nan"], "--sigma-mrad 'nan': give a number from 0.001"),
     (["--from", "2026-09-02T20:00Z", "--to", "2026-09-02T22:00Z"], "no measurement is possible"),
     (

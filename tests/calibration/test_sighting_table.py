@@ -372,8 +372,8 @@ BAD: list[tuple[str, int, str, str]] = [
     ("wide sigma", 13, "500", "column sigma_mrad: 500 mrad is outside 0.001 to 200 mrad"),
     ("tiny sigma", 13, "1e-300", "column sigma_mrad: 1e-300 mrad is outside 0.001 to 200 mrad"),
     ("sigma in rad", 13, "0.0003", "column sigma_mrad: 0.0003 mrad is outside 0.001 to 200 mrad"),
-    ("no sigma", 13, "", "column sigma_mrad: the cell is empty; enter the ray's standard"),
-    ("half a covariance", 15, "", "column destination_cov_en: the cell is empty; give m² of a"),
+    ("no sigma", 13, "", "column sigma_mrad: the cell is empty; give the ray's standard"),
+    ("half a covariance", 15, "", "column destination_cov_en: the cell is empty; enter m² of a"),
     ("no variance", 14, "-1e-4", "column destination_cov_ee to destination_cov_uu: [-0.0001, "),
     ("not definite", 15, "2e-4", "is not a covariance (not positive semidefinite); correct it"),
     ("covariance NaN", 16, "nan", "column destination_cov_eu: 'nan' is not a finite number"),
@@ -489,7 +489,7 @@ def test_an_unusable_table_is_refused(old: str, new: str, says: str, tmp_path: P
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("s.csv", None, "there is no such file; give the path of a table of sightings"),
+        ("s.csv", None, "no such file; give the path of a table of sightings"),
         ("s.csv", b"", "the file is empty"),
         ("s.csv", b"\n\n \n", "the file has no rows"),
         ("s.csv", b"\x7fELF\0\0", "the file is binary"),
@@ -500,7 +500,7 @@ def test_an_unusable_table_is_refused(old: str, new: str, says: str, tmp_path: P
             "there is no column heliostat; add it. There are Jülich",
         ),
         ("s.txt", b"x", "the name ends in '.txt'; sightings are .csv or .parquet"),
-        ("s.parquet", None, "there is no such file"),
+        ("s.parquet", None, "no such file"),
         ("s.parquet", b"", "the file is empty"),
         ("s.parquet", b"PAR1" + bytes(200), "not a Parquet table"),
     ],

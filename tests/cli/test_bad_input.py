@@ -136,7 +136,7 @@ REPLACED: list[tuple[str, str, str, str, str]] = [
     ("mirror of width 0", "toml", "mirror_width_m = 1.8", "mirror_width_m = 0",
      "mirror_width_m: 0: input should be greater than 0"),
     ("no mirror size", "toml", "mirror_width_m = 1.8\n", "", "mirror_width_m and mirror_height_m"),
-    ("table not there", "toml", "field.csv", "fields.csv", "there is no such file"),
+    ("table not there", "toml", "field.csv", "fields.csv", "no such file"),
     ("parallel axes", "toml", 'kind = "azimuth_elevation"',
      'kind = "two_axis"\naxis_1 = [0,0,1]\naxis_2 = [0,0,2]\nnormal = [0,1,0]', "is no driven"),
     ("empty table", "csv", CSV, "", "the file is empty"),
@@ -242,9 +242,9 @@ def _garbage(path: Path) -> None:
 
 
 FILES: list[tuple[str, Callable[[Path], object], str]] = [
-    ("missing", lambda _path: None, "there is no such file"),
+    ("missing", lambda _path: None, "no such file"),
     ("empty", lambda path: path.touch(), "the file is empty"),
-    ("dangling link", _dangling, "there is no such file"),
+    ("dangling link", _dangling, "no such file"),
     ("binary", lambda path: path.write_bytes(b"\x7fELF\0\0\1\2" * 50), "binary"),
     ("200 MB of garbage", _garbage, "MiB"),
     ("Latin-1", lambda path: path.write_bytes("Jülich".encode("latin-1")), "not UTF-8"),
@@ -379,16 +379,16 @@ ARGUMENTS: list[tuple[list[str], str]] = [
         "--pressure '101325': give a number from 300 to 1,200 (Air pressure",
     ),
     (["sun", "--time", "2026-13-01T00:00Z"], "is not ISO 8601"),
-    (["calibrate", "NOWHERE"], "there is no such file"),
+    (["calibrate", "NOWHERE"], "no such file"),
     (["parameters", "psi_t=much"], "write NAME=VALUE with a number"),
     (["parameters", "psi=1"], "psi_t"),
-    (["evaluate", "NOWHERE"], "there is no such file"),
+    (["evaluate", "NOWHERE"], "no such file"),
     (["evaluate", "PAINT", "--fraction", "0"], "--fraction '0': give a number from 0.01 to 0.999"),
     (["evaluate", "PAINT", "--model", "tilt_north,lean"], "lean"),
     (["evaluate", "PAINT", "--prior", "tilt_north"], "write NAME=VALUE"),
     (["evaluate", "PAINT", "--prior", "tilt_north=-1"], "above 0"),
     (["calibrate", "PAINT", "--prior", "lean=0.01"], "lean"),
-    (["evaluate", "PAINT", "--scheduler", "nowhere:1"], "no answer"),
+    (["evaluate", "PAINT", "--scheduler", "nowhere:1"], "no reply"),
     (["evaluate", "PAINT", "--sightings", "NOWHERE"], "sightings are .csv or"),
     (["calibrate", "EMPTY"], "is missing in this folder"),
     (["calibrate", "PAINT", "--model", "malan9"], "there is no model 'malan9'"),
@@ -398,7 +398,7 @@ ARGUMENTS: list[tuple[list[str], str]] = [
         "--fraction '1.5': give a number from 0.01 to 1 ",
     ),
     (["fetch", "almeria", "AA39", "--into", "EMPTY"], "there is no data set 'almeria'"),
-    (["fetch", "juelich", "../AA39", "--into", "EMPTY"], "give a name of letters and digits"),
+    (["fetch", "juelich", "../AA39", "--into", "EMPTY"], "use a name of letters and digits"),
 ]
 
 

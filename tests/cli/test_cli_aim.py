@@ -89,7 +89,7 @@ def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> N
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (("--limit=5", "--keep-all"), "no aims were found that hold the flux limit"),
+        (("--limit=5", "--keep-all"), "no aims were found that respect the flux limit"),
         (("--limit=much",), "--limit 'much': use 0.001 to 64000 kW/m²"),
         (("--limit=none.csv",), "none.csv"),
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),

@@ -265,7 +265,7 @@ def test_show(call: Any, place: Path) -> None:
     assert json.loads(call("show", place / "bare.toml", "--json")) == []
     bare = replace(example_plant(), cameras=(replace(CAMERA, position=None, R_enu_camera=None),))
     write_plant(bare, place / "lens.toml")
-    assert "camera south: its position is not known" in call("show", place / "lens.toml")
+    assert "camera south: its position is unknown" in call("show", place / "lens.toml")
 
 
 # -- bad input -------------------------------------------------------------------------
@@ -277,7 +277,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("teach", "none.toml", *TEACH[2:]), "none.toml: there is no such file"),
+        (("teach", "none.toml", *TEACH[2:]), "none.toml: no such file"),
         ((*TEACH[:2], "none.png", *TEACH[3:]), "none.png"),
         ((*TEACH[:2], "text.png", *TEACH[3:]), "text.png"),
         ((*TEACH[:3], "--target", "targte"), "there is no target 'targte'; did you mean target?"),
@@ -419,7 +419,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
             "camera south: frames of 320 × 240, 640 × 480 px",
         ),
         (("calibrate", "marked.toml", "grey.png", "--camera", "c"), "no target was found: "),
-        (("show", "none.toml"), "none.toml: there is no such file"),
+        (("show", "none.toml"), "none.toml: no such file"),
     ],
 )
 def test_bad_input_is_one_line_and_changes_nothing(

@@ -110,7 +110,7 @@ def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
         ((SUN, "--air=fog"), "air 'fog': known models"),
         ((SUN, "--sun-shape=disk"), "sun shape 'disk'; known"),
         ((SUN, "--focus=near"), "--focus 'near': give plant, slant, flat, or a focal"),
-        ((SUN, "--facets=5"), "--facets '5': give columns and rows such as 5x7"),
+        ((SUN, "--facets=5"), "--facets '5': write COLUMNSxROWS, such as 5x7"),
         ((SUN, "--facets=5x7", "--canting=noon"), "time 'noon' is not ISO 8601"),
         ((SUN, "--cells=0x4"), "--cells '0x4': write ROWSxCOLUMNS, such as 20x56"),
         ((SUN, "--tower=1,2,3"), "--tower '1,2,3': write four numbers in m"),
@@ -137,7 +137,7 @@ def test_bad_input_ends_in_one_line(flux: Any, words: tuple[str, ...], line: str
     ("more", "words", "text"),
     [
         ("[groups.azel.mirror]\nfacets = [2, 0]\n", (), "groups.azel.mirror.facets"),
-        ("[groups.azel.mirror]\nslope_maps = 'maps'\n", (), "there is no such folder"),
+        ("[groups.azel.mirror]\nslope_maps = 'maps'\n", (), "no such folder"),
         ("[groups.azel.mirror]\ncanting = 'slant'\n", (), "add facets = [columns, rows]"),
         ("[[towers]]\neast_m = 0\nnorth_m = 0\nradius_m = 900\ntop_m = 9\n", (), "of a tower of"),
         ("", ("--tower=0,0,900,9",), "inside a tower of radius 900"),

@@ -183,7 +183,7 @@ def test_sightings_name_what_is_left_out(folder: Path, call: Any) -> None:
     left = {line.split(": ", 1)[0]: line.split(": ", 1)[1] for line in found["left_out"]}
     assert left["p3.png"].startswith("no spot")
     assert left["p4.png"] == "the plant has no heliostat H9"
-    assert left["p5.png"].startswith("nothing is known about it")
+    assert left["p5.png"].startswith("no metadata")
     assert "p6.png" in left
 
 
@@ -299,7 +299,7 @@ def test_a_log_names_the_empty_frame_of_each_photograph(folder: Path, call: Any)
         log,
     )
     assert code == 2
-    assert "missing.png: there is no such file" in err
+    assert "missing.png: no such file" in err
 
 
 def test_empty_targets_are_learnt_and_used(folder: Path, call: Any) -> None:
@@ -401,10 +401,10 @@ def test_two_targets_for_one_photograph_are_refused(record: str, folder: Path, c
 
 
 BAD: list[tuple[str, list[str], str]] = [
-    ("absent.png", [], "there is no such file"),
+    ("absent.png", [], "no such file"),
     ("photographs/p0.png", ["--target", "tower"], "there is no target 'tower'"),
     ("photographs/p0.png", ["--camera", "left"], "there is no camera 'left'"),
-    ("photographs/p0.png", ["--log", "absent.csv"], "there is no such file"),
+    ("photographs/p0.png", ["--log", "absent.csv"], "no such file"),
     ("photographs/p0.png", ["--log", "bad.csv"], "there is no column heliostat; add it"),
     ("photographs/p0.png", ["--log", "naive.csv"], "line 2, column timestamp"),
     ("photographs/p0.png", ["--log", "text.csv"], "'x' is not a finite number"),
@@ -496,7 +496,7 @@ def test_a_burst_is_averaged(folder: Path, call: Any) -> None:
     [
         (["nowhere"], "source nowhere: there is no such"),
         (["a", "b"], "--live follows one source, but 2 were given"),
-        (["usb:97"], "there is no such device"),
+        (["usb:97"], "no such device"),
         (["http://127.0.0.1:9/x"], "127.0.0.1:9"),
     ],
 )

@@ -106,7 +106,7 @@ def test_the_example_is_read(folder: Path) -> None:
         ("[time]", "[time]\ndrift_ppm = 50", "time.drift_ppm: the kernel's bound grows by 500 ppm"),
         ("latitude_deg = -33.9281", "latitude_deg = 133", "site.latitude_deg: 133"),
         ("[site] ", "[site", "not valid TOML"),
-        ('"C1.keys.toml" ', '"none.toml" ', "none.toml: there is no such file"),
+        ('"C1.keys.toml" ', '"none.toml" ', "none.toml: no such file"),
         ("version = 1\n", "version = 1\nkeys2 = 3\n", "'keys2' is not known; did you mean 'keys'"),
     ],
 )

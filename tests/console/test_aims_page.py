@@ -70,7 +70,7 @@ def ctl(field: LiveConsole, tmp_path: Path) -> Callable[..., str]:
 
 
 def test_ctl_says_that_there_is_no_limit(ctl: Callable[..., str]) -> None:
-    assert ctl() == "aims of the plant file; it has no flux limit\n"
+    assert ctl() == "aims from the plant file; no flux limit is set\n"
     assert json.loads(ctl("--json"))["strategy"] == "spread"
 
 
@@ -78,10 +78,13 @@ def test_ctl_prints_what_the_page_shows(limited: None, ctl: Callable[..., str]) 
     lines = ctl().splitlines()
     assert lines == [
         "no answer within 60 s",
-        "aims by last good aims",
-        "limit 570 kW/m², flux with its errors up to 551 kW/m², 3.3 % left, 17 cells at the limit",
+        "source of the aims: last good aims",
+        "limit 570 kW/m², flux including errors up to 551 kW/m², 3.3 % left, 17 cells at the limit",
         "161 kW of 166 kW",
-        "5 heliostats have an aim, 1 rest for the limit, 2 still have to move",
+        (
+            "5 heliostats have an aim, 1 are off the receiver because of the limit, "
+            "2 still have to move"
+        ),
         "2 moved 12 s ago: P0001A, P0002A",
     ]
     told = json.loads(ctl("--json"))

@@ -69,3 +69,34 @@ def test_an_event_unfolds_and_stays_so(console: LiveConsole, enter: Callable[...
     page.wait_for_selector(f"{event}[open] >> text={', '.join(names)}")
     page.click(f"{event} summary")
     until(page, f"!document.querySelector('{FOLDED}').open")
+
+
+@NEEDS_BROWSER
+def test_a_command_unfolds_to_its_heliostats(enter: Callable[..., Any]) -> None:
+    refusals = {f"P{k}": "it is locked" if k % 2 else "it is in stow" for k in range(6)}
+    row = {"identity": "a-1", "command": "TRACK", "heliostats": 6, "counted": {}, "finished": True}
+    row |= {"good": False, "text": "TRACK: 6 refused (6 heliostats: why)"}
+    row |= {"refusals": refusals, "steps": {"P1": "waits"}}
+    page = enter("viewer")
+    page.route("**/api/v1/commands", lambda route: route.fulfill(json=[row]))
+    page.click(".hx-tabs >> text=Logs")
+    page.click(".hx-logs button[value=commands]")
+    page.click(f"{FOLDED} summary:has-text('6 refused')")
+    page.wait_for_selector(f"{FOLDED} >> text='P1, P3, P5: it is locked'")
+    page.wait_for_selector(f"{FOLDED} >> text='P0, P2, P4: it is in stow'")
+    # Drawn anew after some seconds, it stays unfolded.
+    page.evaluate("document.querySelector('.hx-logs details').remove()")
+    page.wait_for_selector(f"{FOLDED}[open] >> text='P1, P3, P5: it is locked'")
+
+
+@NEEDS_BROWSER
+def test_an_entry_of_the_timetable_unfolds(
+    console: LiveConsole, ask: Callable[..., httpx.Response], enter: Callable[..., Any]
+) -> None:
+    names = list(console.live.names[:7])
+    entry = {"name": "never", "heliostats": names, "rule": "never"}
+    assert ask("operator", "PUT", "timetable", {"entries": [entry]}).status_code == 200
+    page = enter("viewer")
+    page.click(".hx-tabs >> text=Schedule")
+    page.click(".hx-schedule summary:has-text('and 4 more')")
+    page.wait_for_selector(f".hx-schedule details[open] >> text={', '.join(names[3:])}")

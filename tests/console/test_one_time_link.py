@@ -191,4 +191,4 @@ def test_ctl_says_that_an_account_without_a_password_needs_one(
     refused = CliRunner().invoke(app, words, input=f"{NEW}\n")
     assert refused.exit_code != 0
     said = str(refused.exception or refused.output)
-    assert "has no password until you set one on the page /account" in said
+    assert "has no password until you set one on its /account page" in said

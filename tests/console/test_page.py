@@ -471,6 +471,34 @@ def test_the_head_fits_into_every_width(enter: Callable[[str], Any]) -> None:
         assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
+def test_no_button_moves_when_the_bar_says_something(enter: Callable[[str], Any]) -> None:
+    page = enter("engineer")
+    places = "[...document.querySelectorAll('.hx-bar button')].map((b) => b.offsetTop)"
+    for width in (1600, 1440, 1280, 820):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.evaluate("heliotrope.store.emit('said', {text: ''})")
+        before = page.evaluate(places)
+        page.evaluate("heliotrope.store.emit('said', {text: 'Stow: done'})")
+        assert page.evaluate(places) == before, width
+
+
+@pytest.mark.parametrize("width", [1440, 820])
+def test_the_table_draws_only_rows_in_view(enter: Callable[..., Any], width: int) -> None:
+    page = enter("viewer", viewport={"width": width, "height": 1000})
+    page.click("[data-tab=heliostats]")
+    rows = page.locator(".hx-grid-body .hx-grid-row")
+    page.wait_for_selector(".hx-grid-body .hx-grid-row")
+    page.evaluate("document.querySelector('.hx-grid').scrollTop = 1e6")
+    until(page, "document.querySelector('.hx-grid-body .hx-grid-row').offsetTop > 1000")
+    assert rows.count() < 100
+    # By small steps, up and down, each row is there once, in order.
+    for step in (-90, -50, 60, 30):
+        page.evaluate("step => { document.querySelector('.hx-grid').scrollTop += step; }", step)
+        page.wait_for_timeout(50)
+        tops = rows.evaluate_all("all => all.map((one) => one.offsetTop)")
+        assert tops == list(range(tops[0], tops[0] + 27 * len(tops), 27))
+
+
 def test_the_page_waits_for_a_plant_that_does_not_answer_yet(enter: Callable[[str], Any]) -> None:
     page = enter("operator")
     away = {"detail": "the plant does not answer"}

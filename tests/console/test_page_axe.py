@@ -53,7 +53,7 @@ def test_no_serious_finding(
         found["dialog"] = wrong
     for path in ("report", "trends", "wall"):
         page.goto(f"{field.address}{path}")
-        page.wait_for_selector({"report": "h1", "trends": "h1", "wall": ".hx-legend b"}[path])
+        page.wait_for_selector({"report": "h1", "trends": "h1", "wall": ".hx-large dd"}[path])
         page.evaluate(AXE)
         if wrong := page.evaluate(RUN):
             found[path] = wrong

@@ -32,7 +32,7 @@ def test_a_note_and_the_report_of_the_shift(field: LiveConsole, enter: Callable[
     with task(page, "hand-over note"):
         page.click(".hx-tabs >> text=Shift")
         page.fill("[name=note]", "Mirror 7 is dirty,\nwash it tomorrow")
-        page.click("text=Keep note")
+        page.click("text=Save note")
         page.wait_for_selector("td:has-text('operator: Mirror 7 is dirty, wash it tomorrow')")
     said(page, "note: done")
     assert not page.input_value("[name=note]")
@@ -203,7 +203,6 @@ def test_the_wall_screen_has_nothing_to_click_but_emergency(
     page = enter("viewer", viewport={"width": 1920, "height": 1080})
     page.goto(f"{field.address}wall")
     page.wait_for_selector(".hx-large dd:has-text('MW')")
-    page.wait_for_selector(".hx-legend b")
     until(page, "heliotrope.store.live")
     page.wait_for_selector(".hx-side >> text=/No alarms|▲|○/")
     page.mouse.click(600, 500)
@@ -244,7 +243,7 @@ def test_trends_are_zoomed_moved_and_saved(field: LiveConsole, enter: Callable[.
         page.mouse.up()
         until(page, f"{width} < {0.2 * before}")
     page.click("[aria-label=Earlier]")
-    page.click("[aria-label='Remove available']")
+    page.click("[aria-label='Remove Available']")
     page.wait_for_selector(".hx-trend h2:has-text('available')", state="detached")
 
 

@@ -177,7 +177,11 @@ def test_the_page_says_what_a_proof_has_measured_and_what_it_believes(
     assert followed + believed == 64
     page.wait_for_selector(".hx-plant dd:has-text('the flux, below its limit')")
     page.wait_for_selector(f".hx-plant dd:has-text('{followed} by photograph')")
-    names = page.inner_text(".hx-plant dt:has-text('Believed by reports alone') + dd").split(", ")
+    folded = ".hx-plant dt:has-text('Believed by reports alone') + dd details"
+    assert page.inner_text(folded).endswith(f"and {believed - 3} more")
+    page.click(f"{folded} summary")
+    first, rest = page.inner_text(folded).replace("\n", " ").split(f" and {believed - 3} more")
+    names = [*first.split(", "), *rest.strip().split(", ")]
     assert names[-1] == f"… ({believed})"
     assert set(names[:-1]) < set(field.live.names) - {name}
     page.click(".hx-alert button >> text=Withdraw")

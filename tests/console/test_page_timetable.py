@@ -38,7 +38,7 @@ def test_an_entry_is_added_and_removed(field: LiveConsole, enter: Callable[..., 
     page.select_option("dialog [name=rule]", label="never: only persons calibrate them")
     page.fill("dialog [name=at]", "12:00Z")
     page.click("dialog >> text='Put in force'")
-    page.wait_for_selector("dialog [role=alert]:has-text('leave times and target out')")
+    page.wait_for_selector("dialog [role=alert]:has-text('remove times and target')")
     page.fill("dialog [name=at]", "")
     page.click("dialog >> text='Put in force'")
     page.wait_for_selector("td:text-is('never')")

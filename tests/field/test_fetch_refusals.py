@@ -73,7 +73,7 @@ def test_a_missing_file_names_the_heliostat(database: Database, tmp_path: Path, 
     text = refused(database, tmp_path)
     assert text.startswith("heliostat AA39: http://")
     assert gone in text
-    assert "there is no such file (the server replied 404 Not Found)" in text
+    assert "no such file (the server replied 404 Not Found)" in text
 
 
 def test_forbidden_is_not_tried_again(database: Database, tmp_path: Path) -> None:

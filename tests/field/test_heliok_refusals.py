@@ -119,7 +119,7 @@ def test_a_truncated_file_is_refused(tmp_path: Path, share: float) -> None:
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.xml"
-    with pytest.raises(FormatError, match="there is no such file; give the path of a HelioK file"):
+    with pytest.raises(FormatError, match="no such file; give the path of a HelioK file"):
         heliok.read(path)
     with pytest.raises(FormatError, match="this is a folder"):
         heliok.read(tmp_path)

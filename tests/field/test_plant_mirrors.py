@@ -222,7 +222,7 @@ BAD_MIRRORS = [
     ("focal_m = 1", "mirror.focal", "column mirror.focal is no number of the mirror"),
     ("reflectivity = 1.1", "", "reflectivity"),
     ("slope_error_mrad = 1\nslope_error_rad = 1", "", "slope_error_mrad and slope_error_rad; keep"),
-    ('slope_maps = "none"', "", "none: there is no such folder"),
+    ('slope_maps = "none"', "", "none: no such folder"),
     ("facet_focal_m = [1, 2]", "", "focal length of shape (2, 2) for 2 mirrors of 1 facets"),
     (
         "[[groups.a.mirror.facet]]\ncenter_m = [1.5, 0]\nsize_m = [2, 3]",
@@ -372,7 +372,7 @@ def test_a_mesh_that_cannot_be_is_one_line(content: str, text: str, tmp_path: Pa
         ('kind = "cavity"\nmesh = "front.obj"\n', "reaches 1.000 m in front of the aperture"),
         ('kind = "cavity"\nmesh = "away.obj"\n', "no triangle of its inner surface faces the"),
         ('kind = "mesh"\nmesh = "m.txt"\n', "the name ends in '.txt'; meshes are .obj or .stl"),
-        ('kind = "mesh"\nmesh = "none.obj"\n', "there is no such file"),
+        ('kind = "mesh"\nmesh = "none.obj"\n', "no such file"),
     ],
 )
 def test_a_receiver_that_cannot_be_is_one_line(keys: str, text: str, tmp_path: Path) -> None:

@@ -355,7 +355,7 @@ def test_bad_places_get_one_line(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     cases: dict[Path, str] = {
         tmp_path: "this is a folder; specify an image file",
-        tmp_path / "none.png": "there is no such file",
+        tmp_path / "none.png": "no such file",
         link: f"a link to {tmp_path / 'gone.png'}, which does not exist",
         pipe: "this is a device or a pipe",
         tmp_path / ("x" * 300): "cannot be read (File name too long)",

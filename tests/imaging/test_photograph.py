@@ -145,7 +145,7 @@ def test_memory_that_is_none_is_refused(tmp_path: Path) -> None:
         FormatError, match="not a readable archive; it should be a model of an empty target"
     ):
         Memory.load(tmp_path)
-    with pytest.raises(InputError, match="give a folder"):
+    with pytest.raises(InputError, match="specify a writable folder"):
         learnt().save(tmp_path / "file" / "below")
 
 

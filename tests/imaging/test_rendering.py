@@ -463,7 +463,7 @@ def test_cameras_that_cannot_see_the_target() -> None:
     assert CAMERA.position is not None
     assert CAMERA.R_enu_camera is not None
     lost = replace(CAMERA, position=None, R_enu_camera=None)
-    with pytest.raises(InputError, match="its position is not known"):
+    with pytest.raises(InputError, match="its position is unknown"):
         render(scene(camera=lost), 0)
     behind = replace(CAMERA, position=CAMERA.position * [1.0, -1.0, 1.0])
     with pytest.raises(InputError, match="does not see the front of target target"):

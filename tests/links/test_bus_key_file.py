@@ -42,7 +42,7 @@ def test_a_step_out_of_order_is_refused(
 ) -> None:
     file = tmp_path / "C1.bus.toml"
     assert keys_bus(monkeypatch, "list", file) != 0
-    assert "heliotrope keys bus new makes it" in capsys.readouterr().err
+    assert "create it with heliotrope keys bus new" in capsys.readouterr().err
     found = BusKeyFile(file)
     with pytest.raises(InputError, match="it has no key; say"):
         found.rotate()

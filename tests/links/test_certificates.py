@@ -120,4 +120,4 @@ def test_from_the_command_line(tmp_path: Path) -> None:
     assert "--certificate and --key" in made.output
     assert run.invoke(app, [*words, "--request"]).exit_code == 0
     absent = run.invoke(app, ["keys", "tls", str(tmp_path / "none"), "--name", "a"])
-    assert "there is no such folder" in str(absent.exception)
+    assert "no such folder" in str(absent.exception)

@@ -56,7 +56,7 @@ def test_the_engine_and_rays_agree_on_canted_facets() -> None:
 @pytest.mark.parametrize(
     ("facets", "canting", "line"),
     [
-        ((0, 3), "slant", "0 × 3 facets; must be 1 to 50 each way"),
+        ((0, 3), "slant", "0 × 3 facets; give 1 to 50 each way"),
         ((3, 2), -5.0, "a focal length of -5.0 m must be above 0"),
         ((3, 2), -NOON, "pass one sun vector above the horizon"),
     ],

@@ -483,7 +483,7 @@ def test_what_cannot_be_is_refused() -> None:
         (lambda: MirrorOptics.of(1.0, 1.0, focus=-3.0), "a focus must be above 0 m"),
         (lambda: MirrorOptics.of(1.0, 1.0, error=0.6), "an error must be from 0 to 0.5 rad"),
         (lambda: MirrorOptics.of(np.ones((2, 2)), 1.0), "give numbers or"),
-        (lambda: MirrorOptics.of([1.0, 1.0], 1.0).broadcast(3), "mirrors: 2 for 3 beams"),
+        (lambda: MirrorOptics.of([1.0, 1.0], 1.0).broadcast(3), "mirrors: got 2 for 3 beams"),
         (
             lambda: optics.beams((0, 0, 0), (0, 0, 0), MirrorOptics.of(1, 1)),
             "length 0 has no direction",

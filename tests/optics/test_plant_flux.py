@@ -193,7 +193,7 @@ def no_receiver() -> Plant:
             "pass either a time or a sun vector",
         ),
         (lambda: ht.flux(plant(), "2026-09-02T22:00Z"), r"the sun stands -\d+\.\d° above the hor"),
-        (lambda: ht.flux(plant(), ["2026-09-02T10:00Z"]), "give one time"),
+        (lambda: ht.flux(plant(), ["2026-09-02T10:00Z"]), "pass one time"),
         (lambda: ht.flux(no_receiver(), sun=SUN), "has no receiver; add one to the plant file"),
         (lambda: ht.flux(plant(), sun=SUN, dni=-1.0), r"DNI -1.0 W/m² must be 0 or more"),
         (lambda: ht.flux(plant(), sun=SUN, error=np.nan), "an error of nan rad must be from 0"),

@@ -237,7 +237,7 @@ def test_bad_scenes_are_refused_in_one_line() -> None:
         mirrors(slope=0.2)
     table = FacetTable(np.array([[[5.0, 0.0]]]), np.zeros((1, 1, 2)), np.ones((1, 1, 2)),
                        np.full((1, 1), np.inf))  # fmt: skip
-    with pytest.raises(InputError, match=r"mirror 0: a facet reaches 6\.000 m from the middle"):
+    with pytest.raises(InputError, match=r"mirror 0: a facet reaches 6\.000 m from the centre"):
         mirrors().with_facets(table)
     with pytest.raises(InputError, match="face 0 has no area"):
         Mesh("mesh", np.zeros((3, 3)), np.array([[0, 1, 2]]))

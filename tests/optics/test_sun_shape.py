@@ -103,7 +103,7 @@ def test_the_error_is_the_one_that_random_rays_show() -> None:
     ("text", "line"),
     [
         ("square", "sun shape 'square'; known: pillbox, limb, quartic, buie, gaussian"),
-        ("limb:3", "sun shape 'limb:3': limb takes no number; write limb"),
+        ("limb:3", "sun shape 'limb:3': limb takes no number; write just limb"),
         ("buie:x", "sun shape 'buie:x': write a number after the colon"),
         ("buie:0.9", "circumsolar ratio 0.9 must be from 0.01 to 0.7"),
         ("buie:nan", "circumsolar ratio nan must be"),

@@ -112,7 +112,7 @@ def test_a_beam_is_seen_where_it_is(plant: Plant, frame: Frame, tmp_path: Path) 
         view = cameras.view(target.name)
         assert view.version == 1
         assert view.jpeg.startswith(b"\xff\xd8")
-        assert view.reading[0].startswith("1 spot(s), +")
+        assert view.reading[0].startswith("1 spot, +")
     finally:
         cameras.close()
     assert list((tmp_path / "m").glob("*.npz"))
@@ -193,7 +193,7 @@ def test_a_time_that_is_too_unsure_is_a_reason(plant: Plant, frame: Frame) -> No
     [
         ("", "does not say where its frames come from; add source"),
         ("night.avi", "is a recording; specify a source of live frames"),
-        ("nowhere", "there is no such file"),
+        ("nowhere", "no such file"),
         ("ftp://a/b", "not over ftp"),
     ],
 )

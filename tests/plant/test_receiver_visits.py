@@ -564,7 +564,7 @@ def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str)
 def test_a_plant_refuses_receiver_visits_without_a_camera_or_a_face() -> None:
     whole = design_of(2)
     unplaced = tuple(replace(c, position=None, R_enu_camera=None) for c in whole.cameras)
-    with pytest.raises(InputError, match="its position is not known"):
+    with pytest.raises(InputError, match="its position is unknown"):
         replace(whole, cameras=unplaced)
     around = replace(whole.receivers[0], kind="external_cylinder")
     with pytest.raises(InputError, match="only a planar one has a face"):

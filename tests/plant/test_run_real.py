@@ -482,7 +482,7 @@ def test_each_cluster_gets_its_way(folder: Path) -> None:
         ("links.toml", "[mqtt]", "[mqtt]\nusernme = 'a'", "not known; did you mean 'username'"),
         ("links.toml", f"mqtt://127.0.0.1:1883/{PREFIX}", "tcp://a:1", "mqtt.url: specify mqtt://"),
         ("links.toml", '"127.0.0.1:4840"', '"127.0.0.1:4840"\nkey = "a"', "needs both certif"),
-        ("links.toml", "links.keys", "other.keys", "other.keys: there is no such file"),
+        ("links.toml", "links.keys", "other.keys", "other.keys: no such file"),
         ("links.toml", "127.0.0.1:4840", "0.0.0.0:4840", "tcp.listen: 0.0.0.0 is not this mach"),
         ("links.toml", "mqtt://127.0.0.1:1883", "mqtt://10.0.0.9", "mqtt.url: 10.0.0.9 is not"),
         ("links.keys", "K2 =", "# K2 =", "clusters.K2: a cluster and its plant authenticate"),
@@ -563,7 +563,7 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
             ("plant.toml", "--clusters", "links.toml"),
             "a real plant must keep its records; use --data",
         ),
-        (("plant.toml", "--clusters", "no.toml"), "no.toml: there is no such file"),
+        (("plant.toml", "--clusters", "no.toml"), "no.toml: no such file"),
         (
             ("plant.toml", "--clusters", "links.toml", "--speed", 2),
             "run: --speed: only available in simul",

@@ -275,7 +275,9 @@ def read_photos(
         f"{place / name}: {table.name} lists it, but there is no such file" for name in missing
     ]
     if not photos:
-        raise InputError(f"{place}: no photograph of {len(problems)} can be used: {problems[0]}")
+        raise InputError(
+            f"{place}: none of the {len(problems)} photographs can be used: {problems[0]}"
+        )
     return _of_one_camera(photos, problems, sizes, place)
 
 

@@ -281,7 +281,7 @@ def aims(context: typer.Context, as_json: Json = False) -> None:
         return
     if answer["problem"]:
         print(answer["problem"])
-    print(f"aims computed by {answer['source'] or 'nobody yet'}")
+    print(f"source of the aims: {answer['source'] or 'none yet'}")
     if answer["peak"] is not None:
         print(
             f"limit {1e-3 * answer['limit']:.4g} kW/m², flux including errors up to "

@@ -44,8 +44,8 @@ class Canting:
                 raise InputError(f"canting {self.kind} {text} {what}")
         if self.focal is not None and not (self.focal > 0.0).all():
             raise InputError(
-                f"canting: a focal length of {self.focal.min():g} m must be above 0; kind none "
-                "does not cant"
+                f"canting: the focal length must be above 0, got {self.focal.min():g} m; for no "
+                "canting, specify the kind none"
             )
         if self.sun is not None:
             object.__setattr__(self, "sun", normalize(self.sun, "canting: sun"))

@@ -64,7 +64,8 @@ def lengths(prefix: bytes, most_head: int, most_blob: int) -> tuple[int, int]:
         raise FrameError(f"local interface: bytes that do not begin with {MARK.decode()}")
     if head > most_head or blob > most_blob:
         raise FrameError(
-            f"local interface: a frame of {head} + {blob} bytes; at most {most_head} + {most_blob}"
+            f"local interface: a frame with a head of {head} and a blob of {blob} bytes; the "
+            f"limits are {most_head} and {most_blob}"
         )
     return head, blob
 

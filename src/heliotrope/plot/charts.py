@@ -64,7 +64,9 @@ def _groups(groups: Sequence[Group], count: int) -> Sequence[Group]:
 def _points(values: npt.ArrayLike, name: str) -> FloatArray:
     points = np.asarray(values, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
-        raise InputError(f"{name}: shape {points.shape}; give right and up of M points, (M, 2)")
+        raise InputError(
+            f"{name}: got the shape {points.shape}; expected M pairs of right and up, (M, 2)"
+        )
     return points
 
 

@@ -403,6 +403,6 @@ def _verify_head(connection: Connection, head: Head) -> bool:
     if digest != head.digest:
         what = "is not there" if digest is None else "has another digest"
         raise StoreError(
-            f"head {head}: link {head.number} {what}; records were removed or made anew since"
+            f"head {head}: link {head.number} {what}; records have since been removed or rewritten"
         )
     return True

@@ -46,6 +46,17 @@ export function table(columns, rows, act) {
   return h("div", { className: "hx-scroll" }, h("table", { className: "hx-table" }, h("thead", {}, head), h("tbody", {}, body)));
 }
 
+// The first names of many, all of them on a click; a list that is drawn anew stays as it was. Of `all` there may be more than the names.
+const FEW = 3;
+export function several(names, key, shown, all = names.length) {
+  if (names.length <= FEW + 1) return h("b", {}, names.join(", "));
+  const rest = names.slice(FEW), more = all > names.length ? `, … (${count(all)})` : "";
+  const box = h("details", { className: "hx-several", open: shown.has(key) },
+    h("summary", { title: names.join(", ") + more }, h("b", {}, names.slice(0, FEW).join(", ")), " ", t("and {n} more", { n: count(all - FEW) })), rest.join(", ") + more);
+  box.ontoggle = () => (box.open ? shown.add(key) : shown.delete(key));
+  return box;
+}
+
 // Saves rows as a file of comma-separated values.
 export function saveCsv(name, titles, rows) {
   const cell = (value) => (/[",\n]/.test(String(value ?? "")) ? `"${String(value).replaceAll('"', '""')}"` : String(value ?? ""));

@@ -128,8 +128,8 @@ export class FieldMap {
     const size = Math.max(2, Math.min(26, (store.field.size ?? 2.2) * this.scale * 0.85));
     const half = 0.5 * size;
     this.drawSquares(c, size);
-    this.drawMarks(c, half, night);
     if (size > 14) this.drawNames(c, half, night);
+    this.drawMarks(c, half, night);
     this.drawSun(c, night);
     this.drawLasso(c, night);
   }
@@ -167,7 +167,6 @@ export class FieldMap {
     const step = [5, 10, 20, 50, 100, 200, 500, 1000].find((s) => s * this.scale > 70) ?? 1000;
     for (let k = 1; k <= 12; k++) {
       c.beginPath(); c.arc(tx, ty, k * step * this.scale, 0, 2 * Math.PI); c.stroke();
-      c.fillText(`${k * step} m`, tx + 4, ty + k * step * this.scale - 4);
     }
     // The tower's shadow, as long as the sun is up.
     if (store.live && head?.sun && head.sun.elevation > 0.02) {
@@ -176,6 +175,7 @@ export class FieldMap {
       c.beginPath(); c.moveTo(tx, ty);
       c.lineTo(tx - length * Math.sin(head.sun.azimuth), ty + length * Math.cos(head.sun.azimuth)); c.stroke();
     }
+    for (let k = 1; k <= 12; k++) c.fillText(`${k * step} m`, tx + 4, ty + k * step * this.scale - 4);
     c.fillStyle = night ? "#e8eaed" : "#202428";
     c.beginPath(); c.arc(tx, ty, 5, 0, 2 * Math.PI); c.fill();
     c.fillText(t("tower"), tx + 8, ty - 6);
@@ -252,11 +252,18 @@ export class FieldMap {
     }
   }
 
+  // The names in view; one that would lie on an earlier one is left out until there is room for it.
   drawNames(c, half, night) {
     c.fillStyle = night ? "#c9d1d9" : "#24292f"; c.font = "10px sans-serif"; c.textAlign = "center";
+    const high = 11, lines = new Map();
     for (let row = 0; row < this.x.length; row++) {
-      const [px, py] = this.toScreen(this.x[row], this.y[row]);
-      if (px > -20 && py > -20 && px < this.width + 20 && py < this.height + 20) c.fillText(store.field.names[row], px, py + half + 10);
+      const [px, py] = this.toScreen(this.x[row], this.y[row]), name = store.field.names[row];
+      if (px < -20 || py < -20 || px > this.width + 20 || py > this.height + 20) continue;
+      const wide = c.measureText(name).width + 4, line = Math.floor(py / high);
+      const near = [line - 1, line, line + 1].flatMap((one) => lines.get(one) ?? []);
+      if (near.some(([x, y, w]) => Math.abs(y - py) < high && 2 * Math.abs(x - px) < w + wide)) continue;
+      lines.set(line, [...(lines.get(line) ?? []), [px, py, wide]]);
+      c.fillText(name, px, py + half + 10);
     }
   }
 

@@ -1,7 +1,7 @@
 // The tabs of the page.
 import { api, me, store } from "./live.js";
 import { colourOf, dark } from "./palette.js";
-import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, span, table } from "./dom.js";
+import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, several, span, table } from "./dom.js";
 import { act, aim, askAnd } from "./orders.js";
 import { drawFlux, fluxPoint } from "./showing.js";
 import { markCorners } from "./marking.js";
@@ -13,13 +13,15 @@ const canCommand = () => me.role !== "viewer";
 const severe = { emergency: "bad", alarm: "bad", warning: "warn", fault: "bad" };
 
 // Names, units, their number in one of the reading's, and digits.
-const SENSORS = { dni: [word("Direct sunlight"), "W/m²", 1, 0], receiver_flux_nominal: [word("Flux on the receiver, of the full field's"), "%", 100, 0],
+const SENSORS = { dni: [word("Direct sunlight"), "W/m²", 1, 0], receiver_flux_nominal: [word("Flux on the receiver (share of the full field's)"), "%", 100, 0],
   wind_gust: [word("Wind gust (3 s)"), "m/s", 1, 1], wind_mean: [word("Mean wind (10 min)"), "m/s", 1, 1], temperature: [word("Air"), "°C", 1, 0] };
 
 export function plant(box) {
   const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" }), measured = h("div"), sensors = h("div");
   const { receivers } = store.field, figures = h("div"), limit = h("div");
   let [name] = receivers;
+  const unfolded = new Set();
+  let proven = "";
   const unsure = h("input", { type: "checkbox", onchange: () => draw() });
   const choice = h("select", { ariaLabel: t("Receiver"), onchange: () => { name = choice.value; predict(); } }, receivers.map((one) => h("option", { value: one }, one)));
   box.append(h("h3", {}, t("Heliostats")), states, proof, h("h3", {}, t("Sun")), light, sensors,
@@ -36,7 +38,7 @@ export function plant(box) {
     })), facts([[t("Clusters heard"), t("{n} of {all}", { n: count(head.clusters_alive), all: count(store.field.clusters.length) })],
       [t("Waiting to join the receiver"), count(head.waiting)],
       [t("Calibrated"), t("{n} of {all}", { n: count(head.calibration.done), all: count(most) })],
-      [t("Median error"), `${mrad(head.calibration.quality?.median)} mrad`]]));
+      [t("Median error"), head.calibration.quality ? `${mrad(head.calibration.quality.median)} mrad` : "–"]]));
     light.replaceChildren(facts([[t("Azimuth"), `${degrees(head.sun.azimuth, 1)}°`], [t("Elevation"), `${degrees(head.sun.elevation, 1)}°`],
       [t("Shadow of the tower"), head.sun.elevation > 0.02 ? t("{length} m to {azimuth}°", { length: number(store.field.tower[2] / Math.tan(head.sun.elevation), 0), azimuth: degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0) }) : t("none: the sun is down")]]));
     const readings = Object.entries(head.readings);
@@ -44,11 +46,15 @@ export function plant(box) {
       const [label, unit, size, digits] = SENSORS[of] ?? [of.replaceAll("_", " "), "", 1, 2];
       return [t(label), value === null ? t("no reading") : `${number(size * value, digits)} ${unit}`];
     }))] : []));
+    // Drawn anew only when it changes: what is unfolded keeps the keyboard's focus.
+    const order = JSON.stringify({ ...head.order, seconds: 0 });
+    if (order === proven) return;
+    proven = order;
     proof.replaceChildren(...(head.order.on ? [h("p", { className: "hx-said bad" },
       t("{act} of the field, ordered by {who}: {acknowledged} of {all} acknowledged, {done} done. {text}", { act: t(head.order.act), who: head.order.who, acknowledged: count(head.order.acknowledged), all: count(head.order.heliostats), done: count(head.order.done), text: head.order.text })), facts([
       [t("Measured"), head.order.measured ? t("the flux, below its limit") : t("nothing since the order")],
       [t("Seen to move today"), Object.entries(head.order.followed).map(([by, n]) => t("{n} by {by}", { n: count(n), by })).join(", ") || t("none")],
-      [t("Believed by reports alone"), head.order.believed.join(", ") + (head.order.believed_count > head.order.believed.length ? `, … (${count(head.order.believed_count)})` : "") || t("none")]])] : []));
+      [t("Believed by reports alone"), head.order.believed.length ? several(head.order.believed, "believed", unfolded, head.order.believed_count) : t("none")]])] : []));
   };
   const draw = () => {
     if (!seen) return;
@@ -294,17 +300,6 @@ function learning(box) {
   return refreshed(shown, { every: 5 });
 }
 
-// The first names of many, all of them on a click; a list that is drawn anew stays as it was.
-const FEW = 3;
-function several(names, key, shown) {
-  if (names.length <= FEW + 1) return h("b", {}, names.join(", "));
-  const rest = names.slice(FEW);
-  const box = h("details", { className: "hx-several", open: shown.has(key) },
-    h("summary", { title: names.join(", ") }, h("b", {}, names.slice(0, FEW).join(", ")), " ", t("and {n} more", { n: count(rest.length) })), rest.join(", "));
-  box.ontoggle = () => (box.open ? shown.add(key) : shown.delete(key));
-  return box;
-}
-
 // The points since the plant's last pause of an hour, or all while these span less than two minutes.
 function recent(points) {
   const begin = points.findLastIndex((p, i) => i > 0 && p.at - points[i - 1].at > 3600);
@@ -332,7 +327,7 @@ export function calibration(box) {
         truth ? [key(t("true (twin), median"), colourOf("SEARCHING")), key(t("90th percentile"), colourOf("SEARCHING"), true)] : ""),
       h("h3", {}, t("Error of all heliostats over the year (mrad), UTC")), outlookView(view, ahead, key),
       h("h3", {}, t("Last measurements")),
-      table([[t("Time"), (r) => clock(r.at)], [t("Heliostat"), (r) => r.heliostat], [t("Target"), (r) => r.target, "more"],
+      !view.results.length ? h("p", { className: "hx-hint" }, t("None yet.")) : table([[t("Time"), (r) => clock(r.at)], [t("Heliostat"), (r) => r.heliostat], [t("Target"), (r) => r.target, "more"],
         [t("Before"), (r) => mrad(r.before), "num"], [t("After"), (r) => mrad(r.after), "num"], [t("Predicted"), (r) => mrad(r.predicted), "num"],
         ...(truth ? [[t("True before → after"), (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"]] : []),
         ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
@@ -354,10 +349,11 @@ export function clusters(box) {
     const rank = (r) => (r.alive ? (r.live < r.heliostats ? 1 : 2) : 0);
     rows.sort((a, b) => rank(a) - rank(b) || a.name.localeCompare(b.name));
     body.replaceChildren(facts([[t("Heard"), t("{n} of {all}", { n: count(rows.filter((r) => r.alive).length), all: count(rows.length) })]]),
-      table([[t("Cluster"), (r) => r.name], ["", (r) => h("span", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? t("● healthy") : t("▲ degraded")) : t("✕ silent"))],
+      table([[t("Cluster"), (r) => [h("b", {}, r.name), h("div", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? t("● healthy") : t("▲ degraded")) : t("✕ silent")),
+        h("div", { className: "hx-hint" }, [r.acts.join(", "), r.problem].filter(Boolean).join("; "))]],
         [t("Heliostats"), (r) => `${r.live}/${r.heliostats}`, "num"], [t("Heard"), (r) => (r.age === null ? t("never") : `${number(r.age, 1)} s`), "num"],
-        [t("Poll (ms)"), (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "num"], [t("Answered"), (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
-        [t("Lease (s)"), (r) => number(r.lease_left, 1), "num"], [t("Clock"), (r) => r.time_quality], [t("Settings"), (r) => r.settings || t("not known")], ["", (r) => [r.acts.join(", "), r.problem].filter(Boolean).join("; ")]],
+        [t("Poll (ms)"), (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "most"], [t("Answered"), (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
+        [t("Lease (s)"), (r) => number(r.lease_left, 1), "most"], [t("Clock"), (r) => r.time_quality], [t("Settings"), (r) => r.settings || t("not known")]],
       rows, (r) => { const place = store.field.clusters.indexOf(r.name); store.select(store.field.cluster.flatMap((c, row) => (c === place ? [row] : [])), -1); }));
   }, { every: 3 });
 }
@@ -388,7 +384,7 @@ export function alarms(box) {
     body.replaceChildren(h("div", { className: "hx-row" }, h("b", {}, t("{open} not acknowledged, {active} active", { open: count(open.length), active: count(rows.filter((r) => r.active).length) })),
       canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(open), t("acknowledge all")) }, t("Acknowledge all")) : ""),
     rows.length ? table([["", (r) => h("span", { className: r.active ? (severe[r.severity] ?? "warn") : "" }, r.active ? (severe[r.severity] === "bad" ? "✕" : "▲") : "○")],
-      [t("Time"), (r) => clock(r.at)], [t("What"), (r) => h("div", {}, h("b", {}, r.condition, r.subject ? " · " : ""), r.subject ? several(r.rows.map((one) => one.subject), r.like, shown) : "", h("div", { className: "hx-hint" }, r.said))],
+      [t("Time"), (r) => clock(r.at)], [t("What"), (r) => h("div", {}, h("b", {}, r.condition, r.subject ? " · " : ""), r.subject ? several(r.rows.map((one) => one.subject), r.like, shown) : "", h("div", { className: "hx-hint" }, r.said.replace(`${r.condition}: `, "")))],
       ["", (r) => (r.active ? t("active") : t("over"))],
       ["", (r) => (r.acknowledged_by ? `✓ ${r.acknowledged_by}` : canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => acknowledge(r.rows), t("acknowledge")) }, t("Acknowledge")) : t("not acknowledged"))],
       ["×", (r) => r.rows.reduce((sum, one) => sum + one.count, 0), "num"]], alike(rows)) : h("p", { className: "hx-hint" }, t("No alarms.")));
@@ -408,6 +404,19 @@ function eventText(r) {
   return box;
 }
 
+// The text of a command; what each heliostat does, or why it refused, when it is unfolded.
+const unfoldedCommands = new Set();
+function ticketText(r) {
+  const kind = r.finished ? (r.good ? "good" : "warn") : "", each = Object.entries(r.refusals).concat(Object.entries(r.steps).filter(([name]) => !(name in r.refusals)));
+  if (r.heliostats < 2 || !each.length) return h("span", { className: kind }, r.text);
+  const reasons = new Map();
+  for (const [name, why] of each) reasons.set(why, [...(reasons.get(why) ?? []), name]);
+  const box = h("details", { className: "hx-several", open: unfoldedCommands.has(r.identity) }, h("summary", { className: kind, title: t("Show the {n} heliostats", { n: count(each.length) }) }, r.text),
+    [...reasons].map(([why, names]) => h("div", { className: "hx-hint" }, `${names.join(", ")}: ${why}`)));
+  box.ontoggle = () => (box.open ? unfoldedCommands.add(r.identity) : unfoldedCommands.delete(r.identity));
+  return box;
+}
+
 export function logs(box) {
   let which = "events", filter = "";
   const body = h("div"), past = journal(), tabs = [word("events"), word("journal"), word("packets"), word("commands")].map((name) => h("button", { className: "hx-button", type: "button", value: name, onclick: () => { which = name; mark(); load(); } }, t(name)));
@@ -416,7 +425,7 @@ export function logs(box) {
   const columns = {
     events: [[t("Time"), (r) => moment(r.at)], [t("Kind"), (r) => t(r.kind)], [t("Who"), (r) => r.who], ["", eventText]],
     packets: [[t("Time"), (r) => clock(r.at)], [t("Cluster"), (r) => `${r.way === "to" ? "→" : "←"} ${r.cluster}`], [t("Kind"), (r) => r.kind], [t("Bytes"), (r) => r.size, "num"], ["", (r) => h("code", {}, r.text)]],
-    commands: [[t("Command"), (r) => r.command], [t("Heliostats"), (r) => count(r.heliostats), "num"], ["", (r) => h("span", { className: r.finished ? (r.good ? "good" : "warn") : "" }, r.text)]],
+    commands: [[t("Command"), (r) => r.command], [t("Heliostats"), (r) => count(r.heliostats), "num"], ["", (r) => ticketText(r)]],
   };
   const load = async () => {
     find.hidden = which === "journal";
@@ -496,7 +505,7 @@ async function removeEntry(rows, name) {
 }
 
 export function schedule(box) {
-  const body = h("div");
+  const body = h("div"), unfolded = new Set();
   box.append(body);
   return refreshed(async () => {
     const [plan, retries, holds, progress, timed] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "retries"), api("GET", "holds"), api("GET", "calibration"), api("GET", "timetable")]);
@@ -506,7 +515,7 @@ export function schedule(box) {
         : h("p", { className: "hx-hint" }, t("No measurement is planned.")),
       h("h3", {}, t("Timetable")),
       canCommand() ? h("button", { className: "hx-button", onclick: () => addEntry(timed) }, t("Calibrate at times, first or never…")) : "",
-      timed.length ? table([[t("Entry"), (r) => r.name], [t("Heliostats"), (r) => r.heliostats.join(", ")], [t("Target"), (r) => r.target || t("any")],
+      timed.length ? table([[t("Entry"), (r) => r.name], [t("Heliostats"), (r) => several(r.heliostats, r.name, unfolded)], [t("Target"), (r) => r.target || t("any")],
         [t("When"), (r) => (r.rule ? t(r.rule) : [...r.at, ...(r.every_s ? [t("every {time}", { time: span(r.every_s) })] : [])].join(", "))], [t("Next"), (r) => minute(r.next)], [t("Last"), (r) => minute(r.last)], [t("Result"), (r) => r.text],
         ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => removeEntry(timed, r.name) }, t("Remove…")) : "")]], timed)
         : h("p", { className: "hx-hint" }, t("Empty.")),

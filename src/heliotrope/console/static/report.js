@@ -30,13 +30,13 @@ function sheet(found) {
   const [begin, end] = [found.errors[0], found.errors.at(-1)];
   return [
     h("h1", {}, t("Shift report: {plant}", { plant: found.plant })),
-    h("p", {}, `${moment(found.since)} – ${moment(found.until)} UTC`, h("span", { className: "hx-hint" }, ` · ${t("made {at} UTC, figures for {hours} of it", { at: moment(found.made), hours: hours(found.recorded) })}`)),
+    h("p", {}, `${moment(found.since)} – ${moment(found.until)} UTC`, h("span", { className: "hx-hint" }, ` · ${t("created {at} UTC, with data for {hours} of this period", { at: moment(found.made), hours: hours(found.recorded) })}`)),
     h("h2", {}, t("Production")),
-    facts([...found.production.flatMap((one) => [[t("Energy into {name}, predicted", { name: one.receiver }), `${number(one.energy / 3.6e9, 3)} MWh`], [t("Largest power"), `${number(one.peak / 1e6, 2)} MW, ${moment(one.peak_at)}`]]),
+    facts([...found.production.flatMap((one) => [[t("Energy into {name}, predicted", { name: one.receiver }), `${number(one.energy / 3.6e9, 3)} MWh`], [t("Peak power"), `${number(one.peak / 1e6, 2)} MW, ${moment(one.peak_at)}`]]),
       [t("Direct sunlight"), found.sunshine === null ? t("no reading") : `${number(found.sunshine / 3.6e6, 2)} kWh/m²`], [t("Sun above the horizon"), hours(found.daylight)]]),
     found.power.length > 1 ? powerCurve(found) : "",
     h("h2", {}, t("Availability")),
-    facts([[t("Of the heliostats, by day"), percent(found.availability)], ...Object.entries(found.lacks).map(([why, s]) => [t(why), s === null ? "–" : t("{hours} heliostat hours", { hours: number(s / HOUR, 1) })])]),
+    facts([[t("Heliostats available in daylight"), percent(found.availability)], ...Object.entries(found.lacks).map(([why, s]) => [t(why), s === null ? "–" : t("{hours} heliostat-hours", { hours: number(s / HOUR, 1) })])]),
     h("h2", {}, t("Calibrations")),
     facts(Object.entries(found.outcomes).map(([outcome, n]) => [t(outcome.replaceAll("_", " ")), count(n)])),
     begin ? table([["", (r) => moment(r.at)], [t("Calibrated"), (r) => count(r.calibrated), "num"], [t("Median error (mrad)"), (r) => mrad(r.median), "num"], [t("90th percentile (mrad)"), (r) => mrad(r.percentile_90), "num"]], [begin, end]) : "",

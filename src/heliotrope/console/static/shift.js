@@ -17,8 +17,8 @@ export function shift(box) {
   // What was typed stays until the plant has it.
   const keep = async () => { await api("POST", "notes", { text: text.value.replace(/\s+/g, " ").trim() }); text.value = ""; await load(); };
   box.append(h("h3", {}, t("Report")), h("div", { className: "hx-row hx-search" }, open(t("Last 8 hours"), () => 0, () => 0), open(t("Today"), midnight, () => 0), open(t("Yesterday"), () => midnight() - DAY, midnight)),
-    h("p", { className: "hx-hint" }, t("Production, availability, calibrations, alarms, work and notes of a time, to be printed.")),
+    h("p", { className: "hx-hint" }, t("Production, availability, calibrations, alarms, work and notes for a period, ready to print.")),
     h("h3", {}, t("Hand-over notes")),
-    me.role === "viewer" ? "" : h("form", { className: "hx-note", onsubmit: (event) => { event.preventDefault(); act(keep, t("note")); } }, text, h("button", { className: "hx-button main" }, t("Keep note"))), notes);
+    me.role === "viewer" ? "" : h("form", { className: "hx-note", onsubmit: (event) => { event.preventDefault(); act(keep, t("note")); } }, text, h("button", { className: "hx-button main" }, t("Save note"))), notes);
   return refreshed(load, { key: () => store.head?.events, every: 10 });
 }

@@ -43,11 +43,11 @@ export function fluxPoint(canvas, view, event) {
   return x >= 0 && x <= 1 && y >= 0 && y <= 1 ? [(2 * x - 1) * halfOf(view.right), (1 - 2 * y) * halfOf(view.up)] : null;
 }
 
-export function drawFlux(canvas, view) {
+export function drawFlux(canvas, view, high = 190, letter = 11) {
   const rows = view.flux.length, columns = view.flux[0].length, peak = Math.max(1, ...view.flux.flat());
-  const c = canvas.getContext("2d"), high = 190, aspect = (view.right.at(-1) - view.right[0]) / Math.max(0.1, view.up.at(-1) - view.up[0]);
-  const room = canvas.parentElement.clientWidth - 90, wide = Math.round(Math.max(120, Math.min(room, high * aspect)));
-  canvas.width = wide + 84; canvas.height = high + 22;
+  const c = canvas.getContext("2d"), aspect = (view.right.at(-1) - view.right[0]) / Math.max(0.1, view.up.at(-1) - view.up[0]);
+  const beside = 18 + 6 * letter, below = 2 * letter, room = canvas.parentElement.clientWidth - beside - 6, wide = Math.round(Math.max(120, Math.min(room, high * aspect)));
+  canvas.width = wide + beside; canvas.height = high + below;
   const image = new ImageData(columns, rows);
   for (let y = 0; y < rows; y++) for (let x = 0; x < columns; x++) {
     const [r, g, b] = cividis(view.flux[rows - 1 - y][x] / peak);
@@ -58,7 +58,7 @@ export function drawFlux(canvas, view) {
   c.drawImage(small, 0, 0, wide, high);
   const ink = dark() ? "#c9d1d9" : "#24292f";
   for (let i = 0; i < high; i++) { c.fillStyle = `rgb(${cividis(1 - i / high).join(",")})`; c.fillRect(wide + 12, i, 12, 1); }
-  c.fillStyle = ink; c.font = "11px system-ui, sans-serif"; c.textAlign = "left";
-  c.fillText(number(peak / 1e3, 0), wide + 28, 10); c.fillText("kW/m²", wide + 28, 24); c.fillText("0", wide + 28, high);
-  c.fillText(t("{width} × {height} m, seen from the field", { width: number(2 * halfOf(view.right), 1), height: number(2 * halfOf(view.up), 1) }), 0, high + 16);
+  c.fillStyle = ink; c.font = `${letter}px system-ui, sans-serif`; c.textAlign = "left";
+  c.fillText(number(peak / 1e3, 0), wide + 28, letter - 1); c.fillText("kW/m²", wide + 28, 2.2 * letter); c.fillText("0", wide + 28, high);
+  c.fillText(t("{width} × {height} m, seen from the field", { width: number(2 * halfOf(view.right), 1), height: number(2 * halfOf(view.up), 1) }), 0, high + 1.5 * letter);
 }

@@ -29,6 +29,7 @@ export function heliostats(box) {
   const which = h("input", { type: "search", className: "hx-query", placeholder: t("all; or state = TRACKING and error > 1"), ariaLabel: t("Rows"), title: t("Names or conditions, as above the map; empty: all") });
   const number = h("span", { className: "hx-hint" }), head = h("div", { className: "hx-grid-row head", role: "row" }), body = h("div", { className: "hx-grid-body" });
   const grid = h("div", { className: "hx-grid", role: "grid", tabIndex: 0 }, head, body);
+  const lines = new Map(); // the rows in the page, by their places
   const kept = h("select", { ariaLabel: t("Saved selections"), onchange: () => take(kept.value) });
 
   const sorted = () => {
@@ -42,15 +43,24 @@ export function heliostats(box) {
     body.style.height = `${rows.length * HIGH}px`;
     draw();
   };
-  const draw = () => {
-    const first = Math.max(0, Math.floor(grid.scrollTop / HIGH) - 5), most = Math.ceil((grid.clientHeight || 600) / HIGH) + 10;
-    body.replaceChildren(...rows.slice(first, first + most).map((row, k) => {
-      const line = h("div", { className: "hx-grid-row", role: "row", ariaSelected: store.selection.has(row), onclick: (event) => pick(first + k, event) },
-        COLUMNS.map(([, text, , right]) => h("span", { role: "gridcell", className: right ? "num" : "" }, text(row))));
-      line.style.top = `${(first + k) * HIGH}px`;
-      return line;
-    }));
+  const lineOf = (place) => {
+    const row = rows[place], line = h("div", { className: "hx-grid-row", role: "row", ariaSelected: store.selection.has(row), onclick: (event) => pick(place, event) },
+      COLUMNS.map(([, text, , right]) => h("span", { role: "gridcell", className: right ? "num" : "" }, text(row))));
+    line.style.top = `${place * HIGH}px`;
+    return line;
   };
+  // Makes only the rows that come into view: making all of them takes longer than a frame.
+  const slide = () => {
+    const first = Math.max(0, Math.floor(grid.scrollTop / HIGH) - 5), end = Math.min(rows.length, first + Math.ceil((grid.clientHeight || 600) / HIGH) + 10);
+    for (const [place, line] of lines) if (place < first || place >= end) { line.remove(); lines.delete(place); }
+    const least = Math.min(...lines.keys()), above = [], below = [];
+    for (let place = first; place < end; place++) if (!lines.has(place)) {
+      lines.set(place, lineOf(place));
+      (place < least ? above : below).push(lines.get(place));
+    }
+    body.prepend(...above); body.append(...below);
+  };
+  const draw = () => { lines.clear(); body.replaceChildren(); slide(); };
   // A click selects one; with Ctrl one more or one less, with Shift all up to it.
   const pick = (at, event) => {
     const row = rows[at], chosen = event.ctrlKey || event.metaKey || event.shiftKey ? new Set(store.selection) : new Set();
@@ -78,7 +88,7 @@ export function heliostats(box) {
   const button = (title, go, main) => h("button", { className: `hx-button ${main ?? ""}`, onclick: go }, title);
   which.addEventListener("keydown", (event) => { if (event.key === "Enter") sorted(); event.stopPropagation(); });
   which.addEventListener("search", sorted);
-  grid.addEventListener("scroll", draw);
+  grid.addEventListener("scroll", slide);
   box.append(h("div", { className: "hx-row hx-search" }, which, button(t("Show"), sorted, "main"), number), h("div", { className: "hx-row hx-search" },
     button(t("Select these"), () => store.select(rows, rows.length === 1 ? rows[0] : -1)), button(t("Show the selection"), () => { which.value = store.selected().join(" "); sorted(); }), button(t("Save selection…"), keep), kept, button(t("Save as CSV"), csv)), grid);
   list(); sorted();

@@ -1,6 +1,6 @@
 // Trends of any quantity over days beside their events: drag to zoom, wheel, buttons to move, export.
 import { api } from "./live.js";
-import { clock, h, moment, saveCsv, table } from "./dom.js";
+import { clock, h, moment, saveCsv, several, table } from "./dom.js";
 import { monthDay, plain, t } from "./words.js";
 
 const { uPlot } = window, DAY = 86400, MOST = 6;
@@ -12,7 +12,7 @@ document.documentElement.classList.toggle("light", localStorage.getItem("heliotr
 const [form, tools] = [document.querySelector("form"), document.querySelector("form + div")], said = document.querySelector("[role=status]");
 const charts = document.querySelector("#charts"), events = document.querySelector("#events"), synced = uPlot.sync("trends");
 // A quantity is a kind of figure, and after a dot what it is of: a receiver, a state, a sensor.
-const named = (quantity) => { const [kind, of] = quantity.replaceAll("_", " ").split(/\.(.*)/); return of ? `${t(kind)}: ${kind === "state" ? t(of) : of}` : t(kind); };
+const named = (quantity) => { const [kind, of] = quantity.replaceAll("_", " ").split(/\.(.*)/), text = of ? `${t(kind)}: ${kind === "state" ? t(of) : of}` : t(kind); return text[0].toUpperCase() + text.slice(1); };
 const titleOf = (key) => { const [name, whose] = key.split("@"); return whose ? `${named(name)}, ${whose}` : named(name); };
 const tell = (text, bad) => { said.textContent = text; said.classList.toggle("bad", Boolean(bad)); };
 const asked = new URLSearchParams(location.search);
@@ -44,11 +44,14 @@ tools.append(button(t("Day"), () => lately(1)), button(t("Week"), () => lately(7
   h("span", { className: "hx-hint" }, t("Drag over a chart to zoom in; the wheel zooms; a double click shows the last day.")));
 
 const COLOURS = { alarm: "--bad", command: "--blue", note: "--good", event: "--soft" };
+// Beneath the lines. Marks that would stand closer than GAP are drawn as one, alarms before others.
+const GAP = 3;
 function drawMarks(plot) {
-  const { ctx, bbox } = plot;
-  for (const one of marks.slice(0, 400)) {
-    const x = plot.valToPos(one.at, "x", true);
-    if (x < bbox.left || x > bbox.left + bbox.width) continue;
+  const { ctx, bbox } = plot, taken = new Set(), alarm = (one) => Number(one.kind === "alarm");
+  for (const one of marks.toSorted((a, b) => alarm(b) - alarm(a))) {
+    const x = plot.valToPos(one.at, "x", true), place = Math.round(x / GAP);
+    if (x < bbox.left || x > bbox.left + bbox.width || taken.has(place)) continue;
+    taken.add(place);
     ctx.strokeStyle = css(COLOURS[one.kind] ?? "--soft"); ctx.lineWidth = 1; ctx.globalAlpha = 0.7;
     ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke(); ctx.globalAlpha = 1;
   }
@@ -63,13 +66,14 @@ function draw(one) {
   const plot = new uPlot({ width: box.clientWidth - 22, height: 200, cursor: { sync: { key: synced.key }, drag: { x: true, y: false, setScale: false } }, tzDate: (at) => uPlot.tzDate(new Date(at * 1e3), "UTC"),
     scales: { x: { min: since, max: until } }, axes: [{ ...axis, values: times }, { ...axis, size: 64, values: (_, splits) => splits.map(plain) }], legend: { live: true },
     series: [{ label: "UTC", value: (_, at) => moment(at) }, { label: t("mean"), value: amount, stroke: blue, width: 1.6, points: { show: few } }, { label: t("low"), value: amount, stroke: "transparent", points: { show: false } }, { label: t("high"), value: amount, stroke: "transparent", points: { show: false } }],
-    bands: [{ series: [3, 2], fill: `${blue}30` }], hooks: { draw: [drawMarks], setSelect: [(made) => { const { left, width } = made.select; if (width > 4) { [since, until] = [made.posToVal(left, "x"), made.posToVal(left + width, "x")]; load(); } }] } },
+    bands: [{ series: [3, 2], fill: `${blue}30` }], hooks: { drawAxes: [drawMarks], setSelect: [(made) => { const { left, width } = made.select; if (width > 4) { [since, until] = [made.posToVal(left, "x"), made.posToVal(left + width, "x")]; load(); } }] } },
   [one.at, one.mean, one.low, one.high], box);
   plot.over.addEventListener("wheel", (event) => { event.preventDefault(); const at = plot.posToVal(event.offsetX, "x"), size = event.deltaY > 0 ? 1.4 : 1 / 1.4; [since, until] = [at - (at - since) * size, at + (until - at) * size]; soon(); }, { passive: false });
   plot.over.addEventListener("dblclick", () => lately(1));
   plot.root.setAttribute("role", "img"); plot.root.setAttribute("aria-label", one.title);
 }
 
+const unfolded = new Set();
 let waits = 0;
 const soon = () => { clearTimeout(waits); waits = setTimeout(() => load(), 150); };
 // The last asked for wins: an earlier answer that comes late is left.
@@ -91,9 +95,10 @@ async function load(days = 1) {
     history.replaceState(null, "", `?${new URLSearchParams([...chosen.map((key) => ["q", key]), ["since", since.toFixed(0)], ["until", until.toFixed(0)]])}`);
     charts.replaceChildren(...(chosen.length ? [] : [h("p", { className: "hx-hint" }, t("Choose a quantity and press Add."))]));
     found.forEach(draw);
-    events.replaceChildren(entries.length ? table([[t("Time"), (r) => moment(r.at)], [t("Kind"), (r) => t(r.kind)], [t("What"), (r) => (r.kind === "event" ? t(r.what) : r.what)], ["", (r) => r.text]], entries.slice(0, 100)) : h("p", { className: "hx-hint" }, t("None.")));
+    events.replaceChildren(entries.length ? table([[t("Time"), (r) => moment(r.at)], [t("Kind"), (r) => t(r.kind)], [t("What"), (r) => (r.kind === "event" ? t(r.what) : r.what)], ["", (r) => (r.heliostats.length ? [several(r.heliostats, `${r.at}${r.what}`, unfolded), " ", r.text] : r.text)]], entries.slice(0, 100)) : h("p", { className: "hx-hint" }, t("None.")));
   } catch (error) { if (mine === latest) tell(error.message, true); }
 }
 if (!chosen.length && known.length) chosen = [known.find((one) => one.name.startsWith("power."))?.name ?? known[0].name];
+if (chosen.length) { [quantity.value] = chosen[0].split("@"); mark(); }
 new ResizeObserver(() => { if (charts.clientWidth !== charts.dataset.wide) { charts.dataset.wide = charts.clientWidth; if (shown.length) { charts.replaceChildren(); shown.forEach(draw); } } }).observe(document.body);
 await load();

@@ -24,7 +24,7 @@ function figures(box) {
     })));
   };
   store.on("frame", show);
-  if (name) refreshed(async () => { seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`); drawFlux(flux, seen); show(); }, { every: 10 });
+  if (name) refreshed(async () => { seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`); drawFlux(flux, seen, 300, 15); show(); }, { every: 10 });
   refreshed(async () => {
     const rows = (await api("GET", "alarms")).filter((one) => one.active || !one.acknowledged_by);
     alarms.replaceChildren(...(rows.length ? rows.slice(0, 12).map((one) => h("p", { className: `hx-wall-alarm ${one.active ? SEVERE[one.severity] ?? "warn" : ""}` }, h("b", {}, `${one.active ? "▲" : "○"} ${clock(one.at)} ${one.subject}`), ` ${one.text}`)) : [h("p", { className: "good" }, t("No alarms."))]),

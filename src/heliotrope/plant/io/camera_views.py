@@ -47,7 +47,8 @@ class Views:
         if reading.spots:
             x, y = reading.spots[0].plane
             centroid = float(x), float(y)
-            lines.insert(0, f"{len(reading.spots)} spot(s), {x:+.3f} m right, {y:+.3f} m up")
+            spots = "1 spot" if len(reading.spots) == 1 else f"{len(reading.spots)} spots"
+            lines.insert(0, f"{spots}, {x:+.3f} m right, {y:+.3f} m up")
         version = self.view(name).version + 1
         self._views[name] = CameraView(name, version, at, jpeg, tuple(lines), centroid)
 

@@ -111,7 +111,9 @@ class Logbook:
         self._alarms[key] = AlarmRow(**vars(alarm), at=at, acknowledged_by=by, count=max(count, 1))
         if new or (known is not None and known.active != alarm.active):
             over = "" if alarm.active else " (over)"
-            self.event("alarm", alarm.subject, f"{alarm.condition}: {alarm.text}{over}")
+            # A condition of the safety table names itself in its text.
+            text = alarm.text.removeprefix(f"{alarm.condition}: ")
+            self.event("alarm", alarm.subject, f"{alarm.condition}: {text}{over}")
             if self.forward is not None:
                 self.forward(alarm)
             if self._records is not None:

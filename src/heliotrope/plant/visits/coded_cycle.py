@@ -360,7 +360,7 @@ class CodedCycle(ABC):
         """Refuse to continue without any heliostat."""
         if not visit.visits:
             why = next(iter(visit.lost.values()), "")
-            raise RefusedError(f"{self.kind} to {visit.target.name}: nobody is left; {why}")
+            raise RefusedError(f"{self.kind} to {visit.target.name}: no heliostat is left; {why}")
 
     async def _next(self, visit: CodedVisit, light: Light, taken: _Taken) -> Exposed:
         """Take a photograph; few await evaluation, so an unusable one ends the visit soon."""

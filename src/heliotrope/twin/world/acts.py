@@ -328,7 +328,7 @@ class Acts:
         self._withheld.add(name)
 
     def emergency(self, operations: Operations, person: Person, act: Act) -> None:
-        """Raise an emergency, on which automatic control releases every heliostat it holds."""
+        """Raise an emergency: automatic control releases all heliostats that it holds."""
         self._watch.taken(self.names)
         stand = {call.who: Act[call.act] for call in operations.plant.sentinel.calls}
         operations.emergency(person, act.name, "somebody is in the field")
