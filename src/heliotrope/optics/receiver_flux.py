@@ -405,7 +405,7 @@ class _Grid:
         flux += sums.sum(axis=0)
 
     def images(self, looks: int, field: Any, reach: IntArray) -> Images:
-        """Return single images; ``field`` has one row per image."""
+        """Return single images; the mirror table in ``field`` has one row per image."""
         low, step, rows, area = self._grid
         most, count = int(reach.max(initial=0)), len(field[0])
         tall = (low - most * step, step, rows + 2 * most, area)

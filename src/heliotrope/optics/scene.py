@@ -80,7 +80,7 @@ class Mirrors:
         Focal length of the whole mirror, from curvature and canting, m, (H,); infinite if flat.
     aim
         Intended aim of each beam, ENU m, (H, 3). The normal determines the actual direction of the
-        beam; the aim is used only for blocking and for the distance of attenuation.
+        beam; the aim only sets the distance for blocking and attenuation.
     slope
         Standard deviation of the surface's normal per axis, rad, (H,).
     reflectivity, clean

@@ -186,7 +186,7 @@ class Ledger(Part):
         return np.asarray(self._kinds[kind].sent >= at)
 
     def later(self, kind: Kind, other: Kind) -> Mask:
-        """Return a mask of the heliostats last sent one kind of order after another kind, (N,)."""
+        """Return a mask of the heliostats last sent one kind of order after the other, (N,)."""
         return np.asarray(self._kinds[kind].number > self._kinds[other].number)
 
     def obeyed_since(self, kind: Kind, at: float, after: Kind) -> Mask:
