@@ -1,7 +1,7 @@
 """`heliotrope ctl` at the plant itself: the API's requests over the local interface.
 
-It needs no console, and EMERGENCY, DEFOCUS and STOW take the plant's own socket for them, with no
-valid token either. Nothing heavy is imported: an emergency starts at once.
+No console is needed. EMERGENCY, DEFOCUS and STOW use a separate socket of the plant, even without a
+valid token. No heavy library is imported, so that an emergency starts at once.
 """
 
 import json

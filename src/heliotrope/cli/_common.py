@@ -37,7 +37,7 @@ def parse_time(text: str) -> datetime:
 
 
 def day_of(time: datetime, site: "Site") -> date:
-    """Return the day of a time: for UTC the site's own day, else the day in its time zone."""
+    """Return the day of a time: for UTC the site's own day, otherwise the day in its time zone."""
     from heliotrope.sun import solar_day
 
     return time.date() if time.utcoffset() else solar_day(time, site)
@@ -49,7 +49,7 @@ def sunlit(time: datetime, site: "Site", every: str, least: float = 1.0) -> "pd.
     Raises
     ------
     InputError
-        If the sun does not rise on that day, or the interval is none or too short.
+        If the sun does not rise on that day, or the interval is invalid or too short.
     """
     from heliotrope.sun import daylight
 
@@ -91,7 +91,7 @@ def parse_numbers(
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    # NaN lies within no limits.
+    # NaN is not within any limits.
     if len(values) not in ({count} if count else range(1, 1000)) or not all(
         least <= value <= most for value in values
     ):
@@ -131,7 +131,7 @@ def print_json(value: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value that JSON can hold; NaN and infinity become None."""
+    """Return a value that JSON can represent; NaN and infinity become None."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

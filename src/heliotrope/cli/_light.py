@@ -160,7 +160,7 @@ def _tower(text: str) -> "Tower":
 
     refusal = f"--tower {shown(text)}: write four numbers in m as east,north,radius,top"
     east, north, radius, top = parse_numbers(text, refusal, count=4)
-    # Its foot lies below the ground of any field.
+    # The foot of the tower is below the ground of any field.
     return Tower(east, north, radius, min(top - 1.0, -1e4), top)
 
 

@@ -45,7 +45,8 @@ def start_of(command: str, text: str, design: "Plant") -> "datetime":
     Raises
     ------
     TimeError
-        No time, or one that local controllers cannot count: 32 bits of GPS seconds, from 1980.
+        If the time is invalid, or local controllers cannot count it: 32 bits of GPS seconds, from
+        1980.
     """
     from datetime import UTC, date, datetime, timedelta
     from datetime import time as hour

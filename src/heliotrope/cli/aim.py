@@ -203,7 +203,7 @@ def _wanted(text: str) -> "FluxLimit | None":
 
 
 def _print_ramp(chosen: "AimPlan", joins: "FloatArray") -> None:
-    """Print how the start-up goes: a line for each quarter of the power."""
+    """Print the course of the start-up: one line per quarter of the power."""
     import numpy as np
 
     order = np.argsort(joins)

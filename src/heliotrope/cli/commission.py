@@ -183,7 +183,7 @@ def _fleets(
     flight: tuple[int, int],
     quiet: bool,
 ) -> "tuple[list[Fleet], Any, dict[str, Any] | None]":
-    """Return what is known about the heliostats, the measured ones, and the flight's results."""
+    """Return the knowledge of the heliostats, the measured heliostats, and the flight's results."""
     import numpy as np
 
     from heliotrope.calibration.plan.fleets import fleets_of
@@ -210,7 +210,7 @@ def _fleets(
 def _flown(
     plant: "Plant", fleets: "list[Fleet]", model: str, flight: tuple[int, int], quiet: bool
 ) -> "tuple[list[Fleet], dict[str, Any]]":
-    """Return the fleets after a flight, with each heliostat as the middle one of its cluster."""
+    """Return the fleets after a flight, where each heliostat stands for its whole cluster."""
     import numpy as np
 
     from heliotrope.airborne.plan import Craft, PlanSettings, PointSelection, plan_flight

@@ -40,7 +40,7 @@ AimOption = Annotated[
 TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of this target.")]
 
 
-#: Largest distance of an aim from a target that it is on, m.
+#: Largest distance from a target at which an aim counts as on it, m.
 _ON = 0.01
 _TAKE = "recommended pose; shading and blocking by other mirrors are not considered"
 _NEAREST = "the nearest pose: the beam does not reach its aim"
@@ -98,7 +98,7 @@ def track(
     from heliotrope.geometry import normalize
     from heliotrope.mechanism import track_path, tracking
 
-    # With a given sun the place on Earth does not matter, even to a format that has none.
+    # If the sun vector is specified, the site does not matter, even for a format without one.
     anywhere = sun is not None and field.suffix.lower() in (".csv", ".txt", ".tsv", ".xml")
     plant = _opened(field, site or ("0,0,0" if anywhere else ""), calibration)
     mechanism = plant[heliostat].calibrated
@@ -155,7 +155,7 @@ def track(
 
 
 def _opened(field: Path, place: str, calibration: Path | None) -> "Plant":
-    """Open a field at a place, "" for its own, with a calibration."""
+    """Open a field at a site, "" for its own, with a calibration."""
     plant = open_plant(field, parse_site(place) if place else None)
     if calibration is None:
         return plant
@@ -165,7 +165,7 @@ def _opened(field: Path, place: str, calibration: Path | None) -> "Plant":
 
 
 def _check(every: str | None, law: str, local: bool, trace: bool, target: str | None) -> None:
-    """Refuse options that do not fit together."""
+    """Refuse options that exclude each other."""
     if local and target is not None:
         raise InputError("--target is not fixed to a mirror; use --aim, or leave out --local")
     if law == "guo" and (every is not None or local or trace):
@@ -180,7 +180,7 @@ def _check(every: str | None, law: str, local: bool, trace: bool, target: str | 
 
 
 def _check_sun(heliostat: str, vector: "np.ndarray", time: str) -> None:
-    """Refuse a sun that lights no mirror."""
+    """Refuse a sun direction that lights no mirror."""
     if vector[2] <= 0.0:
         below = f"the sun is {math.degrees(abs(math.asin(vector[2]))):.2f}° below the horizon"
         when = f" at {time}" if time else ""
@@ -188,13 +188,13 @@ def _check_sun(heliostat: str, vector: "np.ndarray", time: str) -> None:
 
 
 def _check_pose(heliostat: str, status: "TrackingStatus") -> None:
-    """Refuse an outcome without a pose that a mirror can take."""
+    """Refuse an outcome without a pose that the heliostat can reach."""
     if status.name in ("NOT_CONVERGED", "DEGENERATE", "BEHIND"):
         raise InputError(f"heliostat {heliostat}: {status.text}; choose another aim")
 
 
 def _sun_of(field: Path) -> "np.ndarray | None":
-    """Return the sun of a HelioK file, (3,); None for other files and where it gives none."""
+    """Return the sun vector of a HelioK file, (3,); None for other files and if it has none."""
     if field.suffix.lower() != ".xml":
         return None
     from heliotrope.field.formats import heliok
@@ -205,7 +205,7 @@ def _sun_of(field: Path) -> "np.ndarray | None":
 
 
 def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) -> Any:
-    """Return the aim that options name, else the heliostat's own, else the first target, (3,)."""
+    """Return the aim from the options, else the heliostat's own, else the first target, (3,)."""
     if aim is not None and target is not None:
         raise InputError("give --aim or --target, not both")
     if aim is not None:
@@ -221,7 +221,7 @@ def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) 
 
 
 def _local_aim(plant: "Plant", heliostat: str, aim: str | None) -> Any:
-    """Return the point fixed to the mirror that --aim or the heliostat's own aim names, (3,)."""
+    """Return the point fixed to the mirror from --aim or the heliostat's own aim, (3,)."""
     if aim is not None:
         return parse_point(aim, "aim")
     own = plant[heliostat].aim
@@ -239,8 +239,8 @@ def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray"
     Raises
     ------
     InputError
-        If the aim is on a target or an aperture whose back the mirror sees, or a target stands
-        before it.
+        If the aim is on a target or an aperture whose back faces the mirror, or a target is in
+        front of it.
     """
     import numpy as np
 
@@ -267,7 +267,7 @@ def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray"
 
 
 def _trace(heliostat: str, steps: "tuple[TraceStep, ...]", as_json: bool) -> None:
-    """Print the table of iterations, as HelioK's debug output has it."""
+    """Print the table of iterations in the form of HelioK's debug output."""
     import numpy as np
 
     if as_json:

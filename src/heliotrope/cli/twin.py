@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from heliotrope.twin.program import TwinProgram
 
-#: Line on standard output once the folder is written and the server answers.
+#: Line on standard output once the folder is written and the server responds.
 READY = "ready"
 
 
@@ -140,7 +140,7 @@ def _run(program: "TwinProgram", *, child: bool) -> None:
     async def main() -> None:
         loop, ending = asyncio.get_running_loop(), asyncio.Event()
         if child:
-            # Ctrl-C in the terminal is the plant's.
+            # Ctrl-C in the terminal is meant for the plant.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
 
             def wait() -> None:

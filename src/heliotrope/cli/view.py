@@ -16,10 +16,10 @@ from heliotrope.cli.track import (
 )
 from heliotrope.errors import InputError
 
-#: Simulated time that passes in a second of the animation, s.
+#: Simulated time per second of the animation, s.
 _PACE = 3600.0
 
-#: Shortest time between two poses, s: a page of 30 s holds 2,000, and 10 MB.
+#: Shortest time between two poses, s; a page of 30 s contains 2,000 poses, 10 MB.
 _LEAST = 30.0
 
 

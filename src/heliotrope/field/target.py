@@ -123,11 +123,11 @@ class Target(Value):
         return np.stack([right, np.cross(self.normal, right)])
 
     def plane_coordinates(self, points: npt.ArrayLike) -> FloatArray:
-        """Return metres to the right of and above the centre, (..., 2), for ENU points (..., 3)."""
+        """Convert ENU points (..., 3) to offsets right of and above the centre, m, (..., 2)."""
         return (as_vectors(points, "points") - self.center) @ self.axes.T
 
     def point(self, plane: npt.ArrayLike) -> FloatArray:
-        """Return ENU points (..., 3) from metres to the right of and above the centre (..., 2)."""
+        """Convert offsets right of and above the centre, m, (..., 2), to ENU points (..., 3)."""
         return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
 
     def holds(self, points: npt.ArrayLike, off: float = _DEPTH) -> npt.NDArray[np.bool_]:

@@ -96,10 +96,10 @@ def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, Rows]:
 def end_down_the_path(
     pose: Pose, path: FloatArray, place: Rows, begin: FloatArray, defocus: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where on the safe path a DEFOCUS ends, below a point on that path: `Motion._turn`.
+    """Return the points at which DEFOCUS ends for heliostats on their safe paths: `Motion._turn`.
 
-    A heliostat moves back down until an axis has turned by its angle or the beam reaches the
-    ground.
+    A heliostat moves back down its path until an axis has turned through its defocus angle or the
+    beam reaches the ground.
 
     Parameters
     ----------
@@ -108,14 +108,14 @@ def end_down_the_path(
     path
         Safe paths, (K, P, 3), m.
     place
-        Number of path points below each heliostat's beam, (K,); 0: it does not move back.
+        Number of path points below each heliostat's beam, (K,); 0: the beam does not move back.
     begin, defocus
-        Present angles, and the turns of the axes, rad, (K, 2).
+        Present angles, and defocus angles of the axes, rad, (K, 2).
 
     Returns
     -------
-    Points (K, 3) and angles (K, 2); NaN where there is none and the heliostat turns by its angles
-    instead.
+    Points (K, 3) and angles (K, 2); NaN where no point is found, so that the heliostat turns by
+    its defocus angles instead.
     """
     points, angles = np.full((len(place), 3), np.nan), np.full((len(place), 2), np.nan)
     place, left = place.copy(), np.arange(len(place))
@@ -132,7 +132,7 @@ def end_down_the_path(
 
 
 def offsets(pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArray) -> FloatArray:
-    """Return the turns of the axes where DEFOCUS does not follow the path: `Motion._turn`.
+    """Return the rotations of the axes where DEFOCUS does not follow the path: `Motion._turn`.
 
     From an aim, the axes turn away from standby. A heliostat that is held turns away from its aim.
 

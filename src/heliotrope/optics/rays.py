@@ -1,10 +1,9 @@
-"""An independent check of the flux: random rays, traced through triangles by `embreex`.
+"""An independent check of the flux: random rays traced through triangles by `embreex`.
 
-The tracer shares nothing with the flux engine but the scene and the random rays of the sun. Each
-ray begins on a mirror, at a random point with a random slope error. Backwards it goes to a random
-point of the sun; an object that it meets on the way shades it. Forwards it is reflected; an object
-that it meets before a surface blocks it. Not for production, because 10⁷ rays take about half a
-minute.
+The tracer shares only the scene and the random sun rays with the flux engine. Each ray begins on a
+mirror, at a random point with a random slope error. It is traced backwards to a random point of the
+sun; an object on this path shades it. It is also reflected forwards; an object before a surface
+blocks it. The tracer is not meant for production, because 10⁷ rays take about half a minute.
 
 As in the engine, two effects are neglected: the sagitta of the mirrors, which count as flat when
 they obstruct their neighbours, and the shading of one surface by another.
@@ -24,14 +23,14 @@ from heliotrope.optics.scene import Scene
 from heliotrope.optics.sun_shape import SunShape
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 
-#: Rays that are traced at once.
+#: Number of rays traced at once.
 _BATCH = 250_000
 #: Limits of the number of rays.
 RAYS = (1_000, 1_000_000_000)
-#: Rays begin this share of the field's size in front of their mirror, so that they do not meet it:
-#: a few steps of single precision. A centimetre would lift them over 1 % of a small shadow.
+#: Rays start in front of their mirror, at this fraction of the field's size, so that they do not
+#: hit it: a few steps of single precision. A centimetre would lift them over 1 % of a small shadow.
 _OFF = 5e-7
-#: Sides of a tower.
+#: Number of sides of a tower.
 _SIDES = 96
 
 
@@ -44,7 +43,7 @@ class RayTrace:
     flux, error
         Flux on each surface, W/m², and its standard error, in the shape of its cells.
     power, power_error
-        On each surface, W, and its standard error, (K,).
+        Power on each surface, W, and its standard error, (K,).
     cosine, shading, blocking, lit, intercept
         Efficiencies of each mirror, (H,), as in `Efficiencies`; NaN where no ray was traced.
     count
@@ -91,14 +90,15 @@ def trace(
     Raises
     ------
     InputError
-        If the number is out of range, a name is unknown, or `embreex` is not installed.
+        If the number of rays is out of range, a name is unknown, or `embreex` is not installed.
     """
     if not RAYS[0] <= rays <= RAYS[1]:
         raise InputError(f"rays: {rays:g} must be from {RAYS[0]:,} to {RAYS[1]:,}")
     shape = SunShape.of(sun)
     tracer = _Tracer(scene, shape, np.random.default_rng(seed))
     power, total = tracer.power(air), int(rays)
-    # Each patch gets rays by its power, begun at a random part of a ray; each ray carries as much.
+    # Each patch gets rays in proportion to its power, rounded from a random start; all rays carry
+    # the same power.
     ends = np.cumsum(power) / power.sum() * total if power.sum() > 0.0 else np.zeros(len(power))
     begins = np.floor(np.append(0.0, ends) + tracer.rng.random()).astype(np.int64)
     counts = np.diff(begins)
@@ -150,7 +150,7 @@ class _Tracer:
         return [np.stack([corners[i] for i in three], axis=1) for three in ((0, 1, 2), (0, 2, 3))]
 
     def power(self, air: str | float) -> FloatArray:
-        """Return the power that leaves each patch if nothing hides it, after the air, W."""
+        """Return the unobstructed power from each patch, after atmospheric attenuation, W."""
         scene, m, k = self.scene, self.scene.mirrors, self.mirror
         sent = scene.dni * m.reflectivity * m.clean * (1.0 - air_loss(m.slant, air))
         sent = sent * np.maximum(m.normal @ scene.sun, 0.0)
@@ -164,19 +164,19 @@ class _Tracer:
         Returns
         -------
         mirror, weight
-            Where each begins, and its power over the mean, (R,).
+            The mirror where each ray starts, and its power relative to the mean, (R,).
         shaded, blocked
             (R,).
         surface, cell
-            What it meets if it is not blocked; −1: nothing, (R,). A ray that passes the aperture
-            of a cavity meets the cavity, whether or not it then meets a cell.
+            The surface and cell that it hits if it is not blocked; −1: none, (R,). A ray through
+            the aperture of a cavity hits the cavity, whether or not it then hits a cell.
         """
         m, k, rng, count = self.scene.mirrors, self.mirror[rows], self.rng, len(rows)
         place = (2.0 * rng.random((count, 2)) - 1.0) * self.half[rows]
         right, up, normal = m.right[k], m.up[k], m.normal[k]
         x, y = (self.center[rows] + place).T[..., None]
         point = m.center[k] + x * right + y * up
-        # A concave mirror's normal leans back to its axis.
+        # The normals of a concave mirror lean towards its axis.
         tilt = self.tilt[rows] - place / (2.0 * self.focal[rows])[:, None]
         tilt = tilt + self.slope[rows][:, None] * rng.standard_normal((count, 2))
         lean = normalize(normal + tilt[:, :1] * right + tilt[:, 1:] * up)
@@ -191,7 +191,7 @@ class _Tracer:
         return k, weight, shaded, blocked, surface, cell
 
     def _pointed(self, ray: FloatArray, k: np.ndarray) -> FloatArray:
-        """Turn rays by random pointing errors, right of and above the aim as seen from there."""
+        """Rotate rays by random pointing errors, right and up as seen from the mirror."""
         spread = self.scene.mirrors.pointing
         if not spread.any():
             return ray
@@ -218,7 +218,7 @@ class _Tracer:
     def _cell(
         self, surface: Surface, point: FloatArray, ray: FloatArray
     ) -> tuple[Any, FloatArray, Any]:
-        """Return the cell that each ray meets from its lit side, or −1, how far, and if it hits."""
+        """Return the cell that each ray hits from its lit side, or −1, distance, and hit mask."""
         if isinstance(surface, Plate | Cylinder):
             on = _on_plate if isinstance(surface, Plate) else _on_cylinder
             cell, distance = on(surface, point, ray)  # type: ignore[arg-type]
@@ -300,7 +300,7 @@ class _Tally:
             flux.append((self.unit * first / cells.area).reshape(cells.shape))
             error.append((self.unit * np.sqrt(second) / cells.area).reshape(cells.shape))
             power.append(self.unit * whole[0])
-            # Of all rays a share lands: the error is that of a binomial distribution.
+            # The number of rays that hit is binomially distributed, which determines the error.
             share = whole[0] / max(count.sum(), 1.0)
             spread.append(self.unit * np.sqrt(whole[1] * max(1.0 - share, 0.0)))
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -319,7 +319,7 @@ class _Tally:
 
 
 def _embree(triangles: list[FloatArray], origin: FloatArray) -> Any:
-    """Return a scene of Embree with triangles, each (T, 3, 3), about an origin."""
+    """Return an Embree scene of triangles, each (T, 3, 3), about an origin."""
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -333,7 +333,7 @@ def _embree(triangles: list[FloatArray], origin: FloatArray) -> Any:
 
 
 def _sides(tower: Tower) -> FloatArray:
-    """Return the sides of a tower as triangles, of the mean radius of the circle."""
+    """Return the sides of a prism inscribed in a tower as triangles."""
     turn = np.linspace(0.0, 2.0 * np.pi, _SIDES + 1)
     edge = tower.radius * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
     edge = edge + [tower.east, tower.north]
@@ -352,5 +352,5 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _single(values: FloatArray) -> np.ndarray:
-    """Return values as Embree takes them."""
+    """Return values in the form that Embree requires."""
     return np.ascontiguousarray(values, dtype=np.float32)

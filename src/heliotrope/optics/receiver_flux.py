@@ -6,7 +6,7 @@ derivative of the ray's position with respect to the position on the mirror; A c
 astigmatism at the true angle of incidence. Covariances of the ray direction times the squared
 distance are added: the slope errors (4 σ² in the plane of incidence and 4 σ² cos² θ across it), the
 covariance of the calibration, and the sun as a short sum of Gaussians. Facets, and the parts of a
-flat mirror, each have their own image; images that lie close together are merged.
+flat mirror, each have their own image; images close to each other are merged.
 
 Neglected: shading of one surface by another, reflection by the receivers, the sagitta of the
 mirrors, and differences in distance within one mirror. The sun's sum of Gaussians is accurate for a
@@ -33,36 +33,36 @@ from heliotrope.optics.sun_shape import SunShape
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 from heliotrope.parallel import run_blocks
 
-#: A part's image is at most as wide as this times the blur by sun and slope.
+#: Largest width of the image of a part, relative to the blur by sun and slope errors.
 PART = 2.0
-#: Parts of a flat mirror at most, each way.
+#: Maximum number of parts of a flat mirror in each direction.
 _MOST = 64
-#: Blocks of mirrors whose flux is summed apart, whatever the number of threads.
+#: Number of blocks of mirrors whose flux is summed separately, for any number of threads.
 _BLOCKS = 8
-#: Cells of a single image below this share of its peak are left out at its edges.
+#: Cells at the edges of a single image are left out below this fraction of its peak.
 LEAST = 5e-4
-#: Mirrors whose directions differ by less than this see the same cells of a mesh, rad.
+#: Difference of directions below which mirrors see the same cells of a mesh, rad.
 _ALIKE = np.radians(5.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Efficiencies:
-    """Where the sun's light on each of H mirrors goes, as shares, (H,).
+    """Efficiencies of each of H mirrors, as fractions, (H,).
 
     Attributes
     ----------
     cosine
         Cosine of the angle of incidence.
     shading, blocking, lit
-        Not shaded, not blocked, and neither (the exact union).
+        Fractions that are not shaded, not blocked, and neither (the exact union).
     mirror
-        Reflectivity times what soiling leaves.
+        Reflectivity times cleanliness.
     air
-        What the air lets through to the aim.
+        Atmospheric transmittance up to the aim.
     intercept
-        Share of the light that leaves the mirror and reaches a surface; NaN if none leaves.
+        Fraction of the light leaving the mirror that reaches a surface; NaN if none leaves.
     total
-        Power on the surfaces over direct normal irradiance times area.
+        Power on the surfaces divided by direct normal irradiance times area.
     """
 
     cosine: FloatArray
@@ -77,23 +77,23 @@ class Efficiencies:
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """Flux of each of H mirrors by itself at K aims, on a surface in columns.
+    """Flux of each of H mirrors alone at K aims, on a surface in columns.
 
     Attributes
     ----------
     values
-        W/m², one image after the other, each column after column, from below.
+        W/m², one image after the other, each column by column, from below.
     begin
-        Where each image begins, (H · K,), the aims of a mirror in a row.
+        Index at which each image begins, (H · K,), with the aims of a mirror in sequence.
     box
-        First column, columns, first row and rows of each image, (H · K, 4). Columns go on
-        at 0 after the last; rows may lie below and above the surface.
+        First column, number of columns, first row and number of rows of each image, (H · K, 4).
+        After the last column, column 0 follows; rows may lie below and above the surface.
     looks
         K.
     shape
         Rows and columns of the surface.
     area
-        Of a cell, m².
+        Area of a cell, m².
     """
 
     values: npt.NDArray[np.float32]
@@ -128,9 +128,9 @@ class FieldFlux:
     sun
         Shape of the sun, or its name; see `SunShape`.
     air
-        Name of the air's model, or the visibility, km; see `air_loss`.
+        Name of the attenuation model, or the visibility, km; see `air_loss`.
     gaussians
-        Number of Gaussians of the sun's shape; each costs as much as the first.
+        Number of Gaussians of the sun shape; the computing time is proportional to it.
 
     Raises
     ------
@@ -161,7 +161,7 @@ class FieldFlux:
         self._transmitted = 1.0 - self._air(mirrors.slant)
         self._light = _light(scene, self._transmitted)
         self._figure = _figure(mirrors)
-        # What the present flux was cast with.
+        # The inputs from which the present flux was computed.
         self._table, self._moments = self._shading.table.copy(), self._shading.lit.moments.copy()
         self._plans = [_plan(surface, scene) for surface in scene.surfaces]
         self._flux = [np.zeros(surface.cells.shape) for surface in scene.surfaces]
@@ -169,7 +169,7 @@ class FieldFlux:
         self._cast(np.arange(len(mirrors)), 1.0)
 
     def check_met(self) -> None:
-        """Raise InputError if mirrors shine, and none sends light to a surface."""
+        """Raise InputError if there are lit mirrors, but none sends light to a surface."""
         for surface, power in zip(self.scene.surfaces, self._power, strict=True):
             if power[:, 0].any() and not power[:, 1].any():
                 raise InputError(
@@ -178,7 +178,7 @@ class FieldFlux:
                 )
 
     def _cast(self, rows: IntArray, sign: float) -> None:
-        """Add (1) or take away (−1) the images of the mirrors in ``rows``."""
+        """Add (1) or subtract (−1) the images of the mirrors in ``rows``."""
         edges = [len(rows) * k // _BLOCKS for k in range(_BLOCKS + 1)]
         for plan, flux, power in zip(self._plans, self._flux, self._power, strict=True):
             plan(rows, edges, self._field(), sign, flux, power)
@@ -193,17 +193,16 @@ class FieldFlux:
         )  # fmt: skip
 
     def move(self, rows: IntArray, mirrors: Mirrors) -> IntArray:
-        """Move mirrors, and return the rows of all whose light has changed.
+        """Move mirrors, and return the indices of all mirrors whose light has changed.
 
-        Only these and the mirrors that they hide or no longer hide are computed again.
+        Only the moved mirrors and those that they hide or no longer hide are computed again.
 
         Parameters
         ----------
         rows
-            Which moved, (M,).
+            Indices of the moved mirrors, (M,).
         mirrors
-            All mirrors, (H,), in their new poses and with their new aims; nothing else of them
-            may differ.
+            All mirrors, (H,), in their new poses and with their new aims; nothing else may differ.
         """
         changed = self._shading.move(rows, mirrors)
         self._cast(changed, -1.0)
@@ -217,17 +216,18 @@ class FieldFlux:
         return changed
 
     def images(self, aims: FloatArray, reach: IntArray, gaussians: int | None = None) -> Images:
-        """Return the image of each mirror by itself at several aims, on the first surface.
+        """Return the image of each mirror alone at several aims, on the first surface.
 
         Parameters
         ----------
         aims
-            ENU m, (H, K, 3). Shading, blocking and air stay those of the present aims, and each
-            mirror keeps its focal length.
+            ENU m, (H, K, 3). Shading, blocking and attenuation remain those of the present aims,
+            and each mirror keeps its focal length.
         reach
-            Rows below and above the surface that each image has too, so that it may be moved, (H,).
+            Number of additional rows of each image below and above the surface, so that it can be
+            moved, (H,).
         gaussians
-            Number of the sun's Gaussians, if another than the flux has.
+            Number of Gaussians of the sun shape, if different from that of the flux.
 
         Raises
         ------
@@ -259,18 +259,18 @@ class FieldFlux:
         groups
             Number of each mirror's group, 0 to G − 1, (H,).
         worth
-            Price of variance, (rows, columns), in any unit per (W/m²)².
+            Weight of the variance, (rows, columns), in any unit per (W/m²)².
 
         Returns
         -------
         tuple
-            Variance by own errors, (W/m²)², (rows, columns); change of the flux by the shared
-            errors of the mirrors of each group, W/m², (G, M, rows, columns); and the worth of each
-            mirror's own variance, (H,).
+            Variance due to own errors, (W/m²)², (rows, columns); change of the flux due to the
+            shared errors of the mirrors of each group, W/m², (G, M, rows, columns); and the
+            weighted variance of each mirror's own errors, (H,).
 
         Notes
         -----
-        To first order in the errors.
+        The result is of first order in the errors.
         """
         plan, errors = self._in_columns(), (as_float(scatter), as_input(modes), as_input(worth))
         return plan.spread(self._field(), errors, groups)[:3]
@@ -278,7 +278,8 @@ class FieldFlux:
     def power_slope(self) -> FloatArray:
         """Return how the power of each mirror on the first surface changes with its beam.
 
-        Derivatives by a displacement to the right and up as seen from the mirror, W/rad, (H, 2).
+        Derivatives with respect to a displacement to the right and up as seen from the mirror,
+        W/rad, (H, 2).
 
         Raises
         ------
@@ -329,18 +330,18 @@ class FieldFlux:
 
     @property
     def leaving(self) -> FloatArray:
-        """Power of each mirror's beam, less what the air takes on the way, W, (H,)."""
+        """Power of each mirror's beam after atmospheric attenuation, W, (H,)."""
         return as_float(self._power[0][:, 0])
 
     @property
     def intercept(self) -> float:
-        """Share of the field's light that reaches a surface; NaN if there is none."""
+        """Fraction of the field's light that reaches a surface; NaN if there is no light."""
         leaving = float(self.leaving.sum())
         return float(self.power.sum()) / leaving if leaving > 0.0 else float("nan")
 
     @property
     def efficiencies(self) -> Efficiencies:
-        """Where the light goes, mirror by mirror."""
+        """Efficiencies of each mirror."""
         mirrors, lit, leaving = self.scene.mirrors, self.lit, self.leaving
         some = leaving > 0.0
         intercept = np.where(some, self.power / np.where(some, leaving, 1.0), np.nan)
@@ -359,7 +360,7 @@ class FieldFlux:
 
 
 class _Grid:
-    """How images fall on a plate or a cylinder."""
+    """Casts images on a plate or a cylinder."""
 
     def __init__(self, surface: Plate | Cylinder) -> None:
         rows, count = surface.shape
@@ -380,7 +381,7 @@ class _Grid:
             wide = 2.0 * half * radius * np.cross(outward, axis)
             mean, edges = outward * np.sin(half) / half, surface.outward(angles)
         self._shape = (kind, as_input(surface.center), as_input(axis), as_input(front), radius)
-        # A cell counts as a Gaussian of its own variance.
+        # A cell is treated as a Gaussian of the same variance.
         arrays = (base, wide / np.sqrt(12.0), mean, edges, angles)
         self._columns = tuple(as_input(array) for array in arrays)
         step = surface.height / rows
@@ -404,12 +405,12 @@ class _Grid:
         flux += sums.sum(axis=0)
 
     def images(self, looks: int, field: Any, reach: IntArray) -> Images:
-        """Return single images; ``field`` has a row of mirrors for each."""
+        """Return single images; the mirror table in ``field`` has one row per image."""
         low, step, rows, area = self._grid
         most, count = int(reach.max(initial=0)), len(field[0])
         tall = (low - most * step, step, rows + 2 * most, area)
         wide = len(self._columns[0])
-        # Half of a full cylinder is seen at once. Memory that is not written costs nothing.
+        # At most half of a full cylinder is visible from a mirror. Unwritten memory costs nothing.
         turn = abs(self._columns[4][-1] - self._columns[4][0])
         full = turn > 2.0 * np.pi - 1e-6
         seen = wide // 2 + 2 if full else wide
@@ -430,7 +431,7 @@ class _Grid:
     def spread(
         self, field: Any, errors: tuple[FloatArray, ...], groups: IntArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return variances, changes of the flux, worths and slopes of the power.
+        """Return variances, changes of the flux, weighted variances and derivatives of the power.
 
         See `FieldFlux.spread` and `FieldFlux.power_slope`.
         """
@@ -455,7 +456,7 @@ class _Grid:
 
 
 class _Cells:
-    """How images fall on a mesh, behind an aperture or not."""
+    """Casts images on a mesh, which may be behind an aperture."""
 
     def __init__(self, surface: Mesh | Cavity, scene: Scene) -> None:
         mesh = surface.inner if isinstance(surface, Cavity) else surface
@@ -490,7 +491,7 @@ class _Cells:
         run_blocks(block, _BLOCKS, 2)
         flux += sums.sum(axis=0)
         if self._front is not None:
-            # What enters the aperture, whatever the cells make of it.
+            # The power that enters the aperture, whether or not it reaches cells.
             self._front(rows, edges, field, sign, self._seen, power)
 
 
@@ -503,7 +504,8 @@ def _hidden(
     away -= np.sum(mesh.cells.center * mesh.cells.normal, axis=-1)[:, None]
     room = 1e-6 * float(np.ptp(mesh.vertices, axis=0).max())
     if (away < room).all() or (away > -room).all():
-        # Convex from outside, or from inside behind its aperture: only backs are dark.
+        # If the mesh is convex from outside, or from inside behind its aperture, only back faces
+        # are dark.
         return np.zeros((1, len(away)), dtype=np.bool_), np.zeros(count, dtype=np.intp)
     normal = scene.mirrors.normal
     ways = reflect(np.broadcast_to(scene.sun, normal.shape), normal)
@@ -522,7 +524,7 @@ def _plan(surface: Surface, scene: Scene) -> _Grid | _Cells:
 
 
 def _light(scene: Scene, transmitted: FloatArray) -> FloatArray:
-    """Return the power across each mirror's beam for one square metre across the sun's light."""
+    """Return the power of each mirror's beam per square metre across the sunlight, W/m²."""
     mirrors = scene.mirrors
     light = scene.dni * mirrors.reflectivity * mirrors.clean * transmitted
     return light if scene.dark is None else np.where(scene.dark, 0.0, light)
@@ -539,7 +541,7 @@ def _figure(mirrors: Mirrors) -> FloatArray:
 
 
 def _divisions(scene: Scene, sun: float = SUN_SIGMA**2) -> IntArray:
-    """Return columns and rows of parts of each mirror, so that no part's image is wide, (H, 2)."""
+    """Return columns and rows of parts of each mirror, so that part images are narrow, (H, 2)."""
     mirrors, cosine = scene.mirrors, scene.incidence
     count = np.ones((len(mirrors), 2), dtype=np.int64)
     if mirrors.facets is not None:
@@ -559,6 +561,6 @@ def _root(covariance: FloatArray) -> FloatArray:
     """Return the lower roots of covariances (N, 2, 2), which may be singular: (N, 3)."""
     first = np.sqrt(np.maximum(covariance[:, 0, 0], 0.0))
     mixed = np.divide(covariance[:, 1, 0], first, out=np.zeros_like(first), where=first > 0.0)
-    # Rounding may leave a singular one slightly negative.
+    # Rounding may make a singular covariance slightly negative.
     second = np.sqrt(np.maximum(covariance[:, 1, 1] - mixed**2, 0.0))
     return np.stack([first, mixed, second], axis=-1)

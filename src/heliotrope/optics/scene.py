@@ -22,7 +22,7 @@ from heliotrope.field.tower import Tower
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, tangent_axes
 from heliotrope.optics.surfaces import Surface
 
-#: Direction and size of a mirror's axes agree to this.
+#: Tolerance for the direction and length of a mirror's axes.
 _TOLERANCE = 1e-6
 
 
@@ -33,7 +33,7 @@ class FacetTable:
     Attributes
     ----------
     center
-        Right and up in the mirror's plane, m, (K, F, 2).
+        Centre, right and up in the mirror's plane, m, (K, F, 2).
     tilt
         Canting: x and y of the facet's normal in the mirror's axes, whose z is near 1, rad,
         (K, F, 2).
@@ -42,8 +42,8 @@ class FacetTable:
     focal
         Focal length of the facet's own curvature, m; infinite if flat, negative if convex, (K, F).
     slope
-        Standard deviation of the facet's normal per axis beside that of its mirror, whose
-        variance adds to it, rad, (K, F); None: 0.
+        Standard deviation of the facet's normal per axis, rad, (K, F), in addition to that of its
+        mirror (the variances add); None: 0.
     """
 
     center: FloatArray
@@ -73,25 +73,25 @@ class Mirrors:
     Attributes
     ----------
     center, normal, right, up
-        Middle, ENU m, unit normal and axes in the plane, (H, 3); right × up = normal.
+        Centre, ENU m, unit normal and axes in the plane, (H, 3); right × up = normal.
     width, height
         Along the axes, m, (H,).
     focal
         Focal length of the whole mirror, from curvature and canting, m, (H,); infinite if flat.
     aim
-        Where each is meant to send its beam, ENU m, (H, 3). The beam goes where the normal
-        sends it: the aim only sets the casting of shadows and the distance for the air.
+        Intended aim of each beam, ENU m, (H, 3). The normal determines the actual direction of the
+        beam; the aim only sets the distance for blocking and attenuation.
     slope
         Standard deviation of the surface's normal per axis, rad, (H,).
     reflectivity, clean
-        Reflectivity of the clean mirror and the share that soiling leaves, 0 to 1, (H,).
+        Reflectivity of the clean mirror and cleanliness, 0 to 1, (H,).
     pointing
         Covariance of the beam right of and above the aim as seen from the mirror (see
         `ExpectedError`), rad², (H, 2, 2).
     facets
         Facets; None: each mirror is one surface.
     kind
-        Row of ``facets`` of each mirror, (H,).
+        Index in ``facets`` of each mirror's kind, (H,).
     """
 
     center: FloatArray
@@ -129,7 +129,7 @@ class Mirrors:
         size
             Width and height, m.
         right
-            Horizontal axes in the planes; None: level.
+            The axes ``right`` in the mirror planes; None: horizontal.
         **more
             Any of ``focal`` (default: the distance to the aim), ``slope`` (1e-3),
             ``reflectivity`` (0.9), ``clean`` (1) and ``pointing`` (0).
@@ -137,7 +137,7 @@ class Mirrors:
         Raises
         ------
         InputError
-            If shapes do not fit or a number is out of range.
+            If shapes do not match or a number is out of range.
         """
         middle = np.atleast_2d(as_vectors(center, "mirrors: centre"))
         count = len(middle)
@@ -164,7 +164,7 @@ class Mirrors:
 
     @property
     def area(self) -> FloatArray:
-        """Area that reflects, m², (H,): of the facets where there are any."""
+        """Reflecting area, m², (H,): that of the facets if there are any."""
         if self.facets is None:
             return as_float(self.width * self.height)
         return as_float((4.0 * self.facets.half.prod(axis=-1)).sum(axis=-1)[self.kind])
@@ -185,14 +185,14 @@ class Mirrors:
         Raises
         ------
         InputError
-            If one is unknown, out of range, or of another shape.
+            If a number is unknown, out of range, or of the wrong shape.
         """
         count = len(self)
         changes: dict[str, Any] = {k: _numbers(k, value, count) for k, value in numbers.items()}
         return replace(self, **changes)
 
     def toward(self, sun: FloatArray, aim: npt.ArrayLike) -> "Mirrors":
-        """Return the mirrors turned about their centres so that they send the sun to other aims.
+        """Return the mirrors rotated about their centres to reflect the sun to other aims.
 
         Parameters
         ----------
@@ -216,7 +216,7 @@ class Mirrors:
         Raises
         ------
         InputError
-            If the numbers do not fit, or a facet lies outside its mirror.
+            If the numbers do not match, or a facet lies outside its mirror.
         """
         rows, count = len(facets.center), len(self)
         if kind is None:
@@ -250,13 +250,13 @@ class Scene:
     dni
         Direct normal irradiance, W/m².
     mirrors
-        In their poses. Mirrors in ``dark`` shade and block, but send no light.
+        Mirrors in their poses. Mirrors in ``dark`` shade and block, but send no light.
     surfaces
         Receivers and targets; a beam is caught by the first that it meets.
     towers
         Obstacles, except those that belong to a surface.
     dark
-        Mirrors whose beams do not count, (H,).
+        Mask of the mirrors whose beams do not count, (H,).
     """
 
     sun: FloatArray
@@ -297,7 +297,7 @@ def _vectors(value: FloatArray, count: int, name: str) -> FloatArray:
     return np.ascontiguousarray(np.broadcast_to(value, (count, 3)))
 
 
-#: Limits of the numbers of a mirror: lowest (excluded if the flag is set), highest, unit.
+#: Limits of the numbers of a mirror: minimum (excluded if the flag is set), maximum, unit.
 _LIMITS = {
     "width": (0.0, True, np.inf, "m"),
     "height": (0.0, True, np.inf, "m"),

@@ -27,23 +27,24 @@ from heliotrope.optics.scene import Mirrors, Scene
 from heliotrope.parallel import run_blocks
 
 IntArray = npt.NDArray[np.int64]
-#: Room for a vertex that moves when its mirror turns, m; beyond it the grid is made anew.
+#: Allowance for the displacement of a vertex when its mirror moves, m; beyond it the grid is
+#: rebuilt.
 SLACK = 0.5
-#: The aim itself, and what touches it, hides nothing: this share of the way is not looked at.
+#: The aim itself and objects that touch it hide nothing, so this fraction of the path is ignored.
 _BEFORE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """What neighbours and towers leave of each mirror.
+    """The unobstructed part of each mirror.
 
     Attributes
     ----------
     shading, blocking, both
-        Shares of the mirror's area that are not shaded, not blocked, and neither, (H,).
+        Fractions of the mirror's area that are not shaded, not blocked, and neither, (H,).
     moments
-        Of the lit part of each part of a mirror: area, centroid (x, y) and covariance
-        (xx, xy, yy) in the mirror's axes, m² and m, (P, 6).
+        Moments of the lit part of each part of a mirror: area, centroid (x, y) and covariance (xx,
+        xy, yy) in the mirror's axes, m² and m, (P, 6).
     begin
         Row of ``moments`` where each mirror's parts begin, (H + 1,).
     """
@@ -63,8 +64,8 @@ class Shading:
     scene
         Mirrors, towers and sun.
     split
-        Columns and rows of equal parts of which the moments are wanted, (H, 2); mirrors with
-        facets have these as their parts. None: one part.
+        Columns and rows of equal parts whose moments are to be computed, (H, 2); the parts of
+        mirrors with facets are the facets. None: one part.
     """
 
     def __init__(self, scene: Scene, split: IntArray | None = None) -> None:
@@ -87,7 +88,7 @@ class Shading:
         return Lit(shading, blocking, both, self._moments, self.parts[3])
 
     def _look(self) -> None:
-        """Lay the grid, and find the candidates of every mirror."""
+        """Build the grid, and find the candidates of every mirror."""
         table = self.table
         self._places = table[:, :3].copy()
         radius = float(table[:, 15].max(initial=1.0))
@@ -152,7 +153,7 @@ class Shading:
         parts = parts_of(self.parts[3], looked)
         before = self._moments[parts]
         self._clip(looked)
-        # Most that might be hidden are not, and their light stays as it was.
+        # Most candidates are not actually hidden, and their light is unchanged.
         changed = np.zeros(len(touched), dtype=np.bool_)
         changed[rows] = True
         altered = (self._moments[parts] != before).any(axis=1)
@@ -161,12 +162,12 @@ class Shading:
         return np.flatnonzero(changed)
 
     def _replace(self, rows: IntArray) -> None:
-        """Find the candidates of some mirrors anew."""
+        """Find the candidates of some mirrors again."""
         spans, near = self._candidates(rows)
         self._spans[rows] = spans + len(self._near)
         self._near = np.concatenate([self._near, near])
         if len(self._near) > 2 * int((self._spans[:, 2] - self._spans[:, 0]).sum()) + 1024:
-            # What is left of lists that were replaced.
+            # Remove the remainders of replaced lists.
             self._spans, self._near = self._candidates(np.arange(len(self.table)))
 
     def _touched(self, rows: IntArray) -> npt.NDArray[np.bool_]:
@@ -197,7 +198,7 @@ def parts_of(begin: IntArray, rows: IntArray) -> IntArray:
 def _rows(
     mirrors: Mirrors, sun: FloatArray, rows: IntArray | slice = slice(None)
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the kernels' table, the central rays and how far they are looked at."""
+    """Return the kernels' table, the central rays and how far they are followed."""
     center, normal = mirrors.center[rows], mirrors.normal[rows]
     table = table_of(mirrors, rows)
     ways = reflect(np.broadcast_to(sun, normal.shape), normal)

@@ -36,11 +36,11 @@ PROFILES = ("pillbox", "limb", "quartic", "buie")
 SUN_SHAPES = (*PROFILES, "gaussian")
 #: Circumsolar ratios for which Buie's profile can be solved.
 CIRCUMSOLAR = (0.01, 0.7)
-#: Usual blur of a beam by the mirror's slope errors, for which `SunShape.gaussians` fits, rad; and
-#: the least and the greatest that it fits for.
+#: Usual blur of a beam by the mirror's slope errors, for which `SunShape.gaussians` fits, and the
+#: smallest and largest blur, rad.
 BLUR = 1.5e-3
 _BLURS = (0.3e-3, 3e-3)
-#: A Gaussian sun is followed to this many σ: 1e-8 of it lies beyond.
+#: A Gaussian sun is truncated at this many σ, beyond which 1e-8 of its light lies.
 _REACH = 6.0
 #: Nodes of an integral over the disk and over the aureole, and of the table for sampling.
 _NODES, _TABLE = 200, 8192
@@ -136,7 +136,7 @@ class SunShape:
 
     @cached_property
     def _nodes(self) -> tuple[FloatArray, FloatArray]:
-        """Angles and shares of the light at them, (M,), for integrals."""
+        """Angles and the fractions of the light at them, (M,), for integrals."""
         theta, weight = _quadrature(self.radius)
         share = weight * theta * self.radiance(theta)
         return theta, as_float(share / share.sum())
@@ -149,7 +149,7 @@ class SunShape:
 
     @cached_property
     def _table(self) -> tuple[FloatArray, FloatArray]:
-        """Share of the light within angles, and these angles."""
+        """Fraction of the light within angles, and these angles."""
         edges = np.linspace(0.0, self.radius, _TABLE)
         edges = np.unique(np.append(edges, np.linspace(0.0, SUN_RADIUS, _TABLE)))
         middle = 0.5 * (edges[1:] + edges[:-1])
@@ -159,7 +159,7 @@ class SunShape:
         return as_float(below[lit] / below[-1]), as_float(edges[lit])
 
     def within(self, theta: npt.ArrayLike) -> FloatArray:
-        """Return the fraction of the light from within given angles of the centre, rad."""
+        """Return the fraction of the light within given angles of the centre, rad."""
         below, edges = self._table
         return as_float(np.interp(as_float(theta), edges, below))
 
@@ -288,7 +288,7 @@ def _chi(csr: float) -> float:
 
 
 def _frequencies(blur: float, count: int = 400) -> tuple[FloatArray, FloatArray]:
-    """Return angular frequencies up to where a blur leaves nothing, and their steps, 1/rad."""
+    """Return nodes and weights in angular frequency, up to where a blur leaves nothing, 1/rad."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     top = 6.0 / blur
     return as_float(0.5 * top * (nodes + 1.0)), as_float(0.5 * top * weights)
@@ -300,10 +300,10 @@ def _sum(parts: Gaussians, k: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _fitted(shape: SunShape, count: int, blur: float) -> Gaussians:
-    """Return the fit in the space of frequencies, where the squared difference is the same.
+    """Return the fit in the frequency domain, where the squared difference is the same.
 
-    Of the weights two follow from the sum and the variance, and the rest are linear; the
-    variances are searched for from a few beginnings.
+    Two weights follow from the sum and the variance, and the remaining ones are linear; the
+    variances are searched for from a few starting points.
     """
     from scipy.optimize import minimize
 
@@ -326,14 +326,14 @@ def _fitted(shape: SunShape, count: int, blur: float) -> Gaussians:
         variance = total * np.exp(np.clip(logs, -6.0, 6.0))
         w = weights(variance)
         rest = (_sum(Gaussians(w, variance), k) - true) * root
-        # Nearly equal Gaussians with huge weights of opposite sign gain nothing.
+        # Nearly equal Gaussians with huge weights of opposite sign are of no benefit.
         return float(rest @ rest / (true * root @ (true * root)) + 3e-6 * w @ w)
 
-    # Of the disk alone, near and far from each other, and with one or two for an aureole.
+    # Starts for the disk alone, near and far from each other, and with one or two for an aureole.
     disk = np.log(SUN_SIGMA**2 / total)
     near, far = (disk + np.linspace(np.log(a), np.log(0.8), count) for a in (0.45, 0.2))
     begins = [near, far, np.append(far[1:], 2.0), np.append(near[:-1], 1.0)]
-    # Four digits of the variances are plenty.
+    # Four digits of the variances are sufficient.
     found = [
         minimize(miss, x, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-9})
         for x in begins

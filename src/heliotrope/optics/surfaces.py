@@ -24,11 +24,11 @@ class Cells:
     Attributes
     ----------
     center, normal
-        Middle, ENU m, and unit normal out of the lit side, (C, 3).
+        Centre, ENU m, and unit normal out of the lit side, (C, 3).
     area
         m², (C,).
     shape
-        Rows and columns; (C,) of a mesh.
+        Rows and columns; (C,) for a mesh.
     """
 
     center: FloatArray
@@ -46,7 +46,7 @@ class Plate:
     name
         Of the receiver or target.
     center, right, up
-        Middle, ENU m, and unit axes in the plane as seen from the front, (3,).
+        Centre, ENU m, and unit axes in the plane as seen from the front, (3,).
     width, height
         m.
     shape
@@ -99,7 +99,7 @@ class Cylinder:
     name
         Of the receiver.
     center
-        Middle of the axis, ENU m, (3,).
+        Midpoint of the axis, ENU m, (3,).
     axis, front
         Unit vector along the axis, upwards, and a unit vector across it from which the columns
         are counted, clockwise as seen from the top, (3,); north for a full cylinder.
@@ -158,7 +158,7 @@ class Cylinder:
 class Mesh:
     """Triangles, each a cell, lit from the side out of which their normals point.
 
-    A cell that another one hides gets no light from behind it; see the engine for how.
+    A cell that is hidden by another cell receives no light through it; see the flux engine.
 
     Attributes
     ----------
@@ -197,7 +197,7 @@ class Mesh:
 
     @cached_property
     def corners(self) -> FloatArray:
-        """Of each triangle, ENU m, (C, 3, 3)."""
+        """Vertices of each triangle, ENU m, (C, 3, 3)."""
         return as_float(self.vertices[self.faces])
 
     @cached_property
@@ -217,9 +217,9 @@ class Cavity:
     Attributes
     ----------
     aperture
-        Flat rectangle, its front to the field.
+        Flat rectangle whose front faces the field.
     inner
-        Lit from the inside of the cavity.
+        Mesh that is lit from inside the cavity.
     """
 
     aperture: Plate
@@ -227,12 +227,12 @@ class Cavity:
 
     @property
     def name(self) -> str:
-        """Of the receiver: the aperture's."""
+        """Name of the receiver, which is that of the aperture."""
         return self.aperture.name
 
     @property
     def center(self) -> FloatArray:
-        """Middle of the aperture, ENU m, (3,)."""
+        """Centre of the aperture, ENU m, (3,)."""
         return self.aperture.center
 
     @property
@@ -251,8 +251,8 @@ def surface_of(item: Receiver | Target, shape: tuple[int, int] | None = None) ->
     Parameters
     ----------
     item
-        A planar one becomes a plate, a cylinder or a sector of one a cylinder. The triangles of a
-        mesh, or of a cavity's inner surface, are its cells.
+        A planar receiver or target becomes a plate, a cylinder or a sector of one becomes a
+        cylinder. The triangles of a mesh, or of a cavity's inner surface, are its cells.
     shape
         Rows and columns; None: `PLATE_CELLS` or `CYLINDER_CELLS`.
     """
@@ -269,7 +269,7 @@ def surface_of(item: Receiver | Target, shape: tuple[int, int] | None = None) ->
             axis = normalize(upright - item.normal[2] * item.normal)
             front, half = item.normal, 0.5 * item.opening_angle
             radius = item.radius
-            # Its centre is that of the curved surface, in the middle of the opening.
+            # The centre of the receiver lies on the curved surface, in the middle of the sector.
             center, span = item.center - radius * item.normal, (-half, half)
         cells = shape or CYLINDER_CELLS
         return Cylinder(item.name, center, axis, front, radius, item.height, span, cells)

@@ -250,7 +250,7 @@ def evaluate(
 
 
 def _advance(row: Condition, track: Track, reading: Reading | None, now: float) -> Track:
-    """Return the track after a reading, or without a new reading, at ``now``."""
+    """Return the track advanced to ``now``, with or without a new reading."""
     value, read_at, fresh = track.value, track.seen, False
     if reading is not None and math.isfinite(reading.value) and read_at <= reading.at <= now:
         # Of two readings with the same time, the worse one counts.

@@ -82,7 +82,7 @@ async def leaving(live: PlantAssembly, keeper: Keeper, chosen: Evidence) -> Asyn
 
 
 async def _watch(live: PlantAssembly, sender: Syslog) -> None:
-    """Raise and end the alarm about messages that do not reach the receiver."""
+    """Raise and clear the alarm about messages that do not reach the receiver."""
     kind, stands, lost = alarms.SYSLOG, False, 0
     while True:
         await asyncio.sleep(_LOOKED)
@@ -104,7 +104,7 @@ async def _export(live: PlantAssembly, keeper: Keeper, chosen: Evidence) -> None
 
 
 async def export(live: PlantAssembly, keeper: Keeper, folder: Path | None) -> None:
-    """Write the heads of the chains to a folder, if one is given, and note them as events."""
+    """Write the heads of the chains to a folder, if specified, and record them as events."""
     now, kind = live.clock.utc(), alarms.HEADS
 
     def write() -> tuple[Head, ...]:

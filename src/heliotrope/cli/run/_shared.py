@@ -42,30 +42,32 @@ from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
 from heliotrope.sun import solar_day
 
-#: Factor on the time between lines while a console is served: people look at the console.
+#: Factor on the time between lines while a console is served, since users look at the console.
 _SELDOM = 6.0
-#: What the console needs beside the base installation.
+#: Packages that the console needs in addition to the base installation.
 _OF_CONSOLE = ("argon2", "fastapi", "uvicorn", "websockets")
 #: File with the password of the first account, where no terminal can show it.
 FIRST_FILE = "first-password"
-#: Default time between lines, and period of the archive, s.
+#: Default time between lines, and archiving interval, s.
 EVERY, _ARCHIVED = 10.0, 5.0
 #: Time between predictions of the field's errors, s.
 FORESEE = 1800.0
-#: Time in which a program ends after a second Ctrl-C, s, and its exit code if it had to be killed.
+#: Time limit for a program to end after a second Ctrl-C, s, and its exit code if it is killed.
 AT_ONCE, _INTERRUPTED = 2.0, 130
-#: Thresholds of the collector. At 10,000 heliostats a beat makes thousands of objects: collecting
-#: the young ones every 700 was most of the longest beats, and a full collection holds the loop for
-#: up to 0.08 s and finds next to nothing.
+#: Thresholds of the garbage collector. With 10,000 heliostats, each beat creates thousands of
+#: objects: collecting young objects every 700 took most of the longest beats, and a full collection
+#: blocks the loop for up to 0.08 s and frees almost nothing.
 _COLLECTED = (50_000, 10, 1000)
-#: Longest notice, bytes.
+#: Maximum length of a notice, bytes.
 _NOTICE = 4096
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-#: Span of the pace that a line shows, s, and the least difference from real time that it shows.
+#: Time over which the displayed pace is averaged, s, and the smallest displayed difference from
+#: real time.
 _SLOWER = 0.05
-#: Length of the plan, visits, as the console asks for it: a shorter one would end the plan there.
+#: Number of visits in the plan, as requested by the console; a shorter plan would be truncated
+#: there.
 _PLANNED = 20
-#: What heliostats of each state do, beside those that track.
+#: Description of what heliostats do in each state other than tracking.
 _WORDS = {
     "UNCONFIGURED": "without parameters",
     "STOWED": "in stow",
@@ -122,7 +124,7 @@ class Shown:
 
     @property
     def marks(self) -> Path | None:
-        """Plant file that keeps the views of targets that persons mark; None: nothing does."""
+        """Plant file that stores target views marked by users; None: they are not stored."""
         return None if self.data is None else self.data / "marks" / "plant.toml"
 
     def settings(self) -> Any:
@@ -154,7 +156,7 @@ class Shown:
 
 
 def check_console(shown: Shown) -> None:
-    """Check that the console can be started, before the plant begins.
+    """Check that the console can be started, before the plant starts.
 
     Raises
     ------
@@ -179,7 +181,7 @@ def check_console(shown: Shown) -> None:
         from heliotrope.console.by_proxy import ByProxy
 
         ByProxy.read(shown.people_by_proxy)
-    # The plant makes the first account; loading this takes longer than a lease lasts.
+    # The plant creates the first account; loading this takes longer than a lease lasts.
     import heliotrope.console.people  # noqa: F401 - only loaded
 
 
@@ -192,9 +194,9 @@ def _missing(error: ImportError) -> InputError:
 
 @contextlib.contextmanager
 def computing(*loads: Callable[[], None]) -> Iterator[WorkerProcesses]:
-    """Begin the processes that compute for a plant, and load what its loop computes.
+    """Start the worker processes of a plant, and load the modules for computations in its loop.
 
-    ``loads`` load what the loop computes beside the plant itself.
+    ``loads`` are functions that load further modules for the loop.
     """
     with contextlib.closing(WorkerProcesses()) as worker:
         worker.start(warm.computing, warm.lighting)
@@ -223,15 +225,15 @@ def _leaves(error: BaseException) -> list[BaseException]:
 
 
 class Ending:
-    """What Ctrl-C and SIGTERM ask for; it is made in the loop of the plant.
+    """The end requested by Ctrl-C and SIGTERM; created in the loop of the plant.
 
     Attributes
     ----------
     asked
-        Set by the first: the plant ends in order.
+        Set by the first signal: the plant shuts down in order.
     at_once
-        Set by the second: nothing is waited for. If the program still runs after `AT_ONCE`, it is
-        ended where it stands; the store is then as after a power cut.
+        Set by the second signal: the program ends without waiting. If it still runs after
+        `AT_ONCE`, it is killed; the store is then in the state after a power failure.
     """
 
     def __init__(self) -> None:
@@ -241,11 +243,11 @@ class Ending:
             self._loop.add_signal_handler(number, self.ask)
 
     def ask(self) -> None:
-        """End in order; from now on a signal asks to end at once."""
+        """Shut down in order; from now on a signal requests an immediate end."""
         self.asked.set()
         for number in _SIGNALS:
             self._loop.remove_signal_handler(number)
-            # Not in the loop, which may be what hangs.
+            # Not in the loop, which may be hanging.
             signal.signal(number, self._hurry)
 
     def _hurry(self, number: int, frame: FrameType | None) -> None:
@@ -253,7 +255,7 @@ class Ending:
         last = threading.Timer(AT_ONCE, os._exit, [_INTERRUPTED])
         last.daemon = True
         last.start()
-        with contextlib.suppress(RuntimeError):  # the loop has ended, and the rest is soon over
+        with contextlib.suppress(RuntimeError):  # the loop has ended, and the program ends soon
             self._loop.call_soon_threadsafe(self.at_once.set)
 
 
@@ -261,8 +263,8 @@ class Ending:
 def store(shown: Shown) -> Iterator[tuple[Keeper, Path]]:
     """Open the store: a database, or a folder; yield it, and the folder of the plant.
 
-    Without ``--data`` the folder of the plant is deleted afterwards. Whatever is made meanwhile,
-    by the console's process too, belongs to this user alone.
+    Without ``--data`` the folder of the plant is deleted afterwards. Whatever is created in the
+    meantime, including by the console process, is accessible only to this user.
     """
     mask = os.umask(0o077)
     folder = shown.data or Path(tempfile.mkdtemp(prefix="heliotrope-"))
@@ -281,7 +283,7 @@ def store(shown: Shown) -> Iterator[tuple[Keeper, Path]]:
 
 
 def pictures(shown: Shown, folder: Path, *, waits: bool = False) -> Pictures:
-    """Return the place where photographs are kept; ``waits``: the loop waits for the disk."""
+    """Return the store of photographs; ``waits``: the loop waits for the disk."""
     disk = None if waits else DiskThread()
     return Pictures(folder / "photographs", shown.photographs, disk)
 
@@ -316,28 +318,28 @@ async def archive(live: PlantAssembly, shown: Shown) -> AsyncIterator[None]:
 class Lines:
     """The printed lines of a plant at work, printed by a thread.
 
-    Their reader may be slow, as a full pipe or a busy disk is, and may have gone: lines are lost
-    then, and the plant goes on.
+    The reader of the lines may be slow, such as a full pipe or a busy disk, or may have gone. Lines
+    are then lost, and the plant continues.
     """
 
     def __init__(self) -> None:
         self._thread = DiskThread(most=100)
 
     def print(self, text: str) -> None:
-        """Print a line soon."""
+        """Queue a line for printing."""
         with contextlib.suppress(DiskBusyError):
             self._thread.do(lambda: print(text, flush=True), lambda _: None)
 
     def close(self) -> None:
-        """Print what waits, and end."""
+        """Print the queued lines, and end."""
         self._thread.close(2.0)
 
 
 def first_password(password: str, folder: Path) -> str:
-    """Return the words that lead a person to the first password.
+    """Return the text that tells a user how to find the first password.
 
-    The password itself goes to a terminal only. What is printed elsewhere ends in a log or journal,
-    so there the password goes into a file that only its owner may read.
+    The password itself is shown only on a terminal. Other output ends up in a log or journal, so
+    the password is then written to a file that only its owner may read.
     """
     if sys.stdout.isatty():
         return f"password {password} (shown only now)"
@@ -350,12 +352,12 @@ def first_password(password: str, folder: Path) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """How a person enters the first account.
+    """How a user signs in to the first account.
 
     Attributes
     ----------
     password
-        Words that lead to its new password; "" for none.
+        Text that tells how to find its new password; "" if there is none.
     by_link
         Whether by a one-time link.
     """
@@ -397,7 +399,7 @@ async def interface(
 
 
 def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Path) -> Entry:
-    """Return how a person enters the first account; nothing to print if they have a password.
+    """Return how a user signs in to the first account; no text if it already has a password.
 
     At a simulated plant that only this machine reaches it is a one-time link. The account is
     written to the store, which may be slow, so this comes before the plant begins.

@@ -41,7 +41,7 @@ class StoppedError(FetchError):
 
 
 class _LaterError(Exception):
-    """A failure that may pass, after a pause (s) if the server asks for one."""
+    """A temporary failure; the server may request a pause (s) before the next attempt."""
 
     def __init__(self, problem: str, pause: float = 0.0) -> None:
         super().__init__(problem)
@@ -55,7 +55,7 @@ class FileRecord:
     Attributes
     ----------
     etag, modified
-        ETag and Last-Modified; empty without.
+        ETag and Last-Modified; empty if missing.
     size
         Bytes of the whole file; −1 if not known.
     done
@@ -91,7 +91,7 @@ class FetchJournal:
                 name = str(record.pop("file"))
                 self._entries[name] = FileRecord(**record)
             except (ValueError, KeyError, TypeError, AttributeError):
-                # A line cut off by a power failure: its file is requested again.
+                # A line truncated by a power failure; its file is requested again.
                 continue
 
     def get(self, name: str) -> FileRecord | None:
@@ -100,7 +100,7 @@ class FetchJournal:
 
     def put(self, name: str, entry: FileRecord) -> None:
         """Store an entry."""
-        # The line end comes first, so that it also ends a line that was cut off.
+        # The line end is written first, so that it also terminates a truncated line.
         line = "\n" + json.dumps({"file": name, **asdict(entry)})
         with self._lock:
             self._entries[name] = entry
@@ -119,7 +119,7 @@ class RemoteFile:
     path, name
         Destination, and name in the journal.
     size, sha256
-        Bytes and hexadecimal digits as the catalogue gives them, if it does.
+        Size in bytes and hexadecimal digest, if the catalogue specifies them.
     """
 
     url: str
@@ -145,9 +145,9 @@ class Channel:
     journal
         Journal of the folder.
     retries
-        Failures in a row without a new byte before a download is given up.
+        Consecutive failures without a new byte before a download is given up.
     backoff
-        Pause after the first failure, s; it doubles with each.
+        Pause after the first failure, s; doubles with each further failure.
     received
         Called with the number of bytes received.
     stop
@@ -163,7 +163,7 @@ class Channel:
 
 
 def download(job: RemoteFile, channel: Channel) -> bool:
-    """Fetch a file; return False if it was there already and has not changed.
+    """Fetch a file; return False if it exists already and has not changed.
 
     Raises
     ------
@@ -317,7 +317,7 @@ def _unchanged_mark(entry: FileRecord) -> str:
 
 
 def _fits(response: "httpx.Response", start: int) -> bool:
-    """Return whether an answer to a range request is that range, or the whole file."""
+    """Return whether the reply to a range request is that range; otherwise it is the whole file."""
     if response.status_code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
         return False
     span = response.headers.get("content-range", "")
@@ -325,7 +325,7 @@ def _fits(response: "httpx.Response", start: int) -> bool:
 
 
 def _whole(response: "httpx.Response") -> int:
-    """Return the size of the whole file, −1 if the answer does not say."""
+    """Return the size of the whole file, −1 if the reply does not state it."""
     if response.headers.get("content-encoding", "identity") != "identity":
         return -1
     if response.status_code == HTTPStatus.PARTIAL_CONTENT:
@@ -341,7 +341,8 @@ def _store(
     with job.part.open("ab" if start else "wb") as stream:
         if not start:
             channel.journal.put(job.name, said)
-        # Chunks as they arrive: larger ones would be lost when the connection breaks.
+        # Chunks are stored as they arrive, since larger ones would be lost if the connection
+        # breaks.
         for chunk in response.iter_bytes():
             _check_stop(channel)
             stream.write(chunk)
@@ -351,7 +352,7 @@ def _store(
 
 
 def _finish(job: RemoteFile, channel: Channel, said: FileRecord) -> None:
-    """Give a complete file its name."""
+    """Rename a complete file to its final name."""
     size = _size(job.part)
     if said.size >= 0 and size != said.size:
         raise _LaterError(f"{size} of {said.size} bytes arrived")

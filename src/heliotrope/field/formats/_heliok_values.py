@@ -12,7 +12,7 @@ from heliotrope.geometry import FloatArray
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3}
 ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0}
 
-# Not float(): that also takes "nan", "inf" and "1_000".
+# Not float(), which also accepts "nan", "inf" and "1_000".
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?:\s+(\w+))?\s*")
 
 
@@ -49,7 +49,7 @@ class Values:
         return FormatError(self.path, problem, f"line {element.line}" if element.line else "")
 
     def text(self, element: XmlElement, attribute: str) -> str:
-        """Return an attribute that must be there and not be blank."""
+        """Return an attribute that must be present and not blank."""
         value = element.get(attribute)
         if value is None or not value.strip():
             raise self.error(element, f"<{element.tag}> has no {attribute}; add the attribute")
@@ -75,7 +75,7 @@ class Values:
         return self._numbers(element, attribute, count, ANGLES, self.angle)
 
     def ratios(self, element: XmlElement, attribute: str, count: int) -> FloatArray:
-        """Return ``count`` numbers without unit."""
+        """Return ``count`` dimensionless numbers."""
         return self._numbers(element, attribute, count, {}, 1.0)
 
     def _numbers(

@@ -9,7 +9,7 @@ from heliotrope.field.flux_limit import FluxLimit, read_limit, write_limit
 from heliotrope.field.flux_table import read_table_limit
 from heliotrope.field.formats._plant_models import AimsTable
 
-#: Settings by key, and the factor from the key's unit.
+#: Name of the setting for each key, and the factor from the key's unit.
 _KEYS = {
     "probability": ("probability", 1.0),
     "drift_mrad": ("drift", 1e-3),
@@ -29,7 +29,7 @@ def build_aims(table: AimsTable | None, folder: Path) -> AimSettings:
     Raises
     ------
     InputError
-        If they cannot be, or a file is not what it should be.
+        If the settings are invalid, or a file does not have the expected contents.
     """
     if table is None:
         return AimSettings()

@@ -18,7 +18,7 @@ def build_joint(table: JointVisitsTable | None) -> JointSettings | None:
     Raises
     ------
     InputError
-        If its numbers cannot be.
+        If its numbers are invalid.
     """
     made = JointSettings(**_values(table, JointSettings))
     return made if table is None or table.allowed else None
@@ -32,7 +32,7 @@ def build_receiver_visits(table: ReceiverVisitsTable | None) -> ReceiverSettings
 def coded_document(
     joint: JointSettings | None, receiver: ReceiverSettings | None
 ) -> dict[str, dict[str, Any]]:
-    """Return the document's part with the tables: what differs from the default."""
+    """Return the part of the document with these tables: values that differ from defaults."""
     tables = {}
     if joint is None:
         tables["joint_visits"] = {"allowed": False}
@@ -44,7 +44,7 @@ def coded_document(
 
 
 def _values(table: StrictTable | None, made: type[CodedSettings]) -> dict[str, Any]:
-    """Return the settings that a table gives, by name, in the program's own units."""
+    """Return the settings of a table, by name, in the program's own units."""
     given = {} if table is None else table.model_dump(exclude_none=True, exclude={"allowed"})
     values: dict[str, Any] = {}
     for name, setting in made.settings().items():
@@ -58,9 +58,9 @@ def _values(table: StrictTable | None, made: type[CodedSettings]) -> dict[str, A
 
 
 def _table(settings: CodedSettings) -> dict[str, Any]:
-    """Return the table of settings: those without a default, and those that differ from it.
+    """Return the table of settings: those that have no default or differ from it.
 
-    Angles are written in radians: the last digit survives in them.
+    Angles are written in radians, to preserve their last digit.
     """
     keys = {name: setting.key(name) for name, setting in settings.settings().items()}
     return {

@@ -1,4 +1,4 @@
-"""Groups in a plant file: from tables to mechanisms and machines, and back without loss."""
+"""Groups in a plant file: from tables to mechanisms and drive settings, and back without loss."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -35,8 +35,8 @@ from heliotrope.mechanism.machine import (
 )
 from heliotrope.sun import Site
 
-# Numbers of a drive as the writer names them; names such as "rate" have no unit because it
-# depends on the kind.
+# Names that the writer uses for the numbers of a drive; names such as "rate" have no unit because
+# the unit depends on the kind.
 _RAW = {
     **{n: i for n, i in SLOTS.items() if n != "initial_angle"},
     "kind": slot.KIND,
@@ -96,7 +96,7 @@ def build_group(
 
 
 class _Reader:
-    """Numbers of one group: from a column of the table where there is one, else from the TOML."""
+    """Numbers of one group: from a column of the table if there is one, otherwise from the TOML."""
 
     def __init__(
         self,
@@ -128,7 +128,7 @@ class _Reader:
         return column
 
     def columns(self, start: str) -> tuple[str, ...]:
-        """Return the table's columns whose names begin so and that hold numbers of this group."""
+        """Return the columns whose names begin with ``start``, with numbers of this group."""
         names = (name for name in self.table.numbers if name.startswith(start))
         return tuple(name for name in names if self.column(name) is not None)
 
@@ -231,7 +231,7 @@ class _Reader:
         )
         missing = [key for key in needed if key not in values]
         self.check_missing(missing, f"specify here, or as columns {where}.KEY,", where)
-        # Popped first: an unpacked generator would run only after **values.
+        # Popped first, because an unpacked generator would run only after **values.
         constants = [values.pop(key) for key in needed]
         return drive_kinds.linear_paint(*constants, **values)
 
@@ -369,13 +369,13 @@ class _Reader:
             self.array(f"{where}.{key}", getattr(table, key))
             for key in ("acceleration_steps_per_s2", "backlash_steps")
         ]
-        # A drive whose counts fall with the angle has its lower stop at the higher count.
+        # If counts decrease with the angle, the lower stop is at the higher count.
         low, high = np.minimum(*ends), np.maximum(*ends)
         columns = [np.broadcast_to(v, self.rows.shape) for v in (low, high, rate, *rest)]
         return np.round(np.stack(columns, axis=-1)).astype(np.int64)
 
     def check_axis(self, drive: Drive, where: str, table: AxisTable) -> None:
-        """Check that the stops and the rate of an axis are given, here or by its drive."""
+        """Check that the stops and the rate of an axis are specified, here or by its drive."""
         given = (
             ("min_deg", (table.min_steps, table.min_deg), slot.MIN_ANGLE),
             ("max_deg", (table.max_steps, table.max_deg), slot.MAX_ANGLE),
@@ -395,7 +395,7 @@ class _Reader:
     def end(
         self, drive: Drive, where: str, steps: int | None, deg: float | None, stop: int
     ) -> FloatArray:
-        """Return one end of an axis, steps, (N,): as given, or the stop of its drive."""
+        """Return one end of an axis, steps, (N,): as specified, or the stop of its drive."""
         counts = self.number(f"{where}_steps", steps)
         angle = self.number(f"{where}_deg", deg)
         if counts is not None and angle is not None:
@@ -421,7 +421,7 @@ class _Reader:
         defocus: FloatArray,
         joints: Sequence[str],
     ) -> None:
-        """Check that the largest turn of a DEFOCUS ends in time, spread as it is."""
+        """Check that the largest rotation of a DEFOCUS, with its spread, ends in time."""
         low, high, rate, ramp, _ = np.stack(axes, axis=1).transpose(2, 0, 1).astype(np.float64)
         steps = np.abs(defocus / drives.radians_per_count(0.5 * (low + high)))
         time = steps / rate + rate / ramp
@@ -463,7 +463,7 @@ def _column(mechanism: Mechanism, name: str) -> str:
 def group_document(
     name: str, heliostats: Heliostats, place: Path
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the TOML of a group, and the columns of what differs between its heliostats.
+    """Return the TOML of a group, and columns of the values that differ between its heliostats.
 
     Slope maps are written beside the plant file at ``place``.
     """
@@ -546,7 +546,7 @@ def _machine_document(
         "defocus_rad": first(
             "machine.defocus_rad", np.array([machine.defocus for machine in machines])
         ),
-        "defocus_spread": 0.0,  # the angles of each mirror are written
+        "defocus_spread": 0.0,  # the angles of each heliostat are written
         "leaves_stow_first": joints[machines[0].azimuth_axis],
     }
     if machines[0].standby is not None:

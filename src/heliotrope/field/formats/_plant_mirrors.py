@@ -17,12 +17,13 @@ from heliotrope.files.times import parse_time
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.sun import Site, vector
 
-#: A focal length from which on a mirror is flat, m: a table of heliostats holds no infinity.
+#: Focal length from which a mirror counts as flat, m, because the heliostat table cannot contain
+#: infinity.
 FLAT = 1e9
 
 
 class _Numbers(Protocol):
-    """What this module needs of a group's reader."""
+    """The part of a group's reader that this module needs."""
 
     path: Path
     group: GroupTable
@@ -43,7 +44,7 @@ def read_facets(reader: _Numbers, size: tuple[FloatArray, FloatArray], site: Sit
     size
         Width and height of its N mirrors, m, (N,).
     site
-        Place of the plant, for canting at a time.
+        Site of the plant, for canting at a specific time.
 
     Raises
     ------
@@ -77,7 +78,7 @@ def read_facets(reader: _Numbers, size: tuple[FloatArray, FloatArray], site: Sit
 
 
 def _check_keys(reader: _Numbers, table: MirrorTable) -> None:
-    """Refuse keys that exclude each other, and columns of the table that are no keys."""
+    """Refuse keys that exclude each other, and columns of the table that are not valid keys."""
     ways = {
         "mirror.facets": table.facets,
         "mirror.facet": table.facet,
@@ -140,11 +141,11 @@ def read_surface(
     reader
         Numbers of the group.
     names
-        Of its heliostats.
+        Names of its heliostats.
     facets
-        Their facets; the whole mirror if it has none.
+        Facets of the heliostats; the whole mirror if it has none.
     whole
-        Whether it has none.
+        Whether the mirror has no facets.
 
     Raises
     ------
@@ -181,7 +182,7 @@ def _full(reader: _Numbers, value: FloatArray | None) -> FloatArray | None:
 def _of_facets(
     reader: _Numbers, table: MirrorTable, key: str, each: list[float] | None, *, whole: bool
 ) -> FloatArray | None:
-    """Return a number of each mirror, (N,), or of each facet if they differ, (N, F)."""
+    """Return a value per mirror, (N,), or per facet if facets differ, (N, F)."""
     if each is not None:
         return reader.array(f"mirror.facet_{key}", each)
     mirror = _full(reader, reader.number(f"mirror.{key}", getattr(table, key)))
@@ -217,7 +218,7 @@ def _maps(
         )
     maps = []
     for i, name in enumerate(names):
-        # Deflectometry measures the whole slope, of which the known curvature is taken off.
+        # Deflectometry measures the total slope, from which the known curvature is subtracted.
         curve = np.inf if focal is None else focal[i]
         maps.append(measured_slopes(folder, name, facets.take(np.array([i])), curve))
     if all(each is None for each in maps):
@@ -239,7 +240,8 @@ def mirror_document(
     name, heliostats
         The group.
     first
-        Puts numbers that differ between heliostats into columns, and returns the first.
+        Function that puts numbers that differ between heliostats into columns, and returns the
+        first.
     place
         The plant file.
     """

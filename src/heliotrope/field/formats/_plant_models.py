@@ -30,7 +30,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 
-#: Angles of a drive; each may be given in ``_deg``, ``_mrad`` or ``_rad``.
+#: Angles of a drive; each may be specified in ``_deg``, ``_mrad`` or ``_rad``.
 DRIVE_ANGLES = (
     "zero",
     "initial_angle",
@@ -250,7 +250,7 @@ RotaryDrive = _drive(
     sense=(Literal[1, -1], 1),
 )
 DirectDrive = _drive("DirectDrive", "direct")
-# The constants of a jack often differ between heliostats: they may stand in the table instead.
+# The constants of a jack often differ between heliostats, so they may be in the table instead.
 LinearDrive = _drive(
     "LinearDrive",
     "linear",

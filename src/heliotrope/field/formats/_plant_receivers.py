@@ -18,7 +18,7 @@ def build_receiver(table: ReceiverTable, folder: Path) -> Receiver:
     Raises
     ------
     InputError
-        If a value is missing or cannot be used, or the file is no mesh.
+        If a value is missing or cannot be used, or the file is not a mesh.
     """
     mesh = _mesh(table, folder)
     width, height = table.width_m, table.height_m
@@ -69,7 +69,7 @@ def receiver_document(receiver: Receiver, number: int, place: Path) -> dict[str,
     Parameters
     ----------
     receiver, number
-        The receiver, and its place among those of the plant.
+        The receiver, and its index among those of the plant.
     place
         The plant file.
     """

@@ -13,9 +13,9 @@ import numpy as np
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, normalize
 
-#: The value that is a name.
+#: The only value that is a name.
 RENAMED = "name"
-#: Digits of a metre that are written: nanometres.
+#: Decimals of a metre that are written (nanometres).
 _DIGITS = 9
 _SIZES = ("width_m", "height_m", "radius_m")
 
@@ -39,15 +39,15 @@ def set_surface(table: Any, changes: Mapping[str, str]) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        A value that does not fit.
+        If a value is invalid.
     UnknownNameError
-        A name that is not a value of it.
+        If a name is not one of its values.
     """
     known = surface_values(table)
     for name in changes:
         if name not in known:
             raise UnknownNameError(f"value of {table['name']}", name, known)
-    # Single points first: the surface then moves and turns with them.
+    # Single points first, because the surface then moves and rotates with them.
     for name, text in changes.items():
         if name == RENAMED:
             table["name"] = text.strip()
@@ -85,7 +85,7 @@ def _turn(table: Any, changes: Mapping[str, str]) -> None:
 
 
 def _corners(table: Any) -> None:
-    """Give an upright target of a size its corners, so that it can lean."""
+    """Add corners to an upright target specified by its size, so that it can be tilted."""
     facing, _ = _angles(table)
     across, up = _axes(facing, 0.0)[:, 0], np.array([0.0, 0.0, 1.0])
     w, h = 0.5 * float(table.pop("width_m")), 0.5 * float(table.pop("height_m"))
@@ -161,7 +161,7 @@ def _move(table: Any, motion: Any) -> None:
 
 
 def _put(array: Any, values: FloatArray) -> None:
-    """Set the numbers of an array in its place: its layout and comments stay."""
+    """Set the numbers of an array in place, so that its layout and comments are preserved."""
     for k, value in enumerate(values):
         new = round(float(value), _DIGITS)
         if float(array[k]) != new:

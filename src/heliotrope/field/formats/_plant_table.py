@@ -15,7 +15,7 @@ from heliotrope.geometry import FloatArray
 TEXTS = ("name", "group", "cluster")
 REQUIRED = ("name", "group", "east_m", "north_m", "up_m")
 
-#: Plausible values by column: a value outside is most likely in another unit.
+#: Plausible values by column; a value outside is most likely in another unit.
 PLAUSIBLE = {
     "east_m": (-50e3, 50e3, "m from the site's reference"),
     "north_m": (-50e3, 50e3, "m from the site's reference"),
@@ -28,7 +28,7 @@ PLAUSIBLE = {
     "pivot_height_m": (-1.0, 30.0, "m"),
     "pivot_offset_m": (-3.0, 3.0, "m"),
 }
-#: Most errors that are listed.
+#: Maximum number of errors that are listed.
 MOST_PROBLEMS = 50
 
 
@@ -40,9 +40,7 @@ class HeliostatColumns:
     ----------
     path
         The file.
-    name, group, cluster
-        Texts, (N,).
-    numbers
+    name, group, cluster Text columns, (N,). numbers
         Columns of numbers, each (N,), by name.
     problems
         Errors found in it.
@@ -66,7 +64,7 @@ def read_table(path: Path) -> HeliostatColumns:
     Raises
     ------
     FormatError
-        Not a table at all; single wrong values go to ``problems``.
+        If it is not a table at all; single wrong values are added to ``problems``.
     """
     rows = read_columns(path)
     rows.need(REQUIRED)
@@ -91,7 +89,7 @@ def read_columns(path: Path) -> Rows:
     Raises
     ------
     FormatError
-        If it cannot be read.
+        If the file cannot be read.
     """
     if path.suffix == ".parquet":
         return read_parquet(path, "the table of heliostats")
@@ -99,7 +97,7 @@ def read_columns(path: Path) -> Rows:
 
 
 def plausible(rows: Rows, column: str, meaning: str, *, empty: float | None = None) -> FloatArray:
-    """Return a column of numbers; one outside the range of its ``meaning`` is refused."""
+    """Return a column of numbers; refuse numbers outside the range of their ``meaning``."""
     low, high, unit = PLAUSIBLE.get(meaning, (-np.inf, np.inf, "a number"))
     values = rows.numbers(column, unit, empty)
     rows.within(column, values, low, high, unit)
@@ -107,12 +105,12 @@ def plausible(rows: Rows, column: str, meaning: str, *, empty: float | None = No
 
 
 def write_table(parts: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write columns, group below group, as CSV (17 digits) or Parquet."""
+    """Write columns, one group after the other, as CSV (17 digits) or Parquet."""
     import pandas as pd
 
     frame = pd.concat([pd.DataFrame(dict(part)) for part in parts], ignore_index=True)
     if path.suffix == ".parquet":
         write_file(path, lambda stream: frame.to_parquet(stream, index=False))
     else:
-        # repr of a float is the shortest text that reads back the same.
+        # The repr of a float is the shortest text from which the same float is read.
         write_file(path, lambda stream: frame.to_csv(stream, index=False, na_rep=""))

@@ -21,7 +21,7 @@ def build_volume(table: AnyVolume) -> Volume:
     Raises
     ------
     InputError
-        If its numbers make none.
+        If its numbers do not define a volume.
     """
     match table:
         case BoxTable():

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     import h5py
 
 _WHAT = "a scenario that ARTIST has made"
-#: ARTIST's names of the deviations, by PAINT's; PAINT's ``joint_tilt_e_2`` tilts the second joint.
+#: ARTIST's names of the deviations, by PAINT's names; PAINT's ``joint_tilt_e_2`` tilts the second
+#: joint.
 _DEVIATIONS = {
     f"{ours}_{axis}{number}": f"{theirs}_{axis}"
     for ours, number, theirs, axes in (
@@ -49,9 +50,9 @@ def write_scenario(
     Parameters
     ----------
     path
-        Of the new scenario; it is there whole or not at all.
+        Path of the new scenario, which is written completely or not at all.
     scenario
-        Made by ARTIST's generator; it is not changed, unless it is ``path``.
+        Scenario created by ARTIST's generator; not changed, unless it is ``path``.
     heliostats
         The group of each heliostat, by name; of kind ``two_jacks``.
     origin
@@ -59,7 +60,7 @@ def write_scenario(
 
     Returns
     -------
-    By heliostat, the parameters that have no place in the form, each with its value and unit.
+    By heliostat, the parameters that the format cannot represent, each with its value and unit.
 
     Raises
     ------
@@ -96,7 +97,7 @@ def write_scenario(
 
 def _mechanism(root: "h5py.File", own: "h5py.Group", properties: dict[str, Any]) -> None:
     for part in ("kinematics", "actuator"):
-        if part not in own:  # it had the prototype's
+        if part not in own:  # the heliostat used the prototype's
             root.copy(f"prototypes/{part}", own, part)
     for ours, theirs in _DEVIATIONS.items():
         _write(own, f"kinematics/deviations/{theirs}", properties[ours])
@@ -113,7 +114,7 @@ def _mechanism(root: "h5py.File", own: "h5py.Group", properties: dict[str, Any])
 
 
 def _write(place: "h5py.Group", name: str, value: npt.ArrayLike) -> None:
-    """Replace a value, in single precision as ARTIST has it."""
+    """Replace a value, in single precision as in ARTIST."""
     array = np.asarray(value)
     if name in place:
         del place[name]

@@ -26,7 +26,7 @@ SUFFIX = ".h5"
 # Maximum number of cells along an edge of a facet, and points per cell, because a mean of few
 # points is noisy.
 _CELLS, _POINTS = 64, 4
-# Minimum share of the points that must lie on their facet; the others are at its rim.
+# Minimum fraction of the points that must lie on their facet; the others are at its rim.
 _ON_FACET = 0.5
 _WHAT = "a deflectometry file in PAINT's form (.h5)"
 
@@ -57,8 +57,8 @@ def measured_slopes(
     Parameters
     ----------
     folder
-        With files NAME.npz or NAME.csv (`heliotrope.field.formats.slopes.read_slopes`), or as
-        `find_deflectometry`.
+        Folder with files NAME.npz or NAME.csv (`heliotrope.field.formats.slopes.read_slopes`), or
+        as for `find_deflectometry`.
     name
         The heliostat.
     facets, focal
@@ -96,8 +96,8 @@ def read_deflectometry(
     Raises
     ------
     FormatError
-        If it cannot be read, is for another number of facets, has points beside its facets or
-        normals that look backwards, or as `heliotrope.field.formats.slopes.read_slopes`.
+        If the file cannot be read, has a different number of facets, has points outside its facets
+        or normals that point backwards, or as for `heliotrope.field.formats.slopes.read_slopes`.
     """
     import h5py
 
@@ -121,7 +121,7 @@ def read_deflectometry(
 
 
 def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, FloatArray]:
-    """Return points and normals of a facet, (K, 3) each, without those that are not numbers."""
+    """Return points and normals of a facet, (K, 3) each, excluding NaN."""
     import h5py
 
     both = []
@@ -163,7 +163,7 @@ def _gridded(
     normals: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2); NaN without any."""
+    """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2); NaN if empty."""
     facets, curve = mirror
     axes, half = facets.axes[0, k], facets.half_size[0, k]
     own = normals @ axes.T

@@ -83,7 +83,7 @@ class FetchProgress(Protocol):
     """Receives the progress of a run, from one thread at a time."""
 
     def __call__(self, state: FetchState, /) -> None:
-        """Take the state."""
+        """Receive the state."""
 
 
 @dataclass(frozen=True)
@@ -93,13 +93,13 @@ class FetchSettings:
     Attributes
     ----------
     workers
-        Files at a time, 1 to 32.
+        Number of files downloaded at a time, 1 to 32.
     timeout
         Limit for connecting and for the next bytes, s.
     retries
-        Failures in a row without a new byte before a file is given up.
+        Consecutive failures without a new byte before a file is given up.
     backoff
-        Pause after the first failure, s; it doubles with each.
+        Pause after the first failure, s; doubles with each further failure.
 
     Raises
     ------
@@ -131,11 +131,11 @@ class Fetched:
     files
         All requested files, in the order of the catalogue.
     new
-        Files downloaded in this run; the others were there.
+        Files downloaded in this run; all others existed already.
     received
         Bytes downloaded.
     missing
-        Data that the catalogue does not have, in words.
+        Data that are missing from the catalogue, in words.
     """
 
     files: tuple[Path, ...]
@@ -220,7 +220,7 @@ def fetch_tower(
 
 @dataclass(frozen=True)
 class _Link:
-    """A document of the catalogue, of a heliostat or ("") of the tower."""
+    """A document of the catalogue, for a heliostat or ("") for the tower."""
 
     heliostat: str
     kind: str
@@ -265,12 +265,12 @@ class _Document:
             raise FetchError(f"{self.url}: {href!r} is not a valid address ({error})") from None
 
     def assets(self) -> dict[str, dict[str, Any]]:
-        """Return the files that an item names.
+        """Return the files listed by an item.
 
         Raises
         ------
         FetchError
-            If it names no files, or one without an address.
+            If it lists no files, or a file without an address.
         """
         assets = self.content.get("assets")
         if not isinstance(assets, dict) or not all(
@@ -327,7 +327,7 @@ class _Run:
         self._channel = Channel(client, journal, settings.retries, settings.backoff, self._received)
 
     def fetch(self, jobs: list[RemoteFile]) -> list[bool]:
-        """Fetch the files; return for each whether it was downloaded now."""
+        """Fetch the files; return for each whether it was downloaded in this run."""
         self._done = self._total = 0
         return self._map("fetching", self._download, jobs)
 
@@ -489,7 +489,7 @@ def _distinct(jobs: Iterable[RemoteFile]) -> list[RemoteFile]:
     Raises
     ------
     FetchError
-        If two different files would go to one place.
+        If two different files would have the same destination.
     """
     distinct: dict[Path, RemoteFile] = {}
     for job in jobs:

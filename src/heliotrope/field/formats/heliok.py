@@ -60,9 +60,9 @@ __all__ = [
 ]
 
 _LEANS = ("east", "north", "up")
-#: A normal closer than this (rad) to the secondary axis is not turned by it.
+#: Angle between normal and secondary axis below which the axis does not rotate the normal, rad.
 ALONG_LIMIT = 1e-6
-#: A facet further from the mirror's normal is a mistake, not canting.
+#: Angle between a facet and the mirror's normal above which it is a mistake, not canting, rad.
 FACET_LIMIT_DEG = 60.0
 
 
@@ -112,7 +112,7 @@ class Model:
     Attributes
     ----------
     name
-        Unique.
+        Unique name.
     primary, secondary
         The driven axes; ``secondary`` is None for a single-axis tracker.
     facets
@@ -304,7 +304,7 @@ def _place(values: Values, element: XmlElement) -> tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class _Kit:
-    """A HeliostatKit or ShapeKit of the scene with what its nodes add up to."""
+    """A HeliostatKit or ShapeKit of the scene with the combined transformation of its nodes."""
 
     element: XmlElement
     path: tuple[str, ...]
@@ -556,7 +556,7 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
 
 
 def _drive(axes: tuple[DrivenAxis, ...]) -> Drive:
-    """Return drives whose counts are radians, one an axis, with its stops."""
+    """Return drives whose counts are radians, one per axis, with its stops."""
     stops = np.array([axis.stops for axis in axes])
     drives = Drive(np.tile(direct().table, (len(axes), 1)))
     return drives.replace(min_angle=stops[:, 0], max_angle=stops[:, 1])

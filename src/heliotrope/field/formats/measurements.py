@@ -49,7 +49,7 @@ class Measurements:
     centroid
         Centroid of the beam on the target, ENU metres about the plant's reference, (M, 3).
     left_out
-        One line for each row that could not be used.
+        One line for each record that could not be used.
     """
 
     heliostat: tuple[str, ...]
@@ -71,10 +71,10 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
     Parameters
     ----------
     folder
-        With ``measurements.csv``, or ``ID/Calibration/*-calibration-properties.json`` (without
-        ``Calibration/`` as ARTIST has it).
+        Folder with ``measurements.csv``, or ``ID/Calibration/*-calibration-properties.json``
+        (ARTIST omits ``Calibration/``).
     centroid
-        Published extractor whose centroid is used.
+        Published extractor whose centroids are used.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
 
 
 def _read_table(path: Path, centroid: Centroid) -> "tuple[pd.DataFrame, list[str]]":
-    """Return the rows of a table, and a line for each that has another length than the header."""
+    """Return the rows of a table, and a line for each row of another length than the header."""
     import pandas as pd
 
     needed = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]
@@ -136,10 +136,10 @@ def _read_files(place: Path, centroid: Centroid) -> "pd.DataFrame":
 def _seconds(texts: "pd.Series[str]") -> FloatArray:
     import pandas as pd
 
-    # A text without a zone is refused; PAINT writes Z.
+    # A time without a zone is refused; PAINT writes Z.
     zoned = texts.where(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True), "")
     times = pd.to_datetime(zoned, utc=True, errors="coerce", format="ISO8601")
-    # In nanoseconds the years end with 2262.
+    # Times in nanoseconds end in the year 2262.
     seconds = (times - pd.Timestamp(0, tz="UTC").as_unit("us")) / pd.Timedelta(seconds=1)
     return np.asarray(seconds, dtype=np.float64)
 
@@ -169,7 +169,7 @@ def _keep_good(
         ]
         good &= ~invalid
     rows = np.flatnonzero(good)
-    # 0 is south and east is positive: the angle from north, clockwise, is 180° minus it.
+    # 0 is south and east is positive, so the clockwise angle from north is 180° minus the azimuth.
     suns = direction(np.pi - np.radians(azimuth[rows]), np.radians(elevation[rows]))
 
     def texts(column: str) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from heliotrope.files.limits import check_file
 from heliotrope.files.text import read_text, write_text
 
 _WHAT = "a mesh (.obj, or binary .stl)"
-#: Header of an STL file, and the bytes of a triangle.
+#: Size of the header of an STL file, and of a triangle, bytes.
 _HEADER, _TRIANGLE = 84, 50
 
 
@@ -26,7 +26,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
     Raises
     ------
     FormatError
-        If it cannot be read, or is not a mesh.
+        If the file cannot be read, or is not a mesh.
     """
     file = check_file(path, _WHAT, binary=True)
     suffix = file.suffix.casefold()
@@ -41,7 +41,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
 
 
 def write_mesh(path: str | Path, mesh: TriangleMesh) -> None:
-    """Write a mesh as OBJ, in metres, so that it reads back exactly."""
+    """Write a mesh as OBJ, in metres, from which exactly the same mesh is read."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist()]
     write_text(path, "\n".join(lines) + "\n")
@@ -57,7 +57,8 @@ def _read_obj(file: Path) -> TriangleMesh:
                 x, y, z = (float(part) for part in parts[:3])
                 vertices.append([x, y, z])
             elif kind == "f":
-                # A corner is vertex, vertex/texture or vertex/texture/normal; −1 is the last.
+                # A corner is vertex, vertex/texture or vertex/texture/normal; −1 is the last
+                # vertex.
                 corners = [int(part.split("/")[0]) for part in parts]
                 rows = [c - 1 if c > 0 else len(vertices) + c for c in corners]
                 if len(rows) < 3:

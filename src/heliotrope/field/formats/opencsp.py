@@ -47,7 +47,7 @@ _SIZES = {
     "Facet Width": "mirror_width_m",
     "Facet Height": "mirror_height_m",
 }
-#: Columns that no other table of heliostats has.
+#: Columns that occur in no other format's heliostat table.
 _OWN = ("Name", "Num. Facets", "Pivot Height")
 
 
@@ -70,7 +70,7 @@ class FieldTable:
     facet_width, facet_height
         m, (N,).
     extra
-        Further columns of the file, word for word, each (N,).
+        Additional columns of the file, unchanged, each (N,).
     """
 
     names: tuple[str, ...]
@@ -113,9 +113,8 @@ def read_field(path: str | Path) -> FieldTable:
     Raises
     ------
     FormatError
-        If the file cannot be read, a column is missing, a row has another number of
-        cells, a cell is not what its column needs, or a name occurs twice; with line and
-        column.
+        If the file cannot be read, a column is missing, a row has another number of cells, a cell
+        is invalid for its column, or a name occurs twice; the text states line and column.
     """
     rows = _read(path, "an OpenCSP heliostat field", COLUMNS)
     names = rows.names("Name", "heliostat")
@@ -142,7 +141,7 @@ def read_field(path: str | Path) -> FieldTable:
 
 
 def is_field(path: Path) -> bool:
-    """Return whether the header of a table names OpenCSP's columns."""
+    """Return whether the header of a table contains OpenCSP's columns."""
     _, table = read_cells(path, "a table of heliostats (SolarPILOT or OpenCSP)")
     return {alike(name) for name in _OWN} <= {alike(cell) for cell in table[0]}
 
@@ -168,7 +167,7 @@ def _count(rows: Rows, column: str) -> FloatArray:
 
 
 def write_field(path: str | Path, table: FieldTable) -> None:
-    """Write the table of heliostats, with its further columns; it is there whole or not at all."""
+    """Write the table of heliostats, with its additional columns, completely or not at all."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*COLUMNS, *table.extra])
@@ -201,8 +200,8 @@ def read_centroids(path: str | Path) -> Centroids:
 def to_plant(table: FieldTable, site: Site, centroids: Centroids | None = None) -> Plant:
     """Return the plant of a field: azimuth-elevation heliostats.
 
-    Heliostats with the same number of facets share a group. Each one's foot stands the pivot height
-    below the location of its pivot.
+    Heliostats with the same number of facets share a group. The foot of each heliostat is below its
+    pivot by the pivot height.
 
     Parameters
     ----------
@@ -211,8 +210,8 @@ def to_plant(table: FieldTable, site: Site, centroids: Centroids | None = None) 
     site
         The plant's reference point: the field's origin.
     centroids
-        From `read_centroids`; they also give the size of the mirror. Without them
-        the facets stand edge to edge.
+        From `read_centroids`; they also determine the size of the mirror. Without them the facets
+        are placed edge to edge.
 
     Raises
     ------

@@ -68,7 +68,7 @@ def _read(
     templates: Mapping[int, solarpilot.Template] | None,
 ) -> Plant:
     if place.is_dir():
-        # These readers load libraries that an opener of another format does not need.
+        # These readers load libraries that other formats do not need.
         from heliotrope.field.formats import paint
 
         _refuse_unused(place, site=site, centroids=centroids, templates=templates)
@@ -123,7 +123,7 @@ _GIVE = (
 
 
 def _refuse_unused(place: Path, **arguments: object) -> None:
-    """Refuse an argument that the format of a file has no use for."""
+    """Refuse an argument that does not apply to the format of a file."""
     for name, value in arguments.items():
         if value is not None:
             raise FormatError(

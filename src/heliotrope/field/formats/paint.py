@@ -26,14 +26,14 @@ from heliotrope.sun import Site
 TOWER_FILE = "tower-measurements.json"
 Origin = tuple[float, float, float]
 
-# θ₀ of the first joint counts from the horizontal, the file's from the vertical.
+# θ₀ of the first joint is relative to the horizontal, that in the file to the vertical.
 _AXIS_1_ZERO = -0.5 * np.pi
-#: Numbers of a drive that PAINT has no place for.
+#: Numbers of a drive that PAINT's format cannot represent.
 _LOST = ("scale", "worm_cos", "worm_sin", "sag")
 
-#: Length and breadth of the strokes of Jülich's marks, m, read off photographs.
+#: Length and width of the strokes of Jülich's marks, measured in photographs, m.
 MARK_SIZE, MARK_STROKE = 0.735, 0.15
-# Marks at the measured points: kind and turn.
+# Marks at the measured points: kind and rotation.
 _MARKS = {
     "upper_left": ("corner", 0.0),
     "upper_middle": ("tee", 0.0),
@@ -46,7 +46,7 @@ _MARKS = {
 
 @dataclass(frozen=True)
 class Properties:
-    """Properties of one heliostat as the file gives them.
+    """Properties of one heliostat as in the file.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ def _number_or(node: JsonNode, key: str, default: float) -> float:
 
 def _drive(node: JsonNode, zero: float) -> Drive:
     kind = node.any_of("type_axis", "type").text()
-    # "ideal" says how ARTIST is to simulate it; the constants beside it are the jack's.
+    # "ideal" tells ARTIST how to simulate the jack, whose constants are beside it.
     if kind not in ("linear", "ideal"):
         raise node.fail(f"actuator of type {kind!r}; known are 'linear' and 'ideal'")
     low, high = node["min_increment"].number(), node["max_increment"].number()
@@ -184,7 +184,7 @@ class Tower:
     origin
         Latitude and longitude in degrees and height in m of the plant's reference.
     targets, receivers
-        In ENU about it.
+        Targets and receivers in ENU about the origin.
     """
 
     origin: Origin
@@ -195,8 +195,8 @@ class Tower:
 def read_tower(path: str | Path) -> Tower:
     """Return the tower's reference point, targets and receivers.
 
-    The planes come from the corners: the normals in the file are rounded to the compass,
-    the real planes are yawed by some milliradians.
+    The planes are computed from the corners, because the normals in the file are rounded to compass
+    directions, whereas the real planes are yawed by some milliradians.
 
     Raises
     ------
@@ -227,7 +227,7 @@ def read_tower(path: str | Path) -> Tower:
 
 
 def _corners(node: JsonNode, points: dict[str, FloatArray], prefix: str = "") -> FloatArray:
-    """Corners from the upper left, as seen from the front."""
+    """Return the corners from the upper left, as seen from the front."""
     order = ("upper_left", "upper_right", "lower_right", "lower_left")
     for corner in order:
         if prefix + corner not in points:
@@ -246,9 +246,9 @@ def _target(name: str, node: JsonNode, points: dict[str, FloatArray]) -> Target:
 def with_marks(targets: Sequence[Target]) -> tuple[Target, ...]:
     """Return targets with the marks at their measured points at Jülich.
 
-    Ls stand at free corners, Ts at the middles and where two targets meet; the points are
-    on their outer edges. The files do not say so; it was measured in published photographs,
-    sizes to a centimetre.
+    Ls are at free corners, Ts at edge midpoints and where two targets meet; the points are on their
+    outer edges. This is not in the files; it was measured in published photographs, sizes to within
+    a centimetre.
     """
     marked = []
     for target in targets:
@@ -284,7 +284,7 @@ def _receiver(name: str, kind: str, node: JsonNode, points: dict[str, FloatArray
 def find_properties(folder: str | Path) -> list[Path]:
     """Return the property files of a folder.
 
-    They are ``properties/ID.json``, as PAINT has them (``ID/Properties/…``), or as ARTIST has them
+    They are ``properties/ID.json``, or as in PAINT (``ID/Properties/…``) or ARTIST
     (``ID/heliostat-properties.json``).
     """
     root = Path(folder)
@@ -295,7 +295,7 @@ def find_properties(folder: str | Path) -> list[Path]:
 
 
 def heliostat_of(file: Path) -> str:
-    """Return the heliostat of a file of PAINT or ARTIST from its folder; empty if unknown."""
+    """Return the heliostat of a PAINT or ARTIST file from its folder; empty if unknown."""
     if file.parent.name in ("Properties", "Calibration"):
         return file.parent.parent.name
     own = (file.parent / "heliostat-properties.json").exists()
@@ -308,7 +308,7 @@ def find_tower(folder: str | Path) -> Path:
     Raises
     ------
     FormatError
-        If there is none.
+        If there is no tower file.
     """
     names = [Path(folder) / TOWER_FILE, *sorted(Path(folder).glob("**/*tower-measurements*.json"))]
     for name in names:
@@ -408,7 +408,7 @@ class CalibrationProperties:
 
 
 def read_calibration_properties(path: str | Path) -> CalibrationProperties:
-    """Return one calibration measurement; both published styles of keys are read."""
+    """Return one calibration measurement; both published key styles are supported."""
     root = read_json(path, "PAINT calibration properties")
     motors = root["motor_position"]
     spots = {name: node.geodetic() for name, node in root["focal_spot"].items() if node.value}
@@ -427,15 +427,15 @@ def read_calibration_properties(path: str | Path) -> CalibrationProperties:
 def write_heliostat(
     heliostats: Heliostats, name: str, origin: Origin, path: str | Path
 ) -> tuple[str, ...]:
-    """Write the properties of one heliostat, its calibrated parameters folded in.
+    """Write the properties of one heliostat, including its calibrated parameters.
 
-    The zero of the second jack is folded into its initial angle. ARTIST reads the form, but takes
-    joint tilts for 0; `artist.write_scenario` gives it all of them.
+    The zero offset of the second jack is included in its initial angle. ARTIST reads this format,
+    but sets joint tilts to 0; `artist.write_scenario` passes all of them to ARTIST.
 
     Returns
     -------
-    The parameters that have no place in the format, each with its value and unit; a plant file
-    keeps them.
+    The parameters that the format cannot represent, each with its value and unit; a plant file
+    contains them.
 
     Raises
     ------
@@ -471,7 +471,7 @@ def written(heliostats: Heliostats, name: str) -> Mechanism:
     Raises
     ------
     InputError
-        If it is of another kind.
+        If the mechanism is of another kind.
     """
     if heliostats.mechanism.kind != "two_jacks":
         raise InputError(
@@ -482,7 +482,7 @@ def written(heliostats: Heliostats, name: str) -> Mechanism:
 
 
 def kinematics_properties(mechanism: Mechanism) -> dict[str, object]:
-    """Return a mechanism as PAINT's file states it: translations, tilts, and two actuators."""
+    """Return a mechanism in PAINT's format: translations, tilts, and two actuators."""
     joints = dict(zip(mechanism.joints, mechanism.angles, strict=True))
     chain: dict[str, object] = {
         "actuators": [_actuator(mechanism.drives.table[k], k) for k in (0, 1)]
@@ -503,7 +503,7 @@ def kinematics_properties(mechanism: Mechanism) -> dict[str, object]:
 
 
 def without_place(mechanism: Mechanism) -> tuple[str, ...]:
-    """Return the parameters of a mechanism that PAINT has no place for, with their values."""
+    """Return the parameters of a mechanism that PAINT cannot represent, with their values."""
     joints = dict(zip(mechanism.joints, mechanism.angles, strict=True))
     lost = {name: float(joints[name]) for name in ("canting", "canting_secondary")}
     for k, d in enumerate(mechanism.driven):
@@ -525,7 +525,7 @@ def _actuator(row: FloatArray, axis: int) -> dict[str, object]:
     def of(name: str) -> float:
         return float(row[SLOTS[name]])
 
-    # SENSE stands before STROKE in the row; SLOTS names only what may be calibrated.
+    # SENSE precedes STROKE in the row; SLOTS contains only parameters that may be calibrated.
     sense = float(row[SLOTS["stroke_offset"] - 1])
     speed = of("speed")
     return {
@@ -539,7 +539,7 @@ def _actuator(row: FloatArray, axis: int) -> dict[str, object]:
         "pivot_radius": of("pivot_radius"),
         "radius_shift": 0.0,
         "clockwise_axis_movement": 1 if sense > 0 else 0,
-        # The bias of the first axis has a place of its own, joint_tilt_e_2.
+        # The bias of the first axis has its own key, joint_tilt_e_2.
         "initial_angle": of("initial_angle") + (of("bias") if axis else -_AXIS_1_ZERO),
         "movement_speed": speed if np.isfinite(speed) else 0.0,
     }

@@ -25,17 +25,17 @@ from heliotrope.field.heliostats import Heliostats
 from heliotrope.files import read_text, write_file, write_text
 from heliotrope.files.documents import read_toml
 
-#: Smaller units that a value may be given in, by the unit of its column, and their size there.
+#: Smaller units in which a value may be entered, by the unit of its column, and their size in it.
 _SMALLER = {"rad": {"mrad": 1e-3, "deg": np.pi / 180.0}, "m": {"mm": 1e-3}}
 _TEXTS = ("cluster", "group")
 _NOTE = "change.txt"
-#: A parameter beyond this many standard deviations of its prior gets a warning.
+#: Number of prior standard deviations above which a parameter causes a warning.
 _STRANGE = 5.0
 
 
 @dataclass(frozen=True)
 class Change:
-    """A value that changes: its name, the old text and the new one, and the unit."""
+    """A changed value: its name, the old and the new text, and the unit."""
 
     name: str
     old: str
@@ -52,7 +52,7 @@ class Edited:
     changes
         The values that changed.
     warnings
-        Of the changed file, those that the old one had not.
+        Warnings about the changed file that did not apply to the old one.
     version
         Stored version of the file before the change; empty if nothing was written.
     """
@@ -64,7 +64,7 @@ class Edited:
 
 @dataclass(frozen=True)
 class Version:
-    """A stored version of a plant file: its name (the time, UTC), and the change that ended it."""
+    """A stored version of a plant file: its name (time in UTC), and the change replacing it."""
 
     name: str
     note: str
@@ -92,7 +92,7 @@ def edit(
     now: datetime | None = None,
     dry: bool = False,
 ) -> Edited:
-    """Change values of one heliostat, target or receiver, and keep the file as it was.
+    """Change values of one heliostat, target or receiver, and keep the old file.
 
     Parameters
     ----------
@@ -101,12 +101,12 @@ def edit(
     who
         Name of the heliostat, target or receiver.
     changes
-        Texts by the names of `values`; an angle may be given in ``_mrad`` or ``_deg``, and a length
-        in ``_mm``, where the name ends in ``_rad`` or ``_m``.
+        Texts by the names of `values`; if a name ends in ``_rad`` or ``_m``, an angle may be
+        entered in ``_mrad`` or ``_deg``, and a length in ``_mm``.
     note
-        Reason, kept with the stored version.
+        Reason, stored with the version.
     now
-        The time; default the clock's.
+        The time; default: the system time.
     dry
         Check, but write nothing.
 
@@ -115,7 +115,7 @@ def edit(
     FormatError
         If the file, or the changed file, cannot be used.
     InputError
-        Values that do not fit, or nothing that changes.
+        If values are invalid, or nothing changes.
     """
     files = _Files(Path(path))
     before, surface = files.values(who), who not in files.plant.names
@@ -140,9 +140,9 @@ def edit(
 
 
 def keep_version(path: str | Path, change: str, *, now: datetime | None = None) -> str:
-    """Store a plant file as it is, before another part of the program changes it.
+    """Store the present version of a plant file, before another part of the program changes it.
 
-    Returns the name of the version; ``change`` says in words what ends it.
+    Returns the name of the version; ``change`` describes the change that replaces it.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def versions(path: str | Path) -> list[Version]:
 
 
 def restore(path: str | Path, version: str, *, note: str = "", now: datetime | None = None) -> str:
-    """Bring back a stored version; return that of the file as it was before.
+    """Restore a stored version; return the version name of the replaced file.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def restore(path: str | Path, version: str, *, note: str = "", now: datetime | N
     if version not in known:
         raise UnknownNameError("stored version", version, known)
     old = _Files(_versions(place) / version / place.name)
-    # The present file may be the one that cannot be read.
+    # The present file may be unreadable.
     kept = _keep(place, old.table, f"version {version} was brought back", note, now)
     _copy(old.place.parent, place.parent, old.table)
     _copy(old.place.parent, place.parent, place.name)
@@ -268,7 +268,7 @@ class _Files:
         raise UnknownNameError(f"value of heliostat {who}", name, known)
 
     def _fill(self, who: str, column: str) -> None:
-        """Give the other heliostats of the group the nominal value of a new column."""
+        """Set the nominal value of a new column for the other heliostats of the group."""
         group, _ = self.plant.find(who)
         if column not in self.cells.columns:
             self.cells[column] = np.nan if self.table.suffix == ".parquet" else ""
@@ -316,7 +316,7 @@ class _Files:
         yield texts
 
     def write(self, home: Path) -> None:
-        """Write table and TOML, the table first: a reader never sees half a file."""
+        """Write the table and then the TOML, so that a reader never sees an incomplete file."""
         import tomlkit
 
         table = home / self.table
@@ -331,7 +331,7 @@ class _Files:
 
 
 def _named_files(table: Any, home: Path) -> Iterator[PurePath]:
-    """Yield the files and folders beside a plant file that it names, such as maps and meshes."""
+    """Yield the files and folders that a plant file refers to, such as maps and meshes."""
     if isinstance(table, Mapping):
         table = list(table.values())
     if isinstance(table, list):
@@ -375,7 +375,7 @@ def _versions(path: Path) -> Path:
 
 
 def _keep(place: Path, table: PurePath, change: str, note: str, now: datetime | None) -> str:
-    """Store the files as they are on the disk; return the name of the version."""
+    """Store the files as they are on disk; return the name of the version."""
     at = (now or datetime.now(UTC)).astimezone(UTC)
     stem, home = at.strftime("%Y-%m-%dT%H%M%SZ"), _versions(place)
     taken = [version.name for version in home.iterdir()] if home.is_dir() else []

@@ -1,6 +1,6 @@
 """Our own format: one TOML file for the plant, with a table of its heliostats beside it.
 
-The TOML file contains what all heliostats share (site, tower, kinds of mechanism, machines); the
+The TOML file contains what all heliostats share (site, tower, kinds of mechanism, drives); the
 table contains what differs: name, group, position, and any number of the group in a column with its
 dotted name. Files are written at full precision, so that a plant reads back exactly as it was.
 """
@@ -272,9 +272,9 @@ def _target(table: TargetTable) -> Target:
 def rectangle(center: FloatArray, width: float, height: float, facing: float) -> FloatArray:
     """Return the corners (4, 3) of an upright rectangle whose front faces azimuth ``facing``.
 
-    From the upper left, as seen from the front; metres and radians.
+    Corners are in order from the upper left, as seen from the front; metres and radians.
     """
-    # Seen from the front, the right hand is a quarter turn back from where it faces.
+    # Seen from the front, right is a quarter turn anticlockwise from the facing direction.
     right = 0.5 * width * direction(facing - 0.5 * np.pi, 0.0)
     up = np.array([0.0, 0.0, 0.5 * height])
     return np.stack(
@@ -421,7 +421,7 @@ def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
 
 
 def _coinciding(surfaces: Sequence[Target | Receiver]) -> list[str]:
-    """Return a line on the surfaces that share a centre."""
+    """Return a warning about the surfaces that share a centre."""
     return [
         f"{one.name} and {other.name} have the same centre; correct one or remove it"
         for one, other in itertools.combinations(surfaces, 2)

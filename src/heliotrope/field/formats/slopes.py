@@ -17,9 +17,9 @@ from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 _COLUMNS = ("facet", "row", "column", "slope_u_mrad", "slope_v_mrad")
-#: A larger deviation is probably in another unit, rad.
+#: Largest plausible deviation; a larger value is probably in another unit, rad.
 LARGEST = 0.1
-# Largest share of a facet's map that may be missing; it is filled from the nearest cell.
+# Largest fraction of a facet's map that may be missing and is filled from the nearest cell.
 _MOST_HOLES = 0.5
 
 
@@ -52,7 +52,7 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
 
 
 def checked_slopes(file: Path, slope: FloatArray, facets: int) -> FloatArray:
-    """Return a slope map whose holes are filled; errors as `read_slopes`."""
+    """Return a slope map whose holes are filled; errors as in `read_slopes`."""
     if slope.ndim != 4 or slope.shape[3] != 2 or not slope.size:
         raise FormatError(file, f"slopes of shape {slope.shape}; they must be (F, H, W, 2)")
     if len(slope) != facets:

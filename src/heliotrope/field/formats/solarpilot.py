@@ -10,7 +10,7 @@ columns by position, so without a header the columns are::
      6 and 4     the columns up to z of either
 
 x is east, y north, z up, in m; z = 0 is the height of the pivots on level ground, so a location is
-that of the pivot, and an aim point is measured from the same zero. The optional groups focus, cant
+that of the pivot, and an aim point is relative to the same origin. The optional groups focus, cant
 and aim are numbers, or NULL for "to be computed". The separator is a comma, a semicolon, a tab or
 spaces; in text passed on by other programs, records may end with a semicolon instead of a line end.
 
@@ -55,7 +55,8 @@ _MEANINGS = (
     "template", "enabled", "in layout", "x", "y", "z", "focus x", "focus y", "cant i", "cant j",
     "cant k", "aim x", "aim y", "aim z",
 )  # fmt: skip
-#: Names that a header may give to a meaning, without unit, blanks and marks; the better one first.
+#: Header names accepted for each meaning, without units, blanks and punctuation; the preferred name
+#: first.
 _NAMES = {
     "name": "name heliostatname heliostat heliostatid helioid hid id label number no nr",
     "template": "template templateid heliostattemplate",
@@ -76,14 +77,14 @@ _NAMES = {
     "longitude": "longitude long lon lng",
     "altitude": "altitude alt height elevation",
 }
-#: Meaning of a name, and its place among those of the meaning.
+#: Meaning of each name, and the rank of the name for this meaning.
 _KNOWN = {n: (meaning, k) for meaning, ns in _NAMES.items() for k, n in enumerate(ns.split())}
-#: Names of three columns side by side, and the axes that tell them apart.
+#: Names of three adjacent columns, and the axes that distinguish them.
 _THREE = {"cantvect": "ijk", "cant": "ijk", "aim": "xyz", "aimpt": "xyz"}
 _METRES, _DEGREES = ("x", "y", "z"), ("latitude", "longitude", "altitude")
 _GROUPS = (("focus x", "focus y"), ("cant i", "cant j", "cant k"), ("aim x", "aim y", "aim z"))
 _UNIT = re.compile(r"\s*(?:[\[(<]\s*(.*?)\s*[\])>]|[_/](mm|cm|km|m|ft|deg|rad))\s*", re.IGNORECASE)
-#: A cell that begins as a number does.
+#: Pattern of a cell that begins like a number.
 _NUMBERED = re.compile(r"[-+]?\d")
 _EXAMPLE = (
     "give id,x,y,z (m east, north, up), id,latitude,longitude,altitude (degrees, m), or the "
@@ -106,15 +107,15 @@ class Layout:
     location
         Positions of the pivots, m east, north and above the base pivot, (N, 3).
     focus
-        Focal lengths in x and y, m, (N, 2); NaN where the file says NULL.
+        Focal lengths in x and y, m, (N, 2); NaN for NULL in the file.
     cant
-        Canting vectors, (N, 3); NaN where NULL.
+        Canting vectors, (N, 3); NaN for NULL.
     aim
-        Aim points, m, in the frame of the locations, (N, 3); NaN where NULL.
+        Aim points, m, in the frame of the locations, (N, 3); NaN for NULL.
     names
-        Unique; H1, H2, … by their row where the file gives none.
+        Unique names; H1, H2, … by row number if the file has none.
     unread
-        Columns of the file that have no place here.
+        Columns of the file that are not read.
     """
 
     template: npt.NDArray[np.int64]
@@ -137,7 +138,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Template:
-    """The dimensions of a heliostat, which a layout does not give.
+    """The dimensions of a heliostat, which a layout does not contain.
 
     Attributes
     ----------
@@ -161,15 +162,15 @@ def read_layout(path: str | Path, site: Site | None = None) -> Layout:
     Parameters
     ----------
     path
-        A table with a header, or one of 14, 12, 6 or 4 columns without.
+        A table with a header, or without a header and with 14, 12, 6 or 4 columns.
     site
         The plant's reference point; only positions in degrees need it.
 
     Raises
     ------
     FormatError
-        If the file cannot be read, has no rows, a header that gives no positions, rows of differing
-        length, or a cell that does not fit its column; with line and column.
+        If the file cannot be read, has no rows, a header without positions, rows of differing
+        length, or a cell that is invalid for its column; the text states line and column.
     """
     file = Path(path)
     places, table = read_cells(file, _WHAT, separators=f"{SEPARATORS} ", record_end=";")
@@ -226,9 +227,9 @@ def _by_position(
 
 
 def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str], dict[str, str]]:
-    """Return unique names of the columns of a header, and those with a meaning by it.
+    """Return unique names of the columns of a header, and the known names by meaning.
 
-    ``head`` are the rows without a number: names, and units if there are two.
+    ``head`` contains the rows without a number: names, and units if there are two rows.
     """
     width = max(k + 1 for cells in head for k, cell in enumerate(cells) if cell)
     names, units = ([*row, *[""] * width][:width] for row in (head[0], (*head[1:2], [])[0]))
@@ -272,7 +273,7 @@ def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str]
             file, f"the header ({shown}) names no position columns; {_EXAMPLE}", place
         )
     if all(axis in columns for axis in _METRES):
-        # Positions in degrees beside them are not read.
+        # Additional positions in degrees are not read.
         columns = {meaning: name for meaning, name in columns.items() if meaning not in _DEGREES}
     flags = [columns.get("enabled", ""), columns.get("in layout", "")]
     if "template" in columns and all(flags):
@@ -330,7 +331,7 @@ def _location(rows: Rows, columns: dict[str, str], site: Site | None) -> FloatAr
 
 
 def _group(rows: Rows, columns: dict[str, str], group: tuple[str, ...]) -> FloatArray:
-    """Return columns that are all numbers or all NULL (or empty) in a row, NaN there."""
+    """Return columns that in each row are all numbers or all NULL (or empty), which becomes NaN."""
     if not all(meaning in columns for meaning in group):
         return np.full((len(rows), len(group)), np.nan)
     names = [columns[meaning] for meaning in group]
@@ -345,7 +346,7 @@ def _group(rows: Rows, columns: dict[str, str], group: tuple[str, ...]) -> Float
 
 
 def write_layout(path: str | Path, layout: Layout) -> None:
-    """Write a layout in 14 columns, as SolarPILOT exports it; it is there whole or not at all."""
+    """Write a layout in 14 columns, as SolarPILOT exports it, completely or not at all."""
     lines = [",".join(part) for part in zip(*COLUMNS, strict=True)]
     groups = (layout.location, layout.focus, layout.cant, layout.aim)
     for i in range(len(layout)):
@@ -368,7 +369,7 @@ def _is_value(cell: str) -> bool:
     if cell.lower() == _NULL:
         return True
     try:
-        # A decimal comma is a number too, which is then refused.
+        # A number with a decimal comma counts as a number, which is refused later.
         float(cell.replace(",", ""))
     except ValueError:
         return False
@@ -376,12 +377,12 @@ def _is_value(cell: str) -> bool:
 
 
 def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> Plant:
-    """Return the plant of a layout: azimuth-elevation heliostats, one group a template.
+    """Return the plant of a layout: azimuth-elevation heliostats, one group per template.
 
-    The origin of ENU is SolarPILOT's, so up = 0 is the height of the base pivot and the
-    feet stand ``pivot_height`` lower. Heliostats not enabled or not in the layout are left
-    out and named in ``notes``, like columns that were not read; focus and cant have no
-    place in a plant and stay in the layout.
+    The origin of ENU is SolarPILOT's, so up = 0 is the height of the base pivot and the feet are
+    ``pivot_height`` lower. Heliostats that are not enabled or not in the layout are left out and
+    named in ``notes``, as are columns that were not read. Focus and cant are not part of a plant
+    and stay in the layout.
 
     Parameters
     ----------
@@ -395,7 +396,7 @@ def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> P
     Raises
     ------
     InputError
-        If a template is not among those given, or none of the heliostats is in use.
+        If a template is not specified, or no heliostat is in use.
     """
     used = layout.enabled & layout.in_layout
     if not used.any():

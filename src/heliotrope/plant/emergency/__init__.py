@@ -1,8 +1,8 @@
-"""Emergencies: the plant's safety-table rows, the orders that they require, and their proof.
+"""Emergencies: the plant's safety-table rows, and the orders that they require and confirm.
 
 `Sentinel` acts on the table and repeats and confirms orders; everything that starts or ends an
-emergency is in its file. `TableWatch` evaluates the rows, and `EmergencyOrder` is one field-wide
-order with its proof.
+emergency is in its file. `TableWatch` evaluates the rows. `EmergencyOrder` is one field-wide order
+with the proof that it has been carried out.
 """
 
 from heliotrope.plant.emergency.order import EmergencyOrder, at_stow, carried_out

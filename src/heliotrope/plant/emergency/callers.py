@@ -1,11 +1,11 @@
-"""Emergency orders of people: one per person, until it is withdrawn.
+"""Emergency orders of users: one per user, until it is withdrawn.
 
 An order that a person repeats merges with the active one and is neither recorded nor sent again, so
 that a program that repeats it hundreds of times a second cannot fill the store or the event list.
-If a person's order is withdrawn while they (or a program with their token) keep repeating it, or by
-others five times within ten minutes, there is a pause before that person's next order is accepted;
-nobody else is affected. The first order of a person is never refused, nor is the first one after
-another person has withdrawn theirs.
+If an order is withdrawn while its author (or a program with the author's token) keeps repeating it,
+or is withdrawn by others five times within ten minutes, that person's next order is accepted only
+after a pause. Nobody else is affected. The first order of a person is never refused, nor is the
+first one after another person has withdrawn theirs.
 """
 
 import math
@@ -32,7 +32,7 @@ _BETWEEN = "; "
 
 @dataclass
 class _History:
-    """What is remembered about a person: when they gave their order, and what became of it."""
+    """History of one person's orders: when they were issued, repeated and withdrawn."""
 
     given: deque[float] = field(default_factory=lambda: deque(maxlen=REPEATED))
     merged: int = 0
@@ -72,13 +72,13 @@ class Callers:
         Parameters
         ----------
         who, act, reason
-            As for `Call`. A person's order keeps the stronger act and each new reason.
+            As for `Call`. A person's order keeps the stronger action and each new reason.
         at, now
             POSIX s, and monotonic s.
 
         Returns
         -------
-        Whether it goes beyond the active order.
+        Whether the order goes beyond the active one.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class Callers:
 
         Returns
         -------
-        What the operator should know: how often it was repeated, and when the next one is accepted.
+        A message for the operator: how often the order was repeated, and when the next is accepted.
         """
         self._calls.pop(who, None)
         self._histories = {

@@ -1,11 +1,11 @@
 """A field-wide emergency order, and the proof that it was carried out.
 
 A heliostat has acknowledged the order when its local controller says so, or when a state reported
-after the order shows it. A heliostat counts as done by its state *and* by its axes. Its beam is off
-the receiver when the axes are within `NEAR` of the defocus goals, whatever the state is called, and
-when the beam, computed from step counts and the believed mechanism, is on no receiver, because a
-heliostat at standby may turn its beam onto one. A heliostat with unknown step counts is never done;
-the report says where its beam was last.
+after the order implies it. Whether a heliostat counts as done depends on its state *and* on its
+axes. Its beam is off the receiver when the axes are within `NEAR` of the defocus goals, whatever
+the state is called, and when the beam, computed from step counts and the believed mechanism, is on
+no receiver, because a heliostat at standby may turn its beam onto one. A heliostat with unknown
+step counts is never done; the report says where its beam was last.
 """
 
 from collections.abc import Mapping
@@ -95,7 +95,7 @@ class EmergencyOrder:
     ) -> tuple[str, ...]:
         """Return which of K heliostats carried out the order but have moved back since.
 
-        They no longer count as done. A row (`NODE`) from before the order is ignored.
+        They no longer count as done. A record (`NODE`) from before the order is ignored.
         """
         done = self.proof.done
         out = np.isin(rows["state"], states.BEAM_OUT)
@@ -137,10 +137,10 @@ class EmergencyOrder:
         mismatched: Mask,
         shining: Mask,
     ) -> None:
-        """Accept the state of heliostats (K,): rows of `NODE`, their time of validity, and drives.
+        """Accept the state of heliostats (K,): `NODE` records, their time of validity, and drives.
 
-        Step counts (``counted``) from before the order prove nothing, because they do not show
-        where the beam is now.
+        Step counts (``counted``) from before the order are ignored, because they do not show where
+        the beam is now.
 
         ``mismatched`` heliostats do not match their address: their counts may belong to another
         heliostat, so nothing that they report counts as proof. As long as a beam is still on a
@@ -158,7 +158,7 @@ class EmergencyOrder:
 
 
 def switched_off(flags: npt.NDArray[Any]) -> Mask:
-    """Return a mask of drives switched off at the heliostat away from stow, which cannot obey."""
+    """Return a mask of heliostats away from stow whose local switch is off, so cannot obey."""
     return np.asarray((flags & meanings.LOCAL_SWITCH != 0) & (flags & meanings.AT_STOW == 0))
 
 
@@ -166,7 +166,7 @@ def at_stow(rows: npt.NDArray[Any]) -> Mask:
     """Return a mask of the rows (K,) of `NODE` whose heliostat is at rest at stow.
 
     A heliostat that is locked there or has a fault counts; a heliostat that is IDLE there does not,
-    because it may go on to track.
+    because it may start to track.
     """
     resting = (rows["state"] == states.STOWED) | (rows["flags"] & meanings.AT_STOW != 0)
     return np.asarray(resting & ~np.isin(rows["state"], states.BEAM_OUT))
@@ -180,7 +180,7 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     act
         DEFOCUS or STOW.
     rows
-        As the clusters report them.
+        The records as reported by the clusters.
     drives
         Drives of these heliostats, (K, 2).
     settled

@@ -38,7 +38,7 @@ from heliotrope.store.records import StoreError
 OFF_SHOWS = 10.0
 #: Longest pause between two orders to one heliostat whose reports do not show them, s.
 LONGEST_PAUSE = 60.0
-#: Row for heliostats whose completion an emergency left unconfirmed.
+#: Row for heliostats that were not confirmed to have carried out an emergency order.
 UNPROVEN = "unproven_after_emergency"
 #: A heliostat that was confirmed after its emergency is reported to the table for this long, s.
 _PROVEN_SHOWS = 5.0
@@ -106,8 +106,8 @@ class Sentinel(Part):
         #: Heliostats that an emergency left unconfirmed, and when each was confirmed, monotonic s.
         unproven = set() if self._recalled.act else set(self._recalled.unproven) & set(field.names)
         self._unproven = dict.fromkeys(sorted(unproven), math.inf)
-        #: The previous program's order, which these heliostats did not prove; reports from now on
-        #: prove it.
+        #: The previous program's order, which these heliostats were not shown to have carried out;
+        #: reports from now on may show it.
         self._before = _left_order(self._recalled, tuple(self._unproven), clock)
         known = {"", *field.names, *field.clusters}
         table.recall(row for row in self._recalled.rows if row[1] in known)
@@ -236,7 +236,7 @@ class Sentinel(Part):
 
     @property
     def _proving(self) -> EmergencyOrder | None:
-        """The order that reports prove now: the last one, or that of the previous program."""
+        """The order that reports now confirm: the last one, or that of the previous program."""
         return self.order or self._before
 
     @property
@@ -310,12 +310,12 @@ class Sentinel(Part):
         changed = replace(standing, unproven=()) != replace(self._kept, unproven=())
         if standing == self._kept or not (changed or now - self._kept_at >= _KEEP_PERIOD):
             return
-        with contextlib.suppress(StoreError):  # it is retried, and the store's alarm tells why
+        with contextlib.suppress(StoreError):  # it is retried, and the store's alarm says why
             self._record.keep_emergency(standing.document)
             self._kept, self._kept_at = standing, now
 
     def _not_done(self) -> tuple[str, ...]:
-        """Return the heliostats not proven to have carried out the last order."""
+        """Return the heliostats not confirmed to have carried out the last order."""
         order = self.order
         return () if order is None else tuple(sorted(order.proof.nodes - order.proof.done.keys()))
 
@@ -363,7 +363,7 @@ class Sentinel(Part):
         return ticket
 
     def on_connected(self, cluster: str, now: float) -> None:
-        """Send a cluster that has reconnected the order that it missed."""
+        """Send the missed order to a cluster that has reconnected."""
         del now
         self._acts.pop(cluster, None)
         self._repeat_order([cluster])
@@ -459,7 +459,7 @@ class Sentinel(Part):
                 self._unproven[name] = min(self._unproven[name], now)
 
     def _doubted(self, heliostat: str) -> str | None:
-        """Return the reason why its reports prove nothing about its beam, None if they count."""
+        """Return the reason why a heliostat's reports do not reveal its beam, None if they do."""
         untrusted = self._identities.untrusted(heliostat)
         return untrusted or self._drive_checks.stalled.get(heliostat)
 
@@ -502,7 +502,7 @@ def _said(causes: Mapping[str, str]) -> str:
 
 
 def _left_order(before: Standing, unproven: tuple[str, ...], clock: Clock) -> EmergencyOrder | None:
-    """Return the order that heliostats have yet to prove after a restart, None if there is none."""
+    """Return the order that heliostats have yet to confirm after a restart, None if none."""
     if not unproven:
         return None
     ticket = Ticket("", before.left_by, unproven, clock, math.inf)

@@ -72,7 +72,7 @@ class Standing:
         Rows of the safety table that keep beams off or wait for acknowledgement, each with its
         cluster or heliostat, "" for the field.
     unproven
-        Heliostats whose completion was not confirmed.
+        Heliostats not confirmed to have carried out the order.
     left_by
         Name of the order that left ``unproven`` heliostats, if no emergency is active.
     """
@@ -87,7 +87,7 @@ class Standing:
 
     @property
     def document(self) -> str:
-        """The document that the store keeps, empty if there is nothing to store."""
+        """The document for the store, empty if there is nothing to store."""
         return "" if self == Standing() else json.dumps(asdict(self))
 
     @property
@@ -107,7 +107,7 @@ class Standing:
 
 
 def read_standing(document: str) -> Standing:
-    """Return the contents of a document; if unreadable, a personal DEFOCUS, the safe choice."""
+    """Return the contents of a document; if unreadable, a user's DEFOCUS, the safe choice."""
     if not document:
         return Standing()
     try:
@@ -116,7 +116,7 @@ def read_standing(document: str) -> Standing:
         unproven = _names(fields["unproven"])
         act, who, reason = (str(fields[key]) for key in ("act", "who", "reason"))
         # A record of an older version does not name the order: assume STOW, which is harder to
-        # prove.
+        # confirm.
         left_by = str(fields.get("left_by", "STOW" if unproven and not act else ""))
         for name in filter(None, (act, left_by)):
             if Act[name] not in (Act.DEFOCUS, Act.STOW):

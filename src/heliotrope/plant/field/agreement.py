@@ -1,7 +1,7 @@
 """The plant's own view of time, site and pointing, compared with the reports.
 
 A cluster with a wrong clock or site sends its local controllers a wrong sun vector, and each
-heliostat then tracks without any fault indication, but beside its aim or standby point. The plant
+heliostat then tracks without any fault indication, but misses its aim or standby point. The plant
 therefore compares the time and the site in each status with its own. From the step counts of each
 heliostat, the sun vector and the parameters that it knows, it also computes where the beam goes,
 and compares that with the point to which the beam was sent.
@@ -37,13 +37,13 @@ from heliotrope.sun import Site, fast_vector
 
 #: Pause between two checks of the pointing, s.
 CHECK_PERIOD = 2.0
-#: Errors above this (rad) are passed to the safety table.
+#: Errors above this limit are passed to the safety table, rad.
 NOTED = 1e-3
-#: Largest number of heliostats that are named; above it, the alarm is about the field.
+#: Maximum number of heliostats named; with more, the alarm concerns the whole field.
 MOST_NAMED = 150
-#: Step counts are used from this time after a beam was first seen to be sent to its point, s.
+#: Time from when a beam is first seen to be sent to its point until its step counts are used, s.
 _SETTLE = 1.0
-#: An axis that comes closer to its goal by this much between two checks is on its way, rad.
+#: An axis that approaches its goal by this much between two checks is still moving, rad.
 _CLOSING = 1e-4
 #: The motion of the sun is computed over this time, s.
 _SPAN = 10.0
@@ -61,7 +61,7 @@ class _Points:
     Parameters
     ----------
     points
-        ENU, m, (N, 3); NaN if there is none; other parts assign them.
+        Assigned points, ENU, m, (N, 3); NaN if there is none. Other parts assign them.
     before
         The earlier points that may still have been in force when the plant's program started.
 
@@ -103,13 +103,14 @@ class Agreement(Part):
     field, ledger, points
         State of the field; orders sent; assigned aims.
     check
-        Heliostats as the plant knows them at start-up.
+        Beam check, with the heliostats as known at start-up.
     site
         Site of the plant.
     utc
         Function that returns the plant's time, POSIX s.
     differing
-        Function that returns why a heliostat does not store the wanted parameters, None if it does.
+        Function that returns why a heliostat does not store the desired parameters, None if it
+        does.
     """
 
     def __init__(
@@ -140,8 +141,8 @@ class Agreement(Part):
         #: Radius of the last search, rad.
         self._radius = np.full(count, np.nan)
         self._lag = np.full(count, np.inf)
-        #: Whether the axes stand away from their goals, and the time of the counts used, monotonic
-        #: s.
+        #: Whether the axes are at rest away from their goals, and the time of the counts used,
+        #: monotonic s.
         self._stands, self._counted = np.zeros(count, dtype=bool), np.full(count, -np.inf)
         self._named_errors: dict[str, float] = {}
         self._at = -np.inf
@@ -158,7 +159,7 @@ class Agreement(Part):
         now: float,
         again: bool,
     ) -> None:
-        """Note how far a command that was sent may move beams from their points."""
+        """Record how far a command that was sent may move beams from their points."""
         del now, again
         if name == "SEARCH":
             rows = np.array([self._field.index[name] for name in heliostats], dtype=np.intp)
@@ -226,7 +227,7 @@ class Agreement(Part):
         field = self._field
         live, state = field.live(now), field.rows["state"].astype(np.int64)
         ready = live & (state == states.IDLE) & (field.rows["flags"] & meanings.READY != 0)
-        # IDLE brings back a heliostat that is already IDLE but stands elsewhere.
+        # IDLE returns a heliostat that is IDLE already but not at its standby point.
         came = self._ledger.obeyed_since(TO_REST, self._at, after=messages.STANDS)
         stilled = self._ledger.sent_since(messages.STANDS, now - _UNDER_WAY)
         came |= np.isin(self._states, _COMES) & ~stilled
@@ -248,8 +249,8 @@ class Agreement(Part):
         present = np.asarray(drives.angles(field.counts(rows)))
         error = self._beside(rows, sent, ends, sun)
         lag = np.abs(ends - present).max(axis=-1)
-        # Axes that come no closer to their goals stand where they are. In large fields, counts may
-        # be older than the last check; unchanged counts give no new information.
+        # Axes that come no closer to their goals are at rest. In large fields, counts may be older
+        # than the last check; unchanged counts give no new information.
         newer = field.counted_at[rows] > self._counted[rows]
         still = (lag > NOTED) & (lag > self._lag[rows] - _CLOSING)
         stands = np.where(newer, still, self._stands[rows])

@@ -120,7 +120,7 @@ class BeamCheck:
     solids
         The receivers with a margin, which the beam must not cross on an approach.
     machines
-        Limits and rest positions of heliostats, by name, as far as the design specifies them.
+        Drive limits and rest positions of heliostats, by name, as far as the design specifies them.
 
     Raises
     ------
@@ -169,7 +169,7 @@ class BeamCheck:
         self._stop(row)
 
     def _stop(self, row: int) -> None:
-        """Use the limits of the machine as stops, as the local controller does for its pose.
+        """Use the drive limits as stops, as the local controller does for its pose.
 
         Without stops, the pose nearest to the present one may differ from the pose that the
         heliostat takes.
@@ -276,10 +276,10 @@ class BeamCheck:
         possible: Sequence[tuple[npt.NDArray[np.intp], FloatArray]],
         sun: FloatArray,
     ) -> dict[str, str]:
-        """Return the heliostats whose resting beams would dazzle a person, and the reasons.
+        """Return the heliostats whose beams at standby would dazzle anyone, and the reasons.
 
-        All resting beams together must stay below `MOST_SUNS` there; if they do not, every
-        heliostat whose light reaches the eye is named.
+        At each eye all beams at standby together must stay below `MOST_SUNS`; otherwise every
+        heliostat whose light reaches that eye is named.
 
         Parameters
         ----------
@@ -402,7 +402,7 @@ class BeamCheck:
         sun
             Sun vectors, (3,) or (K, 3).
         when
-            Description of the location, in words.
+            Description of the motion, in words.
         """
         reasons: dict[str, str] = {}
         if len(rows) and self.volumes and sun[..., 2].max() > 0.0:
@@ -478,7 +478,7 @@ class BeamCheck:
     def at_stow(self) -> dict[str, str]:
         """Return the heliostats that may not rest at their stow positions, and why.
 
-        Heliostats whose machine is unknown are left out; see `standing`.
+        Heliostats with an unknown mechanism are left out; see `standing`.
         """
         known = [row for row, name in enumerate(self.names) if name in self.machines]
         stow = [self.machines[self.names[row]].stow for row in known]

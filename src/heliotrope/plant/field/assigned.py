@@ -1,6 +1,6 @@
 """Assigned aims and standby points of heliostats, preserved across restarts of the plant.
 
-A plant that does not know where its beams are cannot prove where they may go. Points are therefore
+A plant that does not know where its beams are cannot check where they may go. Points are therefore
 stored on disk before the commands that assign them are sent. They count as assigned when they are
 sent; a point whose command is still queued, and may be dropped from the queue, is not yet assigned.
 
@@ -47,7 +47,7 @@ _TAKEN_WITHIN = 5.0
 VERSION = 1
 
 Rows = npt.NDArray[np.intp]
-#: Points by kind and heliostat; None: there no longer is one.
+#: Points by kind and heliostat; None: the point no longer exists.
 Held = Mapping[str, Mapping[str, tuple[float, ...] | None]]
 NOTHING: Held = MappingProxyType({})
 
@@ -86,7 +86,7 @@ class AssignedFile:
         Raises
         ------
         FormatError
-            If the file contains something else.
+            If the file does not contain points.
         """
         try:
             document = json.loads(self.path.read_bytes())
@@ -184,7 +184,7 @@ class Points:
         #: Points acknowledged since the store was last updated, by kind, each with its mark.
         self._taken: dict[str, dict[str, tuple[tuple[float, ...], object]]]
         self._taken = {kind: {} for kind in KINDS}
-        #: Who last stored the assigned point, by kind, because the same point may be assigned
+        #: The last write of the assigned point, by kind, because the same point may be assigned
         #: twice.
         self._marks: dict[str, dict[str, object]] = {kind: {} for kind in KINDS}
         index = {name: row for row, name in enumerate(names)}
@@ -204,7 +204,7 @@ class Points:
         known[rows] = points
 
     def taken(self, kind: str, rows: npt.NDArray[np.intp]) -> None:
-        """Note that local controllers have acknowledged their assigned points; see `settling`."""
+        """Record that local controllers have acknowledged their assigned points; see `settling`."""
         self.earlier[kind][:, rows] = np.nan
         marks = self._marks[kind]
         for row, place in zip(rows, self._arrays[kind][rows].tolist(), strict=True):
@@ -244,8 +244,8 @@ class Points:
         new = {self._names[i]: tuple(p) for i, p in zip(rows, points.tolist(), strict=True)}
         present = self._arrays[kind][rows]
         known = np.isfinite(present).all(axis=-1)
-        # If no point is stored: the one that the machines store, or the new one, not acknowledged
-        # yet.
+        # If no point is stored: the point in the local controllers, or the new, unacknowledged
+        # point.
         first = np.where(known[:, None], present, points).tolist()
         before = {self._names[i]: tuple(p) for i, p in zip(rows, first, strict=True)}
         kinds, mark = (kind, *EARLIER[kind]), object()
@@ -366,14 +366,14 @@ def _followed(
     if last == point:
         return chain
     last = before if last is None else last
-    if earlier[0] == last:  # this only reports that it was not acknowledged yet
+    if earlier[0] == last:  # this only reports that the point was not acknowledged yet
         earlier = [*earlier[1:], None]
     oldest = earlier[-2] if earlier[-1] is None else earlier[-1]
     return [point, last, *earlier[:-2], oldest]
 
 
 def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> None:
-    """Set a standby point, ENU, m, for all heliostats without one; their machines store it."""
+    """Set a standby point, ENU, m, for all heliostats without one; their boards store it."""
     if point is not None:
         standbys[~np.isfinite(standbys).all(axis=-1)] = point
 

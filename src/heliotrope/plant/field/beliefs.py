@@ -1,8 +1,8 @@
 """The plant's beliefs about its heliostats: the single owner of calibrations and their sightings.
 
 A new `HeliostatCalibration` is accepted here once and passed to all subscribers: the controller
-(beam checks and wanted parameters), automatic control, the schedule, the store and the pages. A
-calibration loaded from the store takes the same route.
+(beam checks and desired parameters), automatic control, the schedule, the store and the pages. A
+calibration loaded from the store is passed on in the same way.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,7 +33,7 @@ class KnownSightings:
     Attributes
     ----------
     sightings
-        With heliostat row 0.
+        The sightings, with heliostat index 0.
     identities
         Numbers given by the store; 0 for a sighting that is not stored, (M,).
     targets
@@ -65,7 +65,7 @@ class Beliefs:
     design
         The plant.
     flights
-        Flights of a drone; a new one replaces the object.
+        Drone flights; importing a flight replaces the object.
     """
 
     def __init__(self, design: Plant) -> None:

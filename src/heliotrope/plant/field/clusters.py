@@ -33,8 +33,8 @@ class _Post:
 class ClusterEnd:
     """The plant's end of the link to one cluster.
 
-    A posted message does not wait for a connection: if it cannot be sent now, its outcome reports
-    that at once. Urgent messages overtake all other messages not sent yet.
+    A posted message does not wait for a connection. If it cannot be sent now, its outcome says so
+    at once. Urgent messages overtake all other messages not sent yet.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class ClusterEnd:
     async def keep(
         self, lease: Callable[[], Lease], period: float, greet: Callable[["ClusterEnd"], None]
     ) -> None:
-        """Renew the plant's lease each ``period`` s; greet the cluster in each new connection."""
+        """Renew the plant's lease every ``period`` s; greet the cluster on each new connection."""
         while True:
             due = self._clock.monotonic() + period
             opened = self.link.statistics.opened
@@ -114,7 +114,7 @@ class Clusters:
     members
         Names of the heliostats, by name of the cluster.
     links
-        By name of the cluster.
+        Links, by name of the cluster.
     clock
         Clock of the plant.
     counters
@@ -123,7 +123,7 @@ class Clusters:
     Attributes
     ----------
     ends
-        By name of the cluster.
+        Ends of the links, by name of the cluster.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Heliostats with doubtful step counts or parameters, and what confirms them.
 
 A power failure during motion may leave the step counts of a local controller wrong by up to 1,000
-steps, which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then be off position without any
+steps, which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then be off its aim without any
 other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target or
 an operator has confirmed its position. A confirmation is valid for one boot, because it says
 nothing about the next power failure. Four other groups are kept off in the same way: heliostats

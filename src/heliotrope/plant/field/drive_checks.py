@@ -3,8 +3,8 @@
 Step counts are the steps that a board has sent to its motors. With ice, a loose coupling or an
 unpowered driver the mirror stays where it is while the counts continue. A motion diagnosis with a
 tilt sensor on the mirror reveals this, and so does a photograph of the beam on a target. A
-heliostat whose drives stall is named, joins no receiver, and none of its reports counts as proof of
-an emergency.
+heliostat whose drives stall is named in an alarm and joins no receiver. Its reports do not count as
+confirmation that an emergency order has been carried out.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -75,7 +75,7 @@ class DriveChecks(Part):
         self._silent: set[str] = set()
 
     async def checked(self, heliostats: Iterable[str], timeout: float) -> None:
-        """Wait until no given heliostat is due any longer, for at most ``timeout`` s."""
+        """Wait until none of the heliostats is due any longer, for at most ``timeout`` s."""
         until = self._clock.monotonic() + timeout
         while self.due.intersection(heliostats) and self._clock.monotonic() < until:
             await sleep_until(self._clock, self._clock.monotonic() + _POLL)
@@ -136,7 +136,7 @@ class DriveChecks(Part):
             self._tell(alarms.DRIVE_STALLED.raised(name, drives=text))
 
     def observed(self, heliostat: str, by: str) -> None:
-        """Note that the mirror was seen to follow its drives, by a sensor."""
+        """Record that a sensor has seen the mirror follow its drives."""
         self._shown[heliostat] = self._today(), by
         self._follows(heliostat)
 

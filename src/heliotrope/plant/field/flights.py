@@ -38,7 +38,7 @@ class TakenFlight:
     person
         Who imported it.
     left_out
-        Heliostats whose records cannot be their own, and are left out of all fits.
+        Heliostats whose records must belong to other heliostats, and are left out of all fits.
     """
 
     flight: Flight
@@ -93,7 +93,7 @@ class Flights:
         return sum(map(len, self._rows.get(heliostat, ())))
 
     def adding(self, new: TakenFlight) -> "Flights":
-        """Return the flights with one more; beyond `MOST` the oldest are left out."""
+        """Return the flights with a new one added; beyond `MOST` the oldest are left out."""
         taken = (*self._taken, new)
         oldest = len(taken) - MOST if len(taken) > MOST else 0
         first, size = self._edges[oldest], len(new.flight.shared)
@@ -116,7 +116,7 @@ class Flights:
             self._parts[heliostat] = information, pull
 
     def leave_out(self, heliostats: Collection[str]) -> None:
-        """Leave records of the last flight out of all fits; they cannot be of these heliostats."""
+        """Exclude the last flight's records of these heliostats from all fits, as not theirs."""
         last = replace(self._taken[-1], left_out=frozenset(heliostats))
         self._set((*self._taken[:-1], last))
 
@@ -149,7 +149,7 @@ class Flights:
         return covariance @ drawn, 0.5 * (covariance + covariance.T)
 
     def of_flight(self, number: int) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of the shared errors of one flight, counted from 0."""
+        """Return mean and covariance of the shared errors of one flight, numbered from 0."""
         mean, covariance = self.shared()
         part = slice(self._edges[number], self._edges[number + 1])
         return mean[part], covariance[part, part]

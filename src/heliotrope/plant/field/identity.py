@@ -3,7 +3,7 @@
 Every local controller reports the checksum of the armature that it stores. The armature contains
 the position of the mirror, so no two are equal, and the checksum of another heliostat's armature
 reveals that heliostat's board: a command to H1 would move H2. A checksum that the plant has never
-known says nothing about whose board it is.
+seen does not reveal whose board it is.
 """
 
 import math
@@ -22,7 +22,7 @@ from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
 from heliotrope.safety import Act, Alarm, alarms
 
-#: Why a board proves nothing if it stores an armature that the plant has never known.
+#: Why the reports of a board do not count if it stores an armature unknown to the plant.
 _UNKNOWN = "its local controller stores parameters that are unknown to this plant"
 
 
@@ -36,7 +36,7 @@ class Identities(Part):
     armatures
         Armatures that the plant believes at start-up, (N, 18).
     expected
-        Items that heliostats should store, by name and item.
+        Items that heliostats should store, by heliostat and item.
     connections
         Function that returns how often the link to a cluster has been opened.
     tell
@@ -144,10 +144,10 @@ class Identities(Part):
         return self._owners.get(int(self._stored[row]), set())
 
     def untrusted(self, heliostat: str) -> str | None:
-        """Return the reason why its reports prove nothing about its beam, None if they count.
+        """Return the reason why a heliostat's reports do not reveal its beam, None if they do.
 
-        It is mismatched, or its board stores an armature that the plant has never known, so its
-        step counts belong to the heliostat at which the board was before.
+        The heliostat is mismatched, or its board stores an armature unknown to the plant, so its
+        step counts belong to the heliostat where the board was before.
         """
         row = self._field.index[heliostat]
         unknown = self._stored[row] != 0 and not self._own[row] and heliostat in self._expected
@@ -165,7 +165,7 @@ class Identities(Part):
         return None if judged and math.isfinite(field.heard[row]) else refusals.NOT_HEARD.text
 
     def off(self, now: float) -> dict[str, tuple[Act, str]]:
-        """Return the mismatched heliostats that must leave, with the act and the reason."""
+        """Return the mismatched heliostats to be ordered off, with the action and the reason."""
         if not self.mismatched:
             return {}
         field = self._field

@@ -1,4 +1,4 @@
-"""Learning for heliostat groups, in a process beside the plant."""
+"""Learning for heliostat groups, in a process separate from the plant."""
 
 import asyncio
 import os
@@ -33,7 +33,7 @@ class LearnerProcess:
         Raises
         ------
         InputError
-            If nothing can be learnt from it yet, or the process fails.
+            If the group has too few data yet, or the process fails.
         """
         run = _Run(self._longest)
         try:

@@ -1,12 +1,12 @@
 """The ledger: which orders each heliostat was sent and has acknowledged, by kind of order.
 
-A report says nothing about an order that the board had not received when it made the report. A path
-is proven from the last reported position of a heliostat. If another order has been sent since, the
-heliostat may have left that position, and be on a path that was not proven. The ledger decides
+A report does not reflect an order that the board had not received when it made the report. A path
+is proven clear from the last reported position of a heliostat. If another order has been sent
+since, the heliostat may have left that position, and be on an unproven path. The ledger decides
 whether a report counts, and which of two orders came later.
 
-A heliostat that leaves the receiver counts as lost unless it was ordered off; `losses` checks this
-here too.
+A heliostat that leaves the receiver counts as lost unless it was ordered off; `losses` uses the
+ledger for this, too.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ KINDS = (
 )  # fmt: skip
 #: States in which a new point moves a heliostat.
 _POINTS = {"AIM": states.ON_AIM, "STANDBY": (states.IDLE,)}
-#: Time after an order during which a report may have been made before the board took the order, s.
+#: Time after an order in which a report may still date from before the board received the order, s.
 _TAKEN_WITHIN = 1.0
 #: States in which a heliostat is already off, so that an order does not take it off.
 _GONE = (*states.LEAVING, states.STOWED)
@@ -50,13 +50,13 @@ class _Column:
     Attributes
     ----------
     number
-        Its number in the order of sending, 0 before the first, (N,); a repetition keeps it.
+        Sequence number of the order, 0 before the first, (N,); a repetition keeps the number.
     sent
         When it was first sent, monotonic s, (N,).
     acknowledged, accepted
         When the last acknowledged order was acknowledged, and accepted by the plant, (N,).
     shown
-        Time from which a report shows its effect, (N,).
+        Time from which reports show the effect of the order, (N,).
     """
 
     def __init__(self, count: int) -> None:
@@ -186,13 +186,14 @@ class Ledger(Part):
         return np.asarray(self._kinds[kind].sent >= at)
 
     def later(self, kind: Kind, other: Kind) -> Mask:
-        """Return a mask of the heliostats sent an order of one kind after all of another, (N,)."""
+        """Return a mask of the heliostats last sent one kind of order after the other, (N,)."""
         return np.asarray(self._kinds[kind].number > self._kinds[other].number)
 
     def obeyed_since(self, kind: Kind, at: float, after: Kind) -> Mask:
         """Return a mask of the heliostats that acknowledged an order of a kind since a time, (N,).
 
-        It counts only if it was accepted after the last order of the kind ``after`` was sent.
+        The order counts only if it was accepted after the last order of the kind ``after`` was
+        sent.
         """
         column = self._kinds[kind]
         in_order = column.accepted > self._kinds[after].sent

@@ -23,9 +23,9 @@ from heliotrope.plant.field.state import FieldState
 
 #: Pause before an order is repeated, s; it doubles each time, up to the longest.
 _AGAIN, _LONGEST = 3.0, 300.0
-#: If a lock is older than this when a program starts, only an operator removes it, s.
+#: Age of a lock at program start above which only an operator removes it, s.
 CERTAIN = 3600.0
-#: In place of an order: an operator must give the order.
+#: Placeholder for an order that only an operator may issue.
 _WAIT = "wait"
 
 
@@ -66,7 +66,7 @@ class Locks:
         return frozenset(self._locked)
 
     def take(self, heliostats: Iterable[str], token: int, now: float) -> None:
-        """Note that heliostats are locked under the mandate of a visit."""
+        """Record that heliostats are locked under the mandate of a visit."""
         at = self._utc()
         self._locked.update({name: _Lock(token, now, at) for name in heliostats})
 

@@ -35,5 +35,5 @@ class RowNames(Part):
             if "error" not in answer.data:
                 self._field.learn_order(cluster, tuple(answer.data))
 
-        # The statistics arrive in the same order.
+        # The statistics follow the same order of heliostats.
         self._clusters.ask(self._clusters.ends[cluster], "statistics", learn)

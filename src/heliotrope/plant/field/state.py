@@ -45,7 +45,7 @@ class HeliostatState:
         Whether the age is below the limit. If not, ``state`` is "" and the other values are
         meaningless.
     state, fault, flags
-        In words.
+        State, fault and flags in words.
     counts, goals
         Step counts of the two axes, and their goals, (2,).
     """
@@ -109,8 +109,8 @@ class FieldState:
         Heliostats whose boards had restarted, or stored another armature, at the last status; the
         boards may have been replaced.
     turned
-        Whether a heliostat that is locked or in FAULT has moved since; if so, it has turned away
-        and turns no further, (N,). It would turn if it were locked again, which no status shows.
+        Whether a heliostat has moved since it was locked or in FAULT, (N,). If so, it has turned
+        away and will not turn further, unless it is locked again, which no status shows.
 
     Raises
     ------

@@ -1,11 +1,11 @@
 """Independent witnesses of the sun, which reveal a wrong time or site in plant and clusters.
 
 If plant and clusters share a wrong time or site, all their sun vectors agree, and every heliostat
-tracks without any fault indication, but beside its aim. Before the first heliostat of a day joins a
+tracks without any fault indication, but misses its aim. Before the first heliostat of a day joins a
 receiver, a witness must therefore have seen the sun where the plant computes it: a satellite
 receiver (its time and its position), a sun sensor, or photographs of beams on targets. Until then
-beams may go to targets. While a witness contradicts, nothing leaves stow, because the paths were
-proven for the computed sun.
+beams may go to targets. While a witness contradicts the plant, no heliostat leaves stow, because
+the paths were proven clear for the computed sun.
 """
 
 import asyncio
@@ -38,7 +38,7 @@ SENSOR_ERROR, BEAM_ERROR = 5e-3, 3e-3
 _UP = math.radians(5.0)
 #: Name of calibration visits as a witness.
 PHOTOGRAPHS = "photographs"
-#: Longest text of a sun sensor, bytes.
+#: Maximum length of a sun sensor's file, bytes.
 _LONGEST = 64
 
 
@@ -126,14 +126,14 @@ class SunSensorFile:
 
 
 class Witnesses(Part):
-    """Today's statements of a plant's witnesses.
+    """Today's observations by a plant's witnesses.
 
     Parameters
     ----------
     names
         Witnesses; one of them must agree before the first heliostat of a day joins a receiver.
-        Empty: none is required, and the plant says so once a day; None: none is required, and the
-        plant does not report it.
+        Empty: no witness is required, and the plant says so once a day; None: no witness is
+        required, and the plant does not report this.
     site
         Site of the plant.
     utc
@@ -150,7 +150,7 @@ class Witnesses(Part):
         tell: Callable[[Alarm], None],
     ) -> None:
         self._names, self._site, self._utc, self._tell = names, site, utc, tell
-        #: Day on which a witness last agreed, and day on which the plant reported that none had.
+        #: Day on which a witness last agreed, and day on which the plant reported that none did.
         self._agreed_on = self._told_on = -1
         #: Witnesses that contradict, and their statements.
         self._contradicting: dict[str, str] = {}
@@ -197,8 +197,8 @@ class Witnesses(Part):
         """Compare photographs of a heliostat's beam on a target, before they are used in a fit.
 
         The beam reveals the sun direction if the heliostat was calibrated before today; a
-        calibration of today may come from a wrong sun direction. One heliostat that misses by more
-        may have moved; two heliostats that indicate the same wrong sun direction have not. Returns
+        calibration of today may come from a wrong sun direction. A single heliostat with a larger
+        miss may have moved, but two that indicate the same wrong sun direction have not. Returns
         the reason not to use the photographs, if there is one: the sun direction that they assume
         may be wrong.
 
@@ -216,7 +216,7 @@ class Witnesses(Part):
         offset = np.mean(reflect(path, pose.normal) - source, axis=0)
         if float(np.linalg.norm(offset)) <= BEAM_ERROR:
             self._agreeing.add(record.heliostat)
-            # One heliostat is not enough to settle what two have contradicted.
+            # One heliostat cannot refute a contradiction by two.
             if PHOTOGRAPHS in self._contradicting and len(self._agreeing) < 2:
                 return self.refusal
             self._offsets.clear()

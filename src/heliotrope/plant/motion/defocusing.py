@@ -1,8 +1,8 @@
 """Where DEFOCUS and STOW lead a beam, and which of them moves it out of a keep-out volume.
 
-Anyone may give both orders, and a local controller accepts them in every state, so no command
-authority is needed. The paths are those of a heliostat without a sun vector: a turn by the defocus
-angles, or straight to stow, azimuth last.
+Anyone may issue both orders, and a local controller accepts them in every state, so no command
+authority is needed. The paths are those of a heliostat without a sun vector: a rotation by the
+defocus angles, or straight to stow, azimuth last.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ def order_out(
     aim: FloatArray | None = None,
     standby: FloatArray | None = None,
 ) -> Act:
-    """Return DEFOCUS or STOW, whichever has a path that ends outside and turns less inside.
+    """Return DEFOCUS or STOW: the one whose path ends outside the volumes and rotates less inside.
 
     If the stow position is unknown, it is DEFOCUS.
 
@@ -43,7 +43,7 @@ def order_out(
     paths
         Paths of the heliostats past the keep-out volumes.
     row, counts
-        Row of the heliostat, and the positions of its axes, steps, (2,).
+        Index of the heliostat, and the positions of its axes, steps, (2,).
     sun
         Unit vector to the sun, (3,).
     state
@@ -83,7 +83,7 @@ def defocused(
     paths
         Paths of the heliostats.
     rows, counts, state
-        Rows of the heliostats, (K,), positions of their axes, steps, (K, 2), and states, (K,).
+        Indices of the heliostats, (K,), positions of their axes, steps, (K, 2), and states, (K,).
     sun
         Unit vector to the sun, (3,).
     aims, standbys
@@ -106,7 +106,7 @@ def defocused(
     other = np.where(tracks[:, None], standbys, aims)
     end = turned(begin, offsets(pose, other, begin, turn), *paths.stops(rows))
 
-    # From standby and from an approach, down the safe path, as far as the path is known.
+    # From standby and from an approach, the beam moves down the safe path, if the path is known.
     goes = np.isin(state, (states.IDLE, states.LOCKED, states.APPROACHING))
     goes &= np.isfinite(standbys).all(axis=-1) & np.isfinite(paths.stow[rows]).all(axis=-1)
     down = np.flatnonzero(goes)
@@ -116,7 +116,7 @@ def defocused(
     exists = np.arange(points.shape[1]) < length[:, None]
     apart = np.where(good.reshape(apart.shape) & exists, apart, np.inf)
     place = apart.argmin(axis=-1) if apart.size else length
-    # A heliostat that stands elsewhere has been moved there by an operator.
+    # A heliostat at rest elsewhere has been moved there by an operator.
     at_standby = (place == length - 1) & (apart.min(axis=-1, initial=np.inf) <= _STANDS_BY)
     on_path = (state[down] == states.APPROACHING) | at_standby
     _, lower = end_down_the_path(

@@ -1,6 +1,6 @@
 """The path of a beam between two axis positions, and from stow to standby.
 
-It is the path of `lcu.motion`, with the same points, axis order and speeds. When leaving or
+The path is that of `lcu.motion`, with the same points, axis order and speeds. When leaving or
 reaching stow, the axes move one after the other; in every other motion both start at once, each at
 its own rate, so that the axis with less to do arrives first.
 """
@@ -19,8 +19,8 @@ from heliotrope.plant.field.aims import BeamCheck, point_text
 
 Rows = npt.NDArray[np.intp]
 
-#: Number of parts of a ramp at whose ends the positions of both axes are computed; the error is
-#: then at most 1/36 of the path that a ramp takes.
+#: Number of sections of a ramp, at whose ends the positions of both axes are computed. The error is
+#: at most 1/36 of the length of a ramp.
 _PARTS = 3
 #: Time that a local controller needs between two points of the path, s.
 _PAUSE = 0.15
@@ -35,7 +35,7 @@ class Paths:
     Parameters
     ----------
     check
-        Heliostats with their machines, keep-out volumes and receivers.
+        Heliostats with their mechanisms, keep-out volumes and receivers.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Paths:
         self.stow = np.full((count, 2), np.nan)
         self.azimuth = np.zeros(count, dtype=np.intp)
         self.defocus = np.tile(as_float(Config().defocus), (count, 1))
-        # For an unknown machine, both axes turn at the same rate, without stops.
+        # For an unknown mechanism, both axes rotate at the same rate, without stops.
         self._rate = np.full((count, 2), 1e4)
         self._ramp = np.full((count, 2), 0.5)
         self._backlash = np.zeros((count, 2))
@@ -92,9 +92,9 @@ class Paths:
         return low, high
 
     def turns(self, rows: Rows, begin: FloatArray, end: FloatArray) -> FloatArray:
-        """Return the angles (K, 3, 2) from counts (K, 2) to others, one axis after the other.
+        """Return the angles (K, 3, 2) between two sets of counts (K, 2), one axis after the other.
 
-        The azimuth turns first, as when leaving stow.
+        The azimuth axis moves first, as when leaving stow.
         """
         corner = begin.copy()
         every = np.arange(len(rows))
@@ -104,15 +104,15 @@ class Paths:
     def motion(
         self, rows: Rows, begin: FloatArray, end: FloatArray, *, ramps: bool = True
     ) -> FloatArray:
-        """Return the angles (K, W, 2) from counts (K, 2) to others, both axes at once.
+        """Return the angles (K, W, 2) between two sets of counts (K, 2), both axes at once.
 
         Parameters
         ----------
         rows, begin, end
-            Rows of the heliostats, (K,); steps, (K, 2).
+            Indices of the heliostats, (K,); steps, (K, 2).
         ramps
-            Whether the path goes there at full rate and then back in the curve due to the ramps,
-            for a motion from rest to rest; if not, it only goes there.
+            Whether the path covers both curves of a motion from rest to rest: forward at the full
+            rate, and back along the curve with ramps; otherwise only the first.
         """
         turned = self._turned(rows, begin, end)
         steps, sign, rate = np.abs(turned - begin), np.sign(turned - begin), self._rate[rows]
@@ -124,7 +124,7 @@ class Paths:
         return self.angles(rows, np.stack(path, axis=1))
 
     def _turned(self, rows: Rows, begin: FloatArray, end: FloatArray) -> FloatArray:
-        """Return the counts (K, 2) at which motions reverse: a goal is reached from below."""
+        """Return the counts (K, 2) at which motions reverse to reach goals from below."""
         below = np.maximum(end - self._backlash[rows], self._low[rows])
         return as_float(np.where(end < begin, np.minimum(below, end), end))
 
@@ -194,7 +194,7 @@ class Paths:
 
 
 def _time(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return how long steps (K, 2) take at rates (steps/s) that ramps (s) begin and end, s."""
+    """Return the duration of (K, 2) steps at rates (steps/s), with a ramp (s) at each end, s."""
     whole = steps >= rate * ramp
     return np.asarray(np.where(whole, steps / rate + ramp, 2.0 * np.sqrt(steps * ramp / rate)))
 

@@ -1,4 +1,4 @@
-"""Proof, before a command is sent, that the command brings no beam into a keep-out volume.
+"""Proves, before a command is sent, that it brings no beam into a keep-out volume.
 
 `BeamWatch` monitors afterwards where the beams are.
 """
@@ -33,7 +33,7 @@ Rows = npt.NDArray[np.intp]
 
 #: A heliostat moves if its counts and goals differ by more steps than this.
 _MOVES = 200
-#: Commands whose whole motion is proven before they are sent.
+#: Commands whose whole motion is proven clear before they are sent.
 _PROVEN = messages.TO_STANDBY | messages.BY_COUNTS
 #: States from which IDLE moves a heliostat straight to its standby point. From the last two it does
 #: so once the heliostat has been unlocked, or its fault cleared, which no report may show yet.
@@ -95,7 +95,7 @@ class PathProofs:
     ) -> None:
         self.paths, self._check = paths, paths.check
         self.field, self.ledger, self.points, self.sun = field, ledger, points, sun
-        #: Tables that have been replaced by unverified ones, by row.
+        #: Tables that have been replaced by unverified ones, by index of the heliostat.
         self._earlier: dict[int, Tables] = {}
 
     def check_points(
@@ -122,13 +122,13 @@ class PathProofs:
     def _early(self, name: str, rows: Rows) -> dict[str, str]:
         """Return the heliostats that may not have a new point before their next report, and why.
 
-        The path to the new point is proven from the previous point. A heliostat that is on the way
-        to the previous point, or may be by an order that no report shows yet, would come from
-        elsewhere.
+        The path to the new point is proven clear from the previous point. A heliostat that is still
+        moving to the previous point, or may be because of an order that no report shows yet, would
+        come from elsewhere.
         """
         if not self._check.volumes:
             return {}
-        if name == "AIM":  # tracking heliostats join it, and are examined then
+        if name == "AIM":  # tracking heliostats join the aim, and are checked then
             return self._unplaced(rows, messages.JOINING)
         state = self.field.rows["state"][rows]
         blocked = self._unplaced(rows[np.isin(state, _TO_STANDBY)])
@@ -186,7 +186,7 @@ class PathProofs:
         early = self._unplaced(rows, messages.SAFE)
         rows, blocked = self._resting(rows)
         if not self._check.volumes:
-            blocked = {}  # a path to a point that is unknown here is not proven
+            blocked = {}  # a path to an unknown point cannot be proven clear
         stow, counts = self.paths.stow[rows], self.field.counts(rows)
         begin = dict(zip(rows.tolist(), np.where(np.isfinite(stow), stow, counts), strict=True))
         for some, standbys in self.points.possible("STANDBY", rows):
@@ -197,8 +197,8 @@ class PathProofs:
     def _back_to_standby(self, rows: Rows, now: float) -> dict[str, str]:
         """Return the heliostats whose straight path to standby is blocked, and the reasons.
 
-        A path is proven from where a heliostat stands. A moving heliostat is no longer there, and
-        does not turn back at once.
+        A path is proven clear from the pose of a heliostat at rest. A moving heliostat leaves that
+        pose, and does not turn back at once.
         """
         early = self._unsettled(rows) | self._unplaced(rows, now=now)
         rows, blocked = self._resting(rows)
@@ -242,7 +242,7 @@ class PathProofs:
         return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
 
     def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str | None:
-        """Return the reason why a heliostat may not rest at the stow position in some items."""
+        """Return the reason why a heliostat may not rest at the stow position in ``items``."""
         if "stow" not in items:
             return None
         counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
@@ -254,9 +254,9 @@ class PathProofs:
     def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str | None:
         """Return the reason why new parameters may not be written in this pose, or None.
 
-        With the present parameters and with the new ones, its beam must be clear where it stands
-        and on the path from there to its standby point. With the present parameters it must also be
-        clear on the path along which the new ones will lead it, because the new ones may be wrong.
+        Under both the present and the new parameters, the beam must be clear in the present pose
+        and on the path from there to the standby point. Under the present parameters it must also
+        be clear on the path that the new ones produce, because the new ones may be wrong.
 
         Parameters
         ----------
@@ -280,10 +280,10 @@ class PathProofs:
 
     @contextmanager
     def unverified(self, heliostat: str) -> Iterator[None]:
-        """Prove paths with the present parameters too, while their replacements are being verified.
+        """Check paths with the present parameters too, while new ones are being verified.
 
-        Under the replacements, the heliostat goes to a target and returns; if they are wrong, its
-        beam is where the present parameters say.
+        The heliostat goes to a target and returns by the replacements. If they are wrong, its beam
+        is where the present parameters predict.
         """
         row = self.field.place(heliostat)
         self._earlier[row] = self._tables(row)
@@ -303,7 +303,7 @@ class PathProofs:
 
     @contextmanager
     def _believing(self, row: int, tables: Tables) -> Iterator[None]:
-        """Prove with other tables for a heliostat."""
+        """Use other tables for a heliostat within the block."""
         present = self._tables(row)
         self._check.replace(row, *tables)
         try:
@@ -314,7 +314,8 @@ class PathProofs:
     def _misled(self, rows: Rows, point: FloatArray, tables: Tables) -> dict[str, str]:
         """Return the reason why the path of one heliostat to a point (1, 3) is blocked.
 
-        The parameters of the check lead the heliostat, and the beam goes where ``tables`` say.
+        The heliostat is moved by the parameters of the check, and its beam is computed from
+        ``tables``.
         """
         if not np.isfinite(point).all():
             return {}
@@ -349,7 +350,7 @@ class PathProofs:
     ) -> dict[str, str]:
         """Return the heliostats that may not join their aims now, and the reasons.
 
-        AIM brings a new aim in its values; every other command leads to an aim that they may
+        AIM has a new aim in its values; every other command uses the aim that the heliostats may
         already have.
         """
         if not self._check.volumes:
@@ -376,7 +377,7 @@ class PathProofs:
         return _refusals(reasons)
 
     def _begins(self, rows: Rows) -> list[tuple[npt.NDArray[np.bool_], FloatArray]]:
-        """Return where motions of heliostats (K,) may begin: which, (K,), and their counts (M, 2).
+        """Return where motions of heliostats may begin: masks of them, (K,), and counts (M, 2).
 
         A moving heliostat may be anywhere between its counts and its goals.
         """

@@ -1,7 +1,7 @@
 """Stray beams on a receiver, sent there by no order: from a locked, jogged or defocused heliostat.
 
 Every heliostat that is neither tracking nor searching is checked, from its step counts and the
-mechanism that the plant believes: what counts is where the beam is, whatever the state is called. A
+mechanism that the plant believes, because the state alone does not tell where the beam is. A
 heliostat that approaches its goal still counts as moving. A heliostat at stow is checked like all
 others, because the stow position may be wrong.
 """
@@ -20,7 +20,7 @@ from heliotrope.plant.motion.defocusing import defocused
 from heliotrope.plant.motion.paths import Paths
 from heliotrope.safety import Act
 
-#: A heliostat that stands still is checked once in this many checks.
+#: A heliostat at rest is included in one of this many checks.
 TURNS = 3
 #: A heliostat moves if its counts and goals differ by more steps than the first number, and
 #: approaches its goal if it has made more steps than the second since the last check.
@@ -67,7 +67,7 @@ class StrayBeams:
         return self._check.lights(rows, drives.angles(self._field.counts(rows)), self._sun(0.0))
 
     def check(self, now: float) -> None:
-        """Check the moving heliostats, and some of those that stand still."""
+        """Check the moving heliostats, and some of those at rest."""
         field = self._field
         self._turn = (self._turn + 1) % TURNS
         every = np.arange(len(field))

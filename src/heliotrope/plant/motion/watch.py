@@ -14,17 +14,18 @@ Rows = npt.NDArray[np.intp]
 
 #: Interval between two checks of the beams, s.
 CHECK_PERIOD = 1.0
-#: If stow is unknown: an approach turns an axis by more than this (rad) only when it leaves stow.
+#: An approach rotates an axis by more than this only when leaving stow; used if stow is unknown,
+#: rad.
 _FROM_STOW = 0.15
 
 
 class BeamWatch:
     """Monitors the beams of all heliostats.
 
-    It detects errors that a proof cannot: false counts, changed parameters, a local controller that
-    disobeys, and the motion of the sun, which moves the beam of a heliostat at rest. Every
-    heliostat is checked, whatever its state, if its step counts have ever been known; if they are
-    unknown or the heliostat is silent, it is assumed to stand where it was last reported. Moving
+    Monitoring detects what a check in advance cannot: wrong counts, changed parameters, a local
+    controller that disobeys, and the motion of the sun, which moves the beam of a heliostat at
+    rest. Every heliostat is checked, whatever its state, if its step counts have ever been known;
+    if they are unknown or the heliostat is silent, its last reported pose is assumed. Moving
     heliostats are checked each second, the others in turn.
 
     Parameters
@@ -80,7 +81,7 @@ class BeamWatch:
         name
             Name of the heliostat.
         again
-            Whether the heliostat has already been ordered off, but its beam is still there.
+            Whether the heliostat has been ordered off before, but its beam is still there.
         """
         row = self._field.place(name)
         if name not in self._entering:
@@ -94,7 +95,7 @@ class BeamWatch:
         return order_out(self._paths, row, counts, self.proofs.sun(0.0), state, aim, standby)
 
     def turned(self, name: str) -> bool:
-        """Return whether a beam rests where it may not be, and DEFOCUS can turn it no further."""
+        """Return whether a beam rests where it may not be, and DEFOCUS would not move it."""
         if name not in self._entering and name not in self.stray.shining:
             return False
         row = self._field.place(name)

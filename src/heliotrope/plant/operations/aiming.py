@@ -1,17 +1,18 @@
 """Aims of a plant under a flux limit: computed outside the loop, sent to few heliostats at a time.
 
-At regular intervals `heliotrope.aims.rounds` finds the aims with the highest power, and moves to
-them that exceed the limit nowhere. Heliostats get their aims by the same commands as an operator's,
-with the same proofs. A heliostat at standby joins the receiver only at the aim assigned here, and a
-heliostat without an aim stays at standby. Beams that an operator has aimed, or that automatic
-control may not move, stay and use their share of the limit. Without new aims the last good ones
-stay in force; later the safe spread follows, with fewer heliostats at the aims of the plant file.
+At regular intervals `heliotrope.aims.rounds` finds the aims with the highest power, and a sequence
+of moves to them that never exceeds the limit. Heliostats receive their aims by the same commands as
+an operator would use, with the same checks. A heliostat at standby joins the receiver only at the
+aim assigned here, and a heliostat without an aim stays at standby. Beams that an operator has
+aimed, or that automatic control may not move, stay where they are, and their flux counts towards
+the limit. If no new aims can be computed, the last good ones stay in force at first. Later the
+field goes to the safe spread: fewer heliostats, at the aims of the plant file.
 
-With a ramp, the flux that the beams would bring in full sun may exceed what the receiver has had
-within the last minute only by the rise of one round. While a cloud covers the sun, heliostats leave
-the receiver therefore; they come back in steps. If the measured flux is above the limit, the limit
-of these cells is lowered by the ratio of the measured to the predicted flux, so that the same moves
-relieve them.
+With a ramp limit, the flux that the beams would bring in full sun may exceed the flux of the last
+minute only by the rise allowed in one round. Heliostats therefore leave the receiver while a cloud
+covers the sun, and come back in steps. If the measured flux is above the limit, the limit of the
+cells concerned is lowered by the ratio of the measured to the predicted flux, so that the same
+moves relieve them.
 """
 
 import asyncio
@@ -42,17 +43,18 @@ from heliotrope.safety import alarms
 from heliotrope.store.records import Records, StoreError
 from heliotrope.sun import clear_sky
 
-#: A beam without reports may still be where it was for this time, s.
+#: Time for which a beam without reports may still be where it was last reported, s.
 HOLD = 120.0
-#: Most of a heliostat's own error that counts, rad of the beam per axis. Beyond it the flux is no
-#: longer of first order: the beam is elsewhere, as sharp as ever, and the greatest flux is that of
-#: beams that hit their aims. The blur of a larger error would hide that.
+#: Largest error of a single heliostat that is taken into account, rad of the beam per axis. With a
+#: larger error the flux is no longer linear in the error: the beam is elsewhere but just as sharp,
+#: and the greatest flux is that of beams that hit their aims. The blur of a larger error would hide
+#: this.
 BLUR = 5e-4
 #: Longest wait for a move to end, and wait after it until the beams are at rest, s.
 MOVED, SETTLED = 60.0, 4.0
 #: Time for which a heliostat keeps its old aim if its beam may not go to its new one, s.
 BLOCKED = 300.0
-#: A cell that had a flux within this time takes it again at once, s.
+#: A cell may return to a flux at once if it had that flux within this time, s.
 WARM = 60.0
 #: In full sun the irradiance is at most this multiple of that under a usual clear sky.
 BRIGHT = 1.15
@@ -73,27 +75,29 @@ class AimsView:
     Attributes
     ----------
     strategy
-        "spread" or "limit"; the rest is of "limit".
+        "spread" or "limit"; the other attributes apply to "limit" only.
     source
         Where the present aims come from: "optimiser", "last good aims", "safe spread", "" before
         the first.
     at
         Age of the last good computation, s; infinite before the first.
     limit, peak
-        Least allowable flux less the margin, and greatest predicted flux with its errors, W/m².
+        Lowest allowable flux less the margin, and highest predicted flux including its errors,
+        W/m².
     reserve
-        Least share of the limit that is left anywhere; below 0 it is passed.
+        Smallest fraction of the limit that remains unused in any cell; negative if the limit is
+        exceeded.
     binding
-        Number of cells that the limit binds.
+        Number of cells in which the limit is binding.
     power, planned
-        Of the present aims and of the best, W.
+        Power with the present aims and with the best aims, W.
     gap
-        Share that still better aims could add at most.
+        Upper bound on the fraction of power that better aims could still add.
     aimed, resting, left
-        Heliostats with an aim, wanted ones that rest for the limit, and those that still have to
-        move.
+        Number of heliostats with an aim, of wanted heliostats kept at standby by the limit, and of
+        heliostats that still have to move.
     moved, moved_ago
-        Heliostats that moved last, and how long ago, s.
+        Number of heliostats in the last move, and time since then, s.
     problem
         Why there are no new aims; empty if there are.
     """
@@ -124,13 +128,13 @@ class Aiming:
     plant, log
         The controller, and the logbook for alarms and events.
     automatic
-        Issues the commands, while it has the command authority.
+        Issues the commands while it has the command authority.
     check
-        The measured flux and the prediction.
+        Compares the measured flux with the prediction.
     worker
-        Place for the computation.
+        Runs the computation.
     records
-        Store that names the beams that people have aimed after a restart; None: there is none.
+        Store from which the beams aimed by operators are known after a restart; None: no store.
     """
 
     def __init__(
@@ -154,9 +158,9 @@ class Aiming:
         self._moved_at = -math.inf
         self._source = self._problem = ""
         self._above = False
-        #: Times and flux maps that the receiver has had, W/m², in the irradiance of that time.
+        #: Times, and the flux maps of the receiver then, W/m², at the irradiance of that time.
         self._had: list[tuple[float, FloatArray]] = []
-        #: By how much measured fluxes were above predicted ones, and when.
+        #: When a measured flux was above the limit, and by how much.
         self._beyond: list[tuple[float, Beyond]] = []
 
     # -- people ----------------------------------------------------------------------------
@@ -175,7 +179,7 @@ class Aiming:
                 self._log.take_alarm(alarms.RECORDS.raised(problem=error))
 
     def recall(self) -> None:
-        """Leave the beams where they are that people had aimed when the last program ended."""
+        """Leave alone the beams that operators had aimed when the last program ended."""
         if self._records is None:
             return
         try:
@@ -191,7 +195,7 @@ class Aiming:
         Raises
         ------
         InputError
-            If a heliostat has none under the flux limit.
+            If a heliostat has no aim under the flux limit.
         """
         if self._settings.limit is None:
             return self._plant.default_aims(heliostats)
@@ -272,9 +276,10 @@ class Aiming:
                 await self._go(answer.moves)
 
     def _measure(self, answer: Answer, given: Round) -> bool:
-        """Note the flux that the receiver has, and by how much the measured one is above the limit.
+        """Record the flux on the receiver, and how far the measured flux is above the limit.
 
-        Return whether the latter is news, so that the moves of this round come too late.
+        Return whether the flux has only now been measured above the limit, so that the moves of
+        this round no longer suffice.
         """
         assert self._settings.limit is not None
         self._beyond = [(at, found) for at, found in self._beyond if given.at - at <= WARY]
@@ -291,7 +296,7 @@ class Aiming:
         return len(self._beyond) == 1
 
     def _take(self, answer: Answer, given: Round) -> None:
-        """Accept a result, and report what is above the limit or no longer late."""
+        """Accept a result, and raise or clear the alarms about the limit and late aims."""
         self._answer, self._source = answer, "optimiser"
         if self._problem:
             self._problem = ""
@@ -307,7 +312,7 @@ class Aiming:
         self._above = above
 
     def _ramp(self, now: float, scene: Scene) -> FloatArray | None:
-        """Return the flux up to which the receiver may be heated, in the scene's irradiance."""
+        """Return the flux that the ramp limit allows now, at the scene's irradiance."""
         if self._settings.ramp <= 0.0:
             return None
         had = [flux for _, flux in self._had]
@@ -338,7 +343,7 @@ class Aiming:
             await self._to_safe(self._answer.safe)
 
     async def _to_safe(self, safe: FloatArray) -> None:
-        """Go to the safe spread; all beams elsewhere leave first, so that no beams meet."""
+        """Go to the safe spread; beams at other aims leave first, so that none overlap."""
         on = self._on(self._plant.now()) & self._movers(self._plant.now())
         apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
         rows = np.flatnonzero(on & apart)
@@ -374,7 +379,7 @@ class Aiming:
         return np.array([aims.get(name, none) for name in self._plant.field.names])
 
     def _round(self, now: float) -> Round:
-        """Return what is known now, and drop what is no longer relevant."""
+        """Return the input of a round, and drop what is no longer relevant."""
         plant, settings = self._plant, self._settings
         assert settings.limit is not None
         on, free, allotted = self._on(now), self._movers(now), self._allotted()
@@ -411,7 +416,7 @@ class Aiming:
         return FluxLimit(limit.on(*surface_in(scene).shape) / factor)
 
     def _scene(self, now: float) -> Scene:
-        """Return the field with its receiver, in the light for which the limit must hold."""
+        """Return the field with its receiver, at the irradiance for which the limit must hold."""
         scene, receiver = self._check.flux.scene(now), self._plant.design.receivers[0]
         pointing = scene.mirrors.pointing
         size = np.sqrt(0.5 * np.trace(pointing, axis1=1, axis2=2))
@@ -432,7 +437,7 @@ class Aiming:
     # -- moves -----------------------------------------------------------------------------
 
     async def _go(self, moves: tuple[Move, ...]) -> None:
-        """Make the moves one after the other; a failed move ends them until the next round."""
+        """Make the moves one after the other; after a failed move, wait for the next round."""
         until = self._plant.now() + 2.0 * self._settings.every
         names, aims = self._plant.field.names, self._automatic.aims
         for move in moves:

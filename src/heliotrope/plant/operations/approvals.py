@@ -2,8 +2,8 @@
 
 If the plant file requires it (``[approval]``), a change of a heliostat's parameters by a person, or
 their roll-back, is checked and then waits: nothing is sent to the board until another engineer has
-approved it. Its author may withdraw it, and another engineer may refuse it. It ends by itself when
-its time is over or when the heliostat gets other new parameters. It survives a restart.
+approved it. Its author may withdraw it, and another engineer may refuse it. The change lapses at
+its deadline, or when the heliostat receives other new parameters. It survives a restart.
 
 This is the dual approval of IEC 62443-3-3, SR 2.1 RE 4.
 """
@@ -30,7 +30,7 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records, StoreError
 
-#: Longest time for writing an approved change, s, in addition to the wait for approval.
+#: Time allowed for writing an approved change, s, after the wait for approval.
 _WRITING = 900.0
 
 
@@ -55,11 +55,11 @@ class WaitingChange:
     heliostat, author, reason
         Heliostat whose parameters it changes; the person who requested it, and why.
     at, until
-        Time of the request, and time when it ends by itself, POSIX s.
+        Time of the request, and deadline for the approval, POSIX s.
     version
-        Version that it restores; 0: the values were entered.
+        Version that the change restores; 0: the values were entered by hand.
     based_on
-        Version in use at the time of the request; the change ends once there is another.
+        Version in use at the time of the request; the change lapses once another version is in use.
     parameters
         Parameters that it changes.
     beam_rms, beam_most
@@ -111,7 +111,7 @@ class _Course:
 
 
 class Approvals:
-    """The waiting changes, and what becomes of them.
+    """The changes that wait for approval.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class Approvals:
     errands
         Tracks a change for its author.
     records
-        Store of the waiting changes; None: they end with the program.
+        Store of the waiting changes; None: they are lost when the program ends.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class Approvals:
                 self._end(change, "the heliostat is no longer in the plant file")
 
     def step(self) -> None:
-        """End the changes whose time is over, or that have been superseded."""
+        """End the changes that are past their deadline or have been superseded."""
         for change in self.waiting:
             if reason := self._over(change):
                 self._end(change, reason)
@@ -219,15 +219,15 @@ class Approvals:
         return self._errands.begin("APPROVAL", (heliostat,), progress, patience)
 
     async def approve(self, person: Person, number: int) -> Ticket:
-        """Approve another engineer's change and write it; return the ticket of the writing.
+        """Approve another engineer's change and write it; return the ticket for writing it.
 
-        The command authority is that of its author or of the person who approves.
+        The author's command authority is used, or else the approver's.
 
         Raises
         ------
         RefusedError
             If the person is not an engineer or is its author, if neither has the command authority,
-            or if it cannot be written now, in which case it continues to wait.
+            or if the change cannot be written now, in which case it continues to wait.
         UnknownNameError
             If no such change is waiting.
         """
@@ -250,7 +250,7 @@ class Approvals:
         Raises
         ------
         RefusedError
-            If the person is not an engineer or is its author, or states no reason.
+            If the person is not an engineer, is the author of the change, or states no reason.
         UnknownNameError
             If no such change is waiting.
         """

@@ -1,4 +1,4 @@
-"""Automatic control: the field is raised, calibrated target by target, and stowed before night.
+"""Automatic control: raises the field, calibrates it target by target, and stows it before night.
 
 It commands under its own name. It takes the command authority while nobody else holds it, and
 yields at once: it starts nothing new, and visits in progress are completed. It moves only *wanted*
@@ -46,7 +46,7 @@ from heliotrope.store.records import Kind, PlannedVisit, Records
 
 #: The person under whose name it commands.
 AUTOMATIC = Person("automatic control", Role.ENGINEER)
-#: What an operator should do about a state from which automatic control raises nothing.
+#: What an operator should do about states from which automatic control raises no heliostat.
 _REMEDIES = {
     states.LOCKED: "unlock it",
     states.FAULT: "find the cause, then clear the fault",
@@ -63,7 +63,7 @@ PARTS = RetryLaw(
 )
 #: Why nothing is moved before automatic control has taken the command authority.
 _STARTING = "it is starting"
-#: Outcomes of a requested visit that has shown what it can.
+#: Outcomes after which a requested calibration visit need not be repeated.
 _AS_WANTED = (
     CalibrationOutcome.CALIBRATED,
     CalibrationOutcome.UNCHANGED,
@@ -93,7 +93,7 @@ class AutomaticSettings:
         Whether all heliostats are wanted from the start; otherwise only those that `give_back`
         names.
     calibrate
-        Whether calibration is on at the start.
+        Whether calibration is switched on at the start.
     rate
         Number of heliostats that leave stow, and that go to the receiver, per second.
     beat
@@ -108,8 +108,8 @@ class AutomaticSettings:
         Number of heliostats that may be lost within 30 s; after more, it waits for an operator's
         Resume.
     losses_share
-        Fraction of the field that may be lost within 30 s, if that is fewer, because 3 may be all
-        of a small field.
+        Fraction of the field that may be lost within 30 s, if that is fewer: in a small field the
+        above number may be most of the field.
     foresee
         Time between predictions of the field errors for the rest of the day, s; 0: no predictions.
     events
@@ -281,7 +281,7 @@ class AutomaticControl:
         return names
 
     def drop(self, heliostats: Sequence[str], why: str) -> None:
-        """Drop what operators have requested for heliostats."""
+        """Drop the operators' requests for heliostats."""
         self._withdraw(heliostats, why)
 
     def _withdraw(self, heliostats: Sequence[str], why: str) -> None:
@@ -535,7 +535,7 @@ class AutomaticControl:
         return self._why_idle() or ""
 
     def movable(self) -> npt.NDArray[np.bool_]:
-        """Return a mask of the wanted heliostats that it does not leave where they are, (N,)."""
+        """Return a mask of the wanted heliostats that automatic control may move, (N,)."""
         return np.asarray(self._raising.wanted & ~self._left_alone())
 
     @property
@@ -675,8 +675,8 @@ class AutomaticControl:
         lowest = self._settings.lowest
         if elevation < lowest:
             falls, self._day = self._day, False
-            # A heliostat that was not heard then, or was returned since, is stowed when it is seen,
-            # but not while an operator has the command authority.
+            # A heliostat that did not report then, or was returned since, is stowed when it
+            # reports, but not while an operator has the command authority.
             if falls or self._plant.authority.grant is None or self._has_authority():
                 self._stow_up(told=falls)
             self._withdraw(
@@ -687,7 +687,7 @@ class AutomaticControl:
             self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
 
     def _stow_up(self, *, told: bool) -> None:
-        """Stow the wanted heliostats out of stow; with ``told``, report it even if none are."""
+        """Stow the wanted heliostats that are up; with ``told``, report it even if none is."""
         up = self._plant.field.among(states.UP, self._plant.now()) & self._raising.wanted
         names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
         if names:
@@ -715,13 +715,13 @@ class AutomaticControl:
         return self._losses.settling() | self.service.rows() | self._raising.given_up()
 
     async def _diagnose(self) -> None:
-        """Check each day, before heliostats are raised, that their drives turn their mirrors."""
+        """Check daily, before heliostats are raised, that their drives move the mirrors."""
         if not self._why_idle():
             free = self._raising.wanted & ~self._left_alone()
             await self._checks.step(self._token, free)
 
     def _start_again(self, rows: npt.NDArray[np.intp]) -> None:
-        """Send heliostats to stow that cannot continue where they are; they are raised again."""
+        """Stow heliostats that cannot proceed from where they are; they are then raised again."""
         if len(rows):
             names = tuple(self._plant.field.names[row] for row in rows)
             self._plant.stow(AUTOMATIC.name, names)

@@ -12,7 +12,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import BusFrame
 
-#: Longest wait for a recording, s; it takes five seconds, and is sent in the next second.
+#: Longest wait for a recording, s, which takes five seconds and is sent within another second.
 PATIENCE = 20.0
 _HEAD = struct.calcsize(BUS_ENTRY)
 
@@ -52,7 +52,7 @@ def decoded(answer: Answer) -> tuple[BusFrame, ...]:
     Raises
     ------
     ValueError
-        If it is cut off; other errors of reading where it is damaged otherwise.
+        If the reply is truncated; other decoding errors if it is damaged in another way.
     """
     begin, names = float(answer.data["utc_s"]), dict(answer.data["names"])
     if not math.isfinite(begin):

@@ -72,7 +72,7 @@ class Scheduling(Foreseeing, Protocol):
     ) -> PlannedVisit | None:
         """Return the next of the ready heliostats (N,) for a free target, None if none is due.
 
-        With ``beside``, the heliostat goes there together with those returned before.
+        With ``beside``, the heliostat joins the visit of those returned before.
         """
         ...
 

@@ -15,9 +15,9 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, SightingView
 from heliotrope.plant.visits.expected_errors import expected_covariances, expected_errors
 
-#: Maximum number of points of the quality over time, and of results, that are held.
+#: Maximum number of points of the quality history, and of results, that are kept.
 _POINTS, RESULTS = 4000, 2000
-#: Number of points of the quality that are derived from earlier results.
+#: Number of points of the quality history that are derived from earlier results.
 _RECALLED = 60
 #: Number of heliostats whose priors determine the error of an uncalibrated heliostat.
 _SAMPLE = 100
@@ -62,7 +62,7 @@ class CalibrationBook:
         self.results: deque[CalibrationEntry] = deque(maxlen=RESULTS)
         self.quality: deque[QualityPoint] = deque(maxlen=_POINTS)
         self.failed = 0
-        # Existing beliefs are predicted together, because one by one it takes 20 times as long.
+        # Errors are predicted for all existing beliefs at once; one by one takes 20 times as long.
         self._believe(*plant.beliefs)
         plant.beliefs.subscribe(self._believe, held=False)
 
@@ -129,7 +129,7 @@ class CalibrationBook:
     def error_on(self, target: Target, rows: npt.NDArray[np.intp]) -> FloatArray:
         """Return the expected errors of n beams on a target now, rad RMS (2-D), (n,).
 
-        NaN for rows of the field without a calibration, and while it is dark.
+        NaN for heliostats without a calibration, and while the sun is down.
         """
         if self._dark:
             return np.full(len(rows), np.nan)

@@ -20,8 +20,7 @@ from heliotrope.safety import Alarm, alarms
 from heliotrope.store.records import PlannedVisit
 
 Mask = npt.NDArray[np.bool_]
-#: Function that returns the next of the ready heliostats (N,) for a target; with True, others go
-#: there with it.
+#: Function that returns the next of the ready heliostats (N,) for a target; True: in a joint visit.
 Next = Callable[[str, Mask, bool], PlannedVisit | None]
 
 #: Fraction of the largest expected error up to which automatic control sends a heliostat, because
@@ -182,7 +181,7 @@ class JointVisits:
     async def _several(
         self, target: str, ready: Mask, following: Next, most: int
     ) -> tuple[str, ...]:
-        """Return up to ``most`` of the ready heliostats (N,), in the order of their gain."""
+        """Return up to ``most`` of the ready heliostats (N,), by decreasing gain."""
         names: list[str] = []
         left = ready.copy()
         # If two targets chose alternately, too few would be left for both.
@@ -197,13 +196,13 @@ class JointVisits:
         return tuple(names)
 
     def alone(self, ready: Mask) -> Mask:
-        """Return a mask of the ready heliostats (N,) that no joint visit proved, which go alone."""
+        """Return a mask of the ready heliostats (N,) that joint visits gave up; they go alone."""
         found = np.zeros_like(ready)
         found[[self._plant.field.place(name) for name in self.cycle.attempts.given_up]] = True
         return found & ready
 
     def awaited(self, target: str, ready: Mask) -> bool:
-        """Return whether a target waits for others: the field is raised, and few are ready.
+        """Return whether a target waits for more heliostats, because few have been raised yet.
 
         It waits for at most `_PATIENCE`, once, for a joint first visit that is worthwhile.
         """
@@ -216,7 +215,7 @@ class JointVisits:
         return now - self._waited.setdefault(target, now) < _PATIENCE
 
     def retries(self, now: float) -> tuple[Retry, ...]:
-        """Return the heliostats that come again, or were given up."""
+        """Return the heliostats that are retried, or were given up."""
         return self.cycle.attempts.shown(now)
 
     def begun(self, target: str) -> None:
@@ -319,8 +318,9 @@ class ReceiverVisits:
     def concluded(self, results: Sequence[CycleResult]) -> tuple[str, ...]:
         """Note a visit's results; return the heliostats to measure on a target.
 
-        If less than half of the beams are proven, the light is to blame and not the heliostats. A
-        heliostat that was refused too often while others were measured also goes to a target.
+        If fewer than half of the heliostats are measured, the light is to blame and not the
+        heliostats. A heliostat that failed too often while others were measured also goes to a
+        target.
         """
         results = [r for r in results if r.outcome is not CalibrationOutcome.TAKEN_OUT]
         now, seen = self._plant.now(), [r.heliostat for r in results if r.verdict is None]

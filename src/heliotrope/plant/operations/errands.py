@@ -29,7 +29,7 @@ Progress = Callable[[Sequence[str]], Mapping[str, Step]]
 
 @dataclass(frozen=True)
 class _Errand:
-    """An operation in progress: its ticket, its longest time, and what ends with it."""
+    """An operation in progress: its ticket, its time limit, and what to call if it is given up."""
 
     ticket: Ticket
     progress: Progress
@@ -67,7 +67,7 @@ class Errands:
         progress
             See `Progress`.
         patience
-            Longest time, s; a heliostat that has not ended by then has failed.
+            Time limit, s; a heliostat that is not done by then has failed.
         dropped
             Called with the heliostats for which the operation is given up, and why.
         """

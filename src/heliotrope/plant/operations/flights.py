@@ -37,7 +37,7 @@ from heliotrope.plant.visits.fitting import (
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import FlightEntry
 
-#: Largest fraction of a flight's heliostats whose fit may be wrong.
+#: Largest permissible fraction of a flight's heliostats whose fits are wrong.
 _MOST_WRONG = 0.5
 #: A photograph may be this much later than the plant's time, s.
 _LATE = 300.0
@@ -100,9 +100,9 @@ class FlightIntake:
         Raises
         ------
         RefusedError
-            If the role is too low, the flight is known, or it contradicts the field.
+            If the role is too low, the flight was imported before, or it contradicts the field.
         InputError, UnknownNameError
-            If the flight is not of this plant.
+            If the flight does not belong to this plant.
         StoreError
             If it cannot be stored.
         """
@@ -200,7 +200,8 @@ class FlightIntake:
             return _Waiting(_Way.UNCHANGED, fit, version)
         change = change_of(beliefs.present(fit.name), fit.mechanism, fit.sightings)
         large = change > self._settings.large
-        # A visit fits each heliostat with its own model, which may be a larger one.
+        # A calibration visit fits each heliostat with its own model, which may have more
+        # parameters.
         other = record is None or set(record.names) != set(fit.fitted.names)
         way = _Way.AT_TARGET if large or other else _Way.AT_STOW
         return _Waiting(way, fit, version, large and record is not None)
@@ -208,7 +209,7 @@ class FlightIntake:
     # -- afterwards ------------------------------------------------------------------------
 
     def recall(self) -> None:
-        """Fit the flights from before a restart again; what was waiting then waits again."""
+        """Repeat the fits of flights from before a restart; those that were waiting wait again."""
         beliefs, fits = self._plant.beliefs, dict[str, JudgedFit]()
         known, beliefs.flights = tuple(beliefs.flights), Flights()
         for taken in known:
@@ -223,8 +224,7 @@ class FlightIntake:
             last = max(f.at for f in known if name in f.flight.heliostats)
             if record is not None and record.at >= last:
                 done.add(name)
-        # Only what still waits is followed, because a field with many flights would take minutes to
-        # start.
+        # Only waiting fits are repeated; with many flights the start would take minutes otherwise.
         left = {name: fit for name, fit in fits.items() if name not in done}
         fits |= follow_flights(beliefs, beliefs.flights, self._settings, left)
         for name, fit in fits.items():
@@ -241,7 +241,7 @@ class FlightIntake:
                 continue
             record = beliefs.record(name)
             if record is not None and record.version > waiting.version:
-                # A visit has fitted the flight's records together with its photographs.
+                # A calibration visit has fitted the flight's records together with its photographs.
                 self._waiting[name] = replace(waiting, way=_Way.IN_USE)
             elif waiting.way is _Way.AT_STOW and resting[field.place(name)]:
                 self._waiting[name] = replace(waiting, way=_Way.IN_USE)

@@ -7,14 +7,15 @@ $$D^2 = \sum_c (M_c - F_c)^2 / \sum_c σ_c^2$$
 
 $$σ_c^2 = s_c^2 + (a^2 + e^2) F_c^2 + (b F_\text{peak})^2 + (f F_\text{nominal})^2$$
 
-with s_c by the errors of the calibrations. D² has the mean 1 if the standard deviations are right,
-however many cells there are and however alike their errors: it is our own measure. `SCALE` (a)
-stands for irradiance, reflectivity and soiling, `SHAPE` (b, of maps) for the mirrors' figure,
-`READ` and `FLOOR` (e, f) for the measurement (from rendered frames, see *how to use cameras*).
+where s_c is the standard deviation due to the calibration errors. D² has an expected value of 1 if
+the standard deviations are right, for any number of cells and any correlation of their errors. This
+measure is our own. `SCALE` (a) covers irradiance, reflectivity and soiling, `SHAPE` (b, of maps)
+for the mirrors' figure, `READ` and `FLOOR` (e, f) for the measurement (from rendered frames, see
+*how to use cameras*).
 
 Where the measured flux is above the flux limit, the prediction was too low, and `beyond` says by
-how much, for `Aiming`. Only a plausible measurement counts: with more than `TRUST` times the
-prediction either the sensor lies, or beams are where nobody can say which they are.
+how much, for `Aiming`. Only a plausible measurement counts: above `TRUST` times the prediction,
+either the sensor is wrong or unidentified beams are on the receiver.
 """
 
 import math
@@ -34,14 +35,15 @@ from heliotrope.plant.operations.views import PredictedView
 from heliotrope.safety import FLUX_READING, alarms
 from heliotrope.safety.proof import FLUX_AGE
 
-#: Relative standard deviation of the predicted flux as a whole, and of a cell, of the peak.
+#: Standard deviation of the whole predicted flux, as a fraction, and of a cell, as a fraction of
+#: the peak.
 SCALE, SHAPE = 0.10, 0.05
 #: Standard deviation of a measurement: of its value, and of the nominal flux.
 READ, FLOOR = 0.02, 0.005
 #: Distance, in standard deviations, above which the alarm is raised, and below which it is cleared.
 RAISE, CLEAR = 4.0, 3.0
-#: Time for which the distance must be above or below, s; by then moving heliostats have been
-#: reported.
+#: Time for which the distance must be above or below, s, long enough for moving heliostats to
+#: report.
 HOLD = 120.0
 #: Interval between comparisons, s.
 EVERY = 10.0
@@ -56,9 +58,9 @@ class Beyond:
     Attributes
     ----------
     factor
-        Ratio of the measured flux to the predicted one in the cells where it is above the limit,
-        1 elsewhere, in the order of the limit's cells, (rows, columns); of a measured mean the same
-        in all cells.
+        Ratio of the measured flux to the predicted one in the cells where it is above the limit, 1
+        elsewhere, in the order of the limit's cells, (rows, columns); the same in all cells if only
+        the mean was measured.
     excess
         Greatest ratio of the measured flux to the limit, less 1.
     """
@@ -84,10 +86,12 @@ def distance(view: PredictedView, measured: FloatArray, mean: float, area: float
 
     Returns
     -------
-    D of the module's text; NaN if no cell was measured, or the prediction's uncertainty is unknown.
+    D of the module docstring; NaN if no cell was measured, or the prediction's uncertainty is
+    unknown.
     """
     if measured.ndim and not np.isfinite(view.sigma).any():
-        # Cells have no uncertainty while many beams may be anywhere, but the whole flux has.
+        # While the positions of many beams are unknown, cells have no uncertainty, but the mean
+        # flux has.
         measured = as_float(np.mean(measured))
     if measured.ndim:
         flux, own, shape = view.flux, view.sigma, SHAPE * view.peak
@@ -132,9 +136,9 @@ class FluxCheck:
         self._apart_since = self._agrees_since = math.inf
 
     def see(self, fractions: FloatArray | None) -> None:
-        """Accept what a camera has just measured: fractions of the nominal mean flux, (H, W) or ().
+        """Accept a new measurement: fractions of the nominal mean flux, (H, W) or ().
 
-        None: the camera has not seen all of the light, so there is nothing to compare.
+        None: the camera did not see the whole receiver light, so there is nothing to compare.
         """
         self._seen = fractions, self._plant.now()
 
@@ -150,14 +154,14 @@ class FluxCheck:
         return as_float(self._mean * share) if math.isfinite(share) else None
 
     def beyond(self, limit: FluxLimit, predicted: FloatArray) -> Beyond | None:
-        """Return by how much the measured flux is above a limit, its margin included; None: not.
+        """Return how far the measured flux is above a limit without margin; None: it is not.
 
-        A measured mean stands for a map of the predicted shape.
+        If only the mean is measured, the predicted map is scaled to it.
 
         Parameters
         ----------
         limit
-            Of the receiver.
+            Limit of the receiver.
         predicted
             Flux of the beams at their aims in the present irradiance, W/m², in the order of the
             limit's cells, (rows, columns).

@@ -18,10 +18,10 @@ from heliotrope.plant.operations.solar_day import day_of
 from heliotrope.plant.workers import Worker
 from heliotrope.store.records import FieldPoint, Outlook
 
-#: Time between points of the curve that comes true, s, and number of points that are held.
+#: Time between points of the actual curve, s, and number of points that are kept.
 POINT_EVERY, _POINTS = 60.0, 1500
-#: Least share of the heliostats that may be measured which is ready when a prediction is made:
-#: before that the field is still being raised.
+#: Smallest fraction of the measurable heliostats that must be ready for a prediction; below it the
+#: field is still being raised.
 _UP = 0.5
 _DAY = 86_400.0
 
@@ -34,12 +34,12 @@ class Prospect(Protocol):
         ...
 
     def outlook(self) -> Outlook | None:
-        """Return the prediction, None if nothing can be measured any more on this day."""
+        """Return the prediction, None if nothing more can be measured on this day."""
         ...
 
 
 class Foreseeing(Protocol):
-    """The schedule, as a prediction needs it."""
+    """The part of the schedule that a prediction needs."""
 
     def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> Prospect | None:
         """Return the present knowledge; None if it cannot predict.
@@ -55,14 +55,14 @@ class Foreseeing(Protocol):
 
 
 class Foresight:
-    """Makes predictions, keeps them, and follows what comes true.
+    """Makes and stores predictions, and records the actual errors.
 
     Parameters
     ----------
     plant, keeping
-        The controller, and the memory.
+        The controller, and the store of results.
     schedule
-        What is predicted from.
+        Schedule from whose knowledge predictions are made.
     every
         Time between predictions, s; 0: none is made.
     worker
@@ -71,9 +71,9 @@ class Foresight:
     Attributes
     ----------
     points
-        What has come true, oldest first.
+        Actual errors, oldest first.
     outlooks
-        The first prediction of the day, and the last if it is another one.
+        The first prediction of the day, and the latest if it is a different one.
     """
 
     def __init__(
@@ -92,11 +92,11 @@ class Foresight:
         self._targets = tuple(target.name for target in plant.design.targets)
 
     def recall(self) -> None:
-        """Take up the predictions of this day that the store has kept."""
+        """Load the stored predictions of this day."""
         now = self._utc()
         kept = self._keeping.outlooks(now - _DAY)
         mine = [o for o in kept if self._day(o.made) == self._day(now) and o.made <= now]
-        # The first point of each is what had come true by then.
+        # The first point of each prediction holds the actual errors at that time.
         self.points.extend(outlook.points[0] for outlook in mine)
         self.outlooks = tuple(dict.fromkeys(mine[:1] + mine[-1:]))
 
@@ -110,7 +110,7 @@ class Foresight:
         able, ready
             Heliostats that may be measured on this day, and those ready now, (N,).
         running
-            Whether calibration is running: there is no prediction without.
+            Whether calibration is running; otherwise no prediction is made.
         """
         prospect = self._schedule.foresee(able, self._targets)
         if prospect is None:

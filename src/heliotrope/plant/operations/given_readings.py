@@ -16,48 +16,49 @@ from heliotrope.plant.orders.authority import Person
 OLDEST = 5.0
 #: A reading may be this far ahead of the plant's clock, as two clocks never agree fully, s.
 AHEAD = 0.5
-#: A person who was silent for this long is recorded again as giving a reading, s.
+#: A user who sent no reading for this long is logged again on the next one, s.
 _SILENT = 10.0
 
 
 class GivenReadings:
-    """Takes readings from programs.
+    """Accepts readings from programs.
 
     Parameters
     ----------
     plant
         The controller; its settings name the readings.
     logbook
-        Records who gives which reading.
+        Records who supplies which reading.
     """
 
     def __init__(self, plant: PlantController, logbook: Logbook) -> None:
         self._plant, self._logbook = plant, logbook
-        #: When the newest reading was made, Unix s as its program said, and taken, monotonic s.
+        #: Times of the newest reading: of measurement, Unix s by its program, and of receipt,
+        #: monotonic s.
         self._last: dict[str, tuple[float, float]] = {}
-        #: When each person last gave each reading, monotonic s.
+        #: When each user last supplied each reading, monotonic s.
         self._given: dict[tuple[str, str], float] = {}
 
     def take(self, person: Person, name: str, value: float, at: float) -> None:
-        """Take a reading.
+        """Accept a reading.
 
         Parameters
         ----------
         person
-            Gives it.
+            User whose program supplies the reading.
         name
             Reading of the safety table.
         value
-            In the unit of its row.
+            Value in the unit of its row.
         at
-            When it was made, Unix s.
+            Time of the measurement, Unix s.
 
         Raises
         ------
         UnknownNameError
-            If programs do not give this reading at this plant.
+            If programs do not supply this reading at this plant.
         InputError
-            If it is not finite, too old, from the future, or not newer than the last one.
+            If the reading is not finite, too old, from the future, or not newer than the last one.
         """
         names = self._plant.settings.given
         if name not in names:
@@ -76,7 +77,8 @@ class GivenReadings:
                 f"{AHEAD:g} s; compare the clocks of both computers"
             )
         last, taken = self._last.get(name, (-math.inf, -math.inf))
-        # A copy is refused by its age afterwards; a clock that was set back must not bar for long.
+        # A repeated reading is later refused for its age. A clock that was set back must not block
+        # readings for long.
         if at <= last and now - taken <= OLDEST + AHEAD:
             raise InputError(
                 f"{name}: the reading is {last - at:.1f} s older than the last reading; send each "

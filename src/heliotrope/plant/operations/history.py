@@ -15,13 +15,13 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import STALE_STATE, FieldFrame, Summary, SunView
 from heliotrope.store.records import PlantFigures, Records, StoreError
 
-#: Time between two rows of figures, s.
+#: Time between two records of figures, s.
 EVERY = 60.0
-#: Digits that a figure keeps.
+#: Significant digits stored of a figure.
 _DIGITS = 5
-#: States from which a heliostat does no work until a person has seen to it.
+#: States in which a heliostat does not operate until an operator has attended to it.
 _OUT_OF_ORDER = (states.FAULT, states.UNCONFIGURED)
-#: Unit of a kind of figure; those of readings are the safety table's.
+#: Unit of each kind of figure; readings have the units of the safety table.
 UNITS = {
     "power": "W",
     "state": "",
@@ -71,7 +71,7 @@ def figures(
 
 
 class History:
-    """Takes figures of a plant every minute.
+    """Records figures of a plant every minute.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class History:
             await sleep_until(self._plant.clock, self._plant.now() + EVERY)
 
     async def take(self, records: Records) -> None:
-        """Take one row; the minute is missing where the store takes no more, which is alarmed."""
+        """Store one record; if that fails, the minute is missing and an alarm is raised."""
         try:
             records.record(PlantFigures(self._plant.clock.utc().timestamp(), await self._now()))
         except StoreError:

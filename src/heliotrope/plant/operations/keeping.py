@@ -36,7 +36,7 @@ class Forgetting(Protocol):
     """Records whose old events can be removed."""
 
     def forget_events(self, before: float) -> None:
-        """Remove events before a time, and alarms that were over and acknowledged by then."""
+        """Remove events before a time, and alarms that were cleared and acknowledged by then."""
         ...
 
 
@@ -129,11 +129,11 @@ class Keeping:
             self.lost = str(error)
 
     def learnings(self) -> list[LearningEntry]:
-        """Return the last learning of each group."""
+        """Return the last result of learning for each group."""
         return [] if self._records is None else self._records.learnings()
 
     def timetable(self) -> TimetableRecord | None:
-        """Return the timetable that a person has put in force last; None: nobody has."""
+        """Return the timetable that an operator last put in force; None: no operator has."""
         kept = [] if self._records is None else self._records.timetables()
         return kept[0] if kept else None
 
@@ -159,9 +159,9 @@ class Keeping:
             self.lost = str(error)
 
     def results(self, limit: int) -> tuple[CalibrationEntry, ...]:
-        """Return the results of the last visits of earlier programs, oldest first.
+        """Return the results of the last visits before the program started, oldest first.
 
-        Errors that are not kept are NaN.
+        Errors that were not stored are NaN.
         """
         visits = [] if self._records is None else self._records.visits(limit)
         nan, known, found = float("nan"), dict[str, int](), list[CalibrationEntry]()
@@ -199,9 +199,9 @@ class Keeping:
         entry
             The result.
         begun
-            Beginning of the visit, POSIX s.
+            Start of the visit, POSIX s.
         sigma
-            Predicted error of the normal before it, rad.
+            Predicted error of the normal before the visit, rad.
         """
         if self._records is None:
             return
@@ -230,7 +230,7 @@ class Keeping:
     # -- heliostats out of service, and events ---------------------------------------------
 
     def lockouts(self) -> tuple[Lockout, ...]:
-        """Return the locks of persons that stand, those past their time included."""
+        """Return the personal locks in force, including those past their expected end."""
         if self._records is None:
             return ()
         return tuple(
@@ -245,7 +245,7 @@ class Keeping:
             self._records.hold(lockouts)
 
     def put_back(self, lockouts: Sequence[Lockout], who: str, at: float) -> None:
-        """Keep that locks have been removed."""
+        """Record that locks have been removed."""
         if self._records is not None:
             self._records.unhold(lockouts, who, at)
 

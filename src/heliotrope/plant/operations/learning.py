@@ -1,9 +1,9 @@
-"""Nightly learning: the hyperparameters of each group, in the background.
+"""Nightly learning of the hyperparameters of each group, in the background.
 
-They describe how far the heliostats of a group differ from the plant file, how their drives drift,
-and how noisy their photographs are. Visits use them to follow the drift, and they determine how
-predicted errors, the schedule and the ellipses grow. An operator may start it at any time; no
-heliostat moves.
+Hyperparameters describe how far the heliostats of a group differ from the plant file, how their
+drives drift, and how noisy their photographs are. Visits use them to follow the drift, and they
+determine how predicted errors, the schedule and the ellipses grow. An operator may start it at any
+time; no heliostat moves.
 """
 
 import json
@@ -30,12 +30,12 @@ from heliotrope.plant.operations.views import LearningView
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.store.records import LearningEntry
 
-#: Least time between two nightly attempts, s: one a night.
+#: Minimum time between two nightly attempts, s, so that there is one per night.
 EVERY = 16 * 3600.0
 
 
 class Learner(Protocol):
-    """Where groups are learnt: beside the plant, never in its loop."""
+    """Learns groups outside the plant's event loop."""
 
     async def learn(self, group: GroupHistory) -> LearntGroup:
         """Return the result of learning a group.
@@ -43,7 +43,7 @@ class Learner(Protocol):
         Raises
         ------
         HeliotropeError
-            If it teaches nothing yet, or learning fails; the text is for people.
+            If the group has too few data yet, or learning fails; the text is shown to operators.
         """
         ...
 
@@ -66,11 +66,11 @@ class Learning:
     plant, log, keeping
         The controller, the logbook for events, and the memory.
     model
-        The parameters of a mirror with few sightings: a name of the table, or names.
+        The parameters fitted for a heliostat with few sightings: a name of the table, or names.
     learner
-        Where it is done; None: nothing is learnt.
+        Runs the learning; None: nothing is learnt.
     person
-        Name under which the audit lists the nightly learning.
+        Name under which the audit log lists the nightly learning.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Learning:
         UnknownNameError
             If there is no such group.
         InputError
-            If the plant learns nothing.
+            If the plant has no learner.
         """
         person.must_be(Role.ENGINEER, "learn")
         if group and group not in self._groups:
@@ -142,7 +142,7 @@ class Learning:
     # -- learning --------------------------------------------------------------------------
 
     async def step(self, *, night: bool) -> None:
-        """Learn one group that is due: what persons have asked for, and at night every group."""
+        """Learn one group that is due: one that operators requested, or at night any group."""
         if self._learner is None:
             return
         now = self._utc()
@@ -183,7 +183,7 @@ class Learning:
             self._log.event("calibration", person.name, f"group {name}: {group.said}")
 
     def _judged(self, name: str, group: _Group, person: Person, found: LearntGroup) -> str:
-        """Put what was learnt in force if it foretells photographs better; return what to say."""
+        """Put the result in force if it predicts photographs better; return the message."""
         origin = f"{found.sightings:,} photographs of {found.heliostats} heliostats"
         if not found.gain > 0.0:
             return f"{origin}: new values would not predict them better, so nothing changed"
@@ -215,7 +215,7 @@ class Learning:
         self._plant.beliefs.adopt(entry.group, hyper, source)
 
     def recall(self) -> None:
-        """Put in force what was learnt before a restart."""
+        """Put the results from before a restart in force."""
         for entry in self._keeping.learnings():
             if entry.group not in self._groups:
                 continue  # the plant file has changed; the store still has it

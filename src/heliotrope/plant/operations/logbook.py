@@ -18,17 +18,17 @@ from heliotrope.plant.operations.views import AlarmRow, ClusterRow, EventRow, Pa
 from heliotrope.safety import Alarm, Severity, alarms
 from heliotrope.store.records import Event, Records, StoreError
 
-#: Messages that come each second: only the last of each cluster is kept.
+#: Messages sent every second, of which only the last of each cluster is kept.
 _STEADY = ("lease", "status")
-#: Longest text of a packet, letters.
+#: Longest text of a packet, characters.
 _LONGEST = 240
-#: Heliostats that the text of an event names at most; others are counted.
+#: Maximum number of heliostats named in the text of an event; more are only counted.
 MOST_NAMED = 3
-#: Alarms that the evaluation of the table raises and ends itself: nothing to acknowledge.
+#: Alarms that the table evaluation raises and clears by itself, so they need no acknowledgement.
 _UNACKNOWLEDGED = (alarms.TIME_WENT_BACK.name, alarms.UNKNOWN_READING.name)
-#: Alarms whose acknowledgement the plant takes, beside the rows of the table.
+#: Alarms that the plant lets operators acknowledge, besides the rows of the safety table.
 _CONFIRMED = (alarms.COUNTS_DOUBTFUL.name, alarms.DRIVE_STALLED.name)
-#: An alarm that is raised once and put right by the plant itself.
+#: Alarms that are raised once and whose cause the plant itself removes.
 _PASSING = (alarms.PARAMETERS_DIFFER.name,)
 
 
@@ -63,7 +63,7 @@ class Logbook:
         self._clock, self._records = clock, records
         self._alarms: dict[tuple[str, str], AlarmRow] = {}
         self._events: deque[EventRow] = deque(maxlen=events)
-        #: The heliostats of those events that do not name them all, by number.
+        #: Heliostats of events whose text does not name all of them, by event number.
         self._named: dict[int, tuple[str, ...]] = {}
         self._numbers = count(1)
         self._packets: deque[tuple[float, str, str, bytes]] = deque(maxlen=packets)
@@ -72,7 +72,8 @@ class Logbook:
         self._statuses: dict[str, ClusterStatus] = {}
         self.refused: dict[str, int] = {}
         self.forward: Callable[[Alarm], None] | None = None
-        #: The last record that was refused while its alarm stands, and the store's count of such.
+        #: The last refused record while its alarm is active, and the store's count of refused
+        #: records.
         self._refused, self._refused_count = "", 0
 
     def _now(self) -> float:
@@ -97,7 +98,7 @@ class Logbook:
             self._packets.append((self._now(), cluster, way, data))
 
     def take_alarm(self, alarm: Alarm) -> None:
-        """Take an alarm from the plant or a cluster; one that ends by itself becomes an event."""
+        """Accept an alarm from the plant or a cluster; a self-clearing alarm becomes an event."""
         if alarm.condition in _PASSING:
             self.event("plant", alarm.subject, alarm.text)
             return
@@ -139,7 +140,7 @@ class Logbook:
             self._keep(self._records.record_event, Event(self._now(), kind, line, severity))
 
     def _keep(self, keep: Any, *values: Any) -> None:
-        """Keep a record; one that cannot be kept raises an alarm and stops nothing."""
+        """Store a record; if that fails, an alarm is raised and work continues."""
         try:
             keep(*values)
         except StoreError as error:
@@ -287,7 +288,7 @@ class Logbook:
 
 
 class _Listener:
-    """Notes the messages at one link in the book."""
+    """Records the messages on one link in the logbook."""
 
     def __init__(self, cluster: str, book: Logbook) -> None:
         self._cluster, self._book = cluster, book
@@ -296,7 +297,7 @@ class _Listener:
         """Do nothing: only messages that were sent are noted."""
 
     def sent(self, data: bytes, now: float) -> None:
-        del now  # the book notes its own time
+        del now  # the logbook uses its own time
         self._book.packet(self._cluster, "to", data)
 
     async def waits(self) -> None:
@@ -312,7 +313,7 @@ def _open(row: AlarmRow) -> bool:
 
 
 def _kind(data: bytes) -> str:
-    """Return the kind that a message names, without reading the rest of it."""
+    """Return the kind of a message, without parsing the rest of it."""
     head, _, rest = data.partition(b'"kind":"')
     return rest.partition(b'"')[0].decode("ascii", "replace") if len(head) < 8 else ""
 

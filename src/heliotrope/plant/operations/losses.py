@@ -22,7 +22,7 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.safety import Severity, alarms
 from heliotrope.store.records import Records
 
-#: Losses that may lie within this span count together; until it is over, none is raised again, s.
+#: Losses within this time count together; until it is over, no lost heliostat is raised again, s.
 SPAN = 30.0
 
 Mask = npt.NDArray[np.bool_]
@@ -30,24 +30,24 @@ _NONE: Mask = np.zeros(1, dtype=np.bool_)
 
 
 class Losses:
-    """Losses of wanted heliostats, and the wait for a person after many.
+    """Losses of wanted heliostats, and the wait for an operator after a large number.
 
     Parameters
     ----------
     plant, log
         The controller, and the logbook for the alarm.
     most
-        Heliostats that may be lost within `SPAN` without a person.
+        Number of heliostats that may be lost within `SPAN` without waiting for an operator.
     records
-        Store of alarms: a wait outlasts a restart, and an emergency that held when the last
-        program ended begins one; None: neither.
+        Store of alarms: a wait survives a restart, and an emergency active when the last program
+        ended starts a wait; None: neither.
     stop
         Called when a wait begins.
 
     Attributes
     ----------
     reason
-        Why automatic control waits for a person, empty if it does not.
+        Why automatic control waits for an operator, empty if it does not.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Losses:
         count = len(plant.field)
         self._up: Mask = np.zeros(count, dtype=np.bool_)
         self._seen: Mask = np.zeros(count, dtype=np.bool_)
-        #: When they were last heard there, monotonic s.
+        #: When heliostats last reported there, monotonic s.
         self._up_at = np.full(count, -math.inf)
         self._lost_at = np.full(count, -math.inf)
         self._live_at = np.full(count, plant.now())
@@ -73,25 +73,26 @@ class Losses:
     def look(self, wanted: Mask, at_stow: Mask = _NONE) -> Mask:
         """Return a mask of the wanted heliostats (N,) lost since the last check, (N,).
 
-        One that is IDLE at its stow position is no loss when it reports that it is stowed; while it
-        is diagnosed ``at_stow`` (N,), it moves about that position.
+        A heliostat IDLE at its stow position does not count as lost when it is stowed. Nor do the
+        heliostats diagnosed ``at_stow`` (N,), which move about that position.
         """
         field, now = self._plant.field, self._plant.now()
         there = field.among((states.IDLE,), now) & (field.rows["flags"] & meanings.AT_STOW != 0)
         live, up = field.live(now), field.among(states.BEAM_OUT, now) & ~there & ~at_stow
-        # Only an order locks a heliostat: a person's, or a visit's that writes parameters.
+        # Only an order locks a heliostat: an operator's, or one from a visit that writes
+        # parameters.
         held = field.among((states.LOCKED,), now)
         lost: Mask = live & ~up & ~held & self._up
         lost |= ~self._seen & field.among(states.LEAVING, now)
         lost &= wanted & ~self._plant.ledger.off(self._up_at, now)
-        # A heliostat that is not heard, or is locked, keeps what was seen of it last.
+        # A heliostat that is silent or locked keeps its last observed state.
         self._up = np.where(live & ~held, up, self._up)
         self._up_at[live & up] = field.heard[live & up]
         self._seen |= live
         self._lost_at[lost] = now
         if lost.any():
-            # One that was silent may have been lost at any time since it was last live. Those that
-            # are left to people by now count too.
+            # A heliostat that was silent may have been lost at any time since its last report.
+            # Heliostats since left to the operators count too.
             since = float(self._live_at[lost].min())
             together = int((self._lost_at > since - SPAN).sum())
             if together > self._most:
@@ -102,11 +103,11 @@ class Losses:
         return lost
 
     def settling(self) -> Mask:
-        """Return a mask of the heliostats lost a moment ago and not raised yet, (N,)."""
+        """Return a mask of the heliostats lost recently and not to be raised yet, (N,)."""
         return np.asarray(self._plant.now() - self._lost_at < SPAN)
 
     def resume(self) -> None:
-        """End the wait: a person has looked into the field."""
+        """End the wait, because an operator has checked the field."""
         self._lost_at[:] = -math.inf
         if self.reason:
             self.reason = ""
@@ -125,7 +126,7 @@ class Losses:
 
 
 def _standing(records: Records | None) -> list[str]:
-    """Return the text of the wait that stood when the plant ended."""
+    """Return the text of the wait that was active when the last program ended."""
     if records is None:
         return []
     try:

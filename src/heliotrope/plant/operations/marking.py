@@ -40,14 +40,14 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.orders.authority import Person, Role
 
-#: Pictures that are held for persons who mark them.
+#: Maximum number of pictures held for users who mark them.
 _HELD = 4
-#: Largest RMS residual of the points, px; they are clicked within a pixel or two.
+#: Largest RMS residual of the points, px; users click within a pixel or two.
 _MOST_OFF = 6.0
-#: JPEG quality (0 to 100) of pictures to click in and of the rectified one.
+#: JPEG quality (0 to 100) of pictures to click in and of the rectified picture.
 _JPEG = 92
 
-#: Attributes of a camera that say how it sees.
+#: Attributes of a camera that define its view.
 _VIEW = ("matrix", "distortion", "position", "R_enu_camera")
 
 Pixel = tuple[float, float]
@@ -65,13 +65,13 @@ class MarkedCameras(Protocol):
         ...
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
-        """Read later photographs with a camera, a target's marks, and taught pictures."""
+        """Evaluate later photographs with a camera, a target's marks, and taught pictures."""
         ...
 
 
 @dataclass(frozen=True)
 class PointToMark:
-    """A point of a target: name, place from the left and from above (0 to 1), expected pixel."""
+    """A point of a target: name, position from left and top (0 to 1), and expected pixel."""
 
     name: str
     place: Pixel
@@ -95,7 +95,7 @@ class PictureToMark:
     points
         Points that can be marked.
     kept
-        Where the marks will be kept, in words.
+        Where the marks will be stored, in words.
     """
 
     target: str
@@ -128,17 +128,17 @@ class MarksView:
     target, camera
         Names.
     saved
-        Whether it is in use; otherwise it was only tried.
+        Whether the view is in use; otherwise it was only tried.
     points
         Points in the order given.
     residual
-        RMS of the points, px.
+        RMS residual of the points, px.
     sigma
-        Standard deviation of a place on the target by this view, m.
+        Standard deviation of a position on the target measured with this view, m.
     text
-        What it is, in words.
+        The result in words.
     rectified
-        The target from the front, by this view: JPEG in base64.
+        The target as seen from the front, rectified with this view: JPEG in base64.
     """
 
     target: str
@@ -152,7 +152,7 @@ class MarksView:
 
 
 class Marking:
-    """Takes the views that persons mark.
+    """Accepts the views that users mark.
 
     Parameters
     ----------
@@ -161,8 +161,9 @@ class Marking:
     plant, log
         The controller, and the logbook for events.
     file
-        Plant file that keeps the views, beside ``before.toml`` with the plant's own file as it was:
-        a view counts until that file has another one. None: views end with the program.
+        Plant file that stores the views, next to ``before.toml``, a copy of the plant's own file at
+        that time. A view is valid until the plant's own file has a different view. None: views are
+        lost when the program ends.
     """
 
     def __init__(
@@ -178,12 +179,12 @@ class Marking:
         self._number = 0
 
     def resume(self) -> None:
-        """Take the views that were kept; those that no longer fit the plant's own file are left.
+        """Load the stored views, except those that no longer match the plant's own file.
 
         Raises
         ------
         FormatError
-            If a kept file cannot be used.
+            If a stored file cannot be used.
         """
         file = self._file
         if file is None or not file.is_file():
@@ -195,7 +196,8 @@ class Marking:
                 text = "corners marked earlier are ignored because the plant file has changed since"
                 self._log.event("calibration", target.name, text)
                 continue
-            # Others lie beside the plant's own file, and the cameras have them.
+            # Pictures of other marks are next to the plant's own file, and the cameras already have
+            # them.
             here = [m for m in target.marks if m.code and (file.parent / m.code).is_file()]
             pictures = read_pictures(file.parent, [replace(target, marks=tuple(here))])
             new = kept.camera(camera.name)
@@ -211,7 +213,7 @@ class Marking:
         return next((c for c in self._plant.design.cameras if c.name == name), None)
 
     def _fits(self, before: Plant, camera: Camera, target: str) -> bool:
-        """Return whether the plant's own file still has what was there before a person marked."""
+        """Return whether the plant's own file still has the view from before the marking."""
         old = next((c for c in before.cameras if c.name == camera.name), None)
         then = next((t for t in before.targets if t.name == target), None)
         now = self._plant.design.target(target)
@@ -228,7 +230,7 @@ class Marking:
     # -- looking ---------------------------------------------------------------------------
 
     def begin(self, person: Person, target: str) -> PictureToMark:
-        """Hold the newest frame of a target's camera, to be marked.
+        """Hold the newest frame of a target's camera for marking.
 
         Raises
         ------
@@ -293,28 +295,28 @@ class Marking:
         points: Mapping[str, Pixel],
         token: int | None = None,
     ) -> MarksView:
-        """Try the points that a person clicked, and with a token take their view.
+        """Try the points that a user clicked; with a token, adopt the resulting view.
 
         Parameters
         ----------
         person
             An engineer.
         target, number
-            The target, and the picture of `begin`.
+            The target, and the number of the picture from `begin`.
         points
-            Pixels by the names of the points.
+            Pixel of each point, by the name of the point.
         token
             Token of the command authority; None: nothing is changed.
 
         Raises
         ------
         InputError
-            Points that are too few, outside the picture, or arranged unlike the target; a plant
-            file that cannot be written.
+            If the points are too few, outside the picture, or not arranged like the target, or if
+            the plant file cannot be written.
         RefusedError
             If it is not accepted.
         UnknownNameError
-            Of a target, a point or a picture.
+            If there is no such target, point or picture.
         """
         person.must_be(Role.ENGINEER, "mark corners")
         if token is not None:
@@ -370,7 +372,7 @@ class Marking:
         return taught
 
     def _keep(self, taught: Taught, person: str) -> None:
-        """Write the plant file with a new view, and keep it as it was."""
+        """Write the plant file with a new view, and keep a copy of the old file."""
         if self._file is None:
             return
         camera, target = taught.plant.camera(taught.camera), taught.plant.target(taught.target)
@@ -396,7 +398,7 @@ def _before(file: Path) -> Path:
 
 
 def _near(a: FloatArray | None, b: FloatArray | None) -> bool:
-    """Return whether two arrays are equal, as far as a file tells."""
+    """Return whether two arrays are equal to the precision of a file."""
     if a is None or b is None:
         return a is b
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-9, atol=1e-6))
@@ -410,7 +412,7 @@ def _with(plant: Plant, camera: Camera, target: Target) -> Plant:
 
 
 def _expected(camera: Camera, point: FloatArray, size: tuple[int, int]) -> Pixel | None:
-    """Return where a camera should show a point; None if it does not, or is not located."""
+    """Return the expected pixel of a point; None if out of view or if the camera is not located."""
     if camera.position is None:
         return None
     x, y = (float(v) for v in project(camera, point))

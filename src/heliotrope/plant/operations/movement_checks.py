@@ -20,13 +20,13 @@ from heliotrope.plant.orders.authority import Person
 from heliotrope.plant.orders.guards import Asked
 from heliotrope.safety import Alarm, alarms
 
-#: Heliostats that are diagnosed at once: they take the supply of drives, and no light.
+#: Maximum number of heliostats diagnosed at once; they load the drive supply, but move no beam.
 MOST = 200
-#: Time in which a heliostat holds at stow, and in which a diagnosis ends, s.
+#: Time limits for a heliostat to hold at stow, and for a diagnosis to end, s.
 _HOLDS, _ENDS = 10.0, 180.0
-#: Time in which the result of a diagnosis comes, s.
+#: Time limit for the result of a diagnosis, s.
 _TELLS = 10.0
-#: Diagnoses that do not come to their end, such as those that a person interrupts.
+#: Diagnoses that are not completed, such as those interrupted by an operator.
 CHECKING = RetryLaw(
     "diagnosis of movement",
     5,
@@ -55,7 +55,7 @@ class MovementChecks:
     Attributes
     ----------
     attempts
-        Heliostats whose diagnosis did not come to its end.
+        Heliostats whose diagnosis was not completed.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class MovementChecks:
 
     @property
     def resting(self) -> Mask:
-        """Which heliostats are not raised: those not diagnosed yet today, and that stall, (N,)."""
+        """Mask of the heliostats not to be raised: not yet diagnosed today, or stalled, (N,)."""
         plant = self._plant
         resting = np.zeros(len(plant.field), dtype=np.bool_)
         waiting = plant.drive_checks.due | plant.drive_checks.stalled.keys()
@@ -82,7 +82,7 @@ class MovementChecks:
         return moved
 
     async def step(self, token: int, free: Mask) -> None:
-        """Diagnose the heliostats (N,) at stow that are free and due, `MOST` at once.
+        """Diagnose the free heliostats (N,) at stow that are due, at most `MOST` at once.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class MovementChecks:
     async def _given(
         self, token: int, command: str, names: tuple[str, ...], limit: float
     ) -> tuple[str, ...]:
-        """Give a command, and return the heliostats that have carried it out."""
+        """Issue a command, and return the heliostats that have carried it out."""
         if not names:
             return ()
         try:

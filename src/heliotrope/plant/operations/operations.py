@@ -8,7 +8,7 @@ plan and timetable.
 
 Operator commands pass through here so that automatic control knows what operators want: a heliostat
 that an operator has stowed, defocused or locked stays so until an operator gives it back, and a
-heliostat that an operator has raised and that was lost is left to the operators.
+heliostat that is lost after an operator has raised it is left to the operators.
 """
 
 import asyncio
@@ -69,11 +69,11 @@ _TAKES_FROM_AUTOMATIC = messages.having("manual")
 _GIVES_TO_AUTOMATIC = messages.having("automatic")
 
 _DAY = 86_400.0
-#: Time between looks after the security events, s.
+#: Interval between checks of the security events, s.
 _LOOKED = 5.0
-#: Time between looks at operations under way, s.
+#: Interval between checks of operations in progress, s.
 _FOLLOWED = 1.0
-#: Longest time of a calibration that a person asks for, and of the path to stow, s.
+#: Time limits of a calibration requested by an operator, and of the path to stow, s.
 _ASKED, _PARKED = 3600.0, 600.0
 #: Row of the summary with the reason why the last link was refused.
 REFUSED_LINK = "refused link"
@@ -98,7 +98,7 @@ class Photography:
     Attributes
     ----------
     cameras
-        Photographs of the targets for display, by target name.
+        Latest photographs of the targets for display, by target name.
     pictures
         Stores photographs with their results; None: they are not stored.
     marking
@@ -191,7 +191,7 @@ class Operations:
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations end")
 
     async def _look(self) -> None:
-        """Look after the security events."""
+        """Check the security events."""
         while True:
             facts = {} if self._extra is None else self._extra()
             self.security.look(str(facts.get(REFUSED_LINK, "")))
@@ -200,13 +200,13 @@ class Operations:
     async def _compare(self) -> None:
         """Compare the flux on the receiver with the predicted one."""
         while True:
-            # The process that computes may have ended; then another begins.
+            # The worker process may have ended, in which case another one is started.
             with contextlib.suppress(HeliotropeError):
                 await self.flux_check.look()
             await sleep_until(self.plant.clock, self.plant.now() + COMPARED)
 
     async def _follow(self) -> None:
-        """Follow operations of persons to their ends."""
+        """Track the operators' operations until they end."""
         while True:
             self.approvals.step()
             self.errands.look()
@@ -353,7 +353,7 @@ class Operations:
         try:
             power = {name: view.power for name, view in (await self._flux.everywhere()).items()}
         except HeliotropeError:
-            power = {}  # the process that computes has ended, and another begins
+            power = {}  # the worker process has ended, and another one is started
         return figures(self.viewer.frame(), self.summary(), self.sun(), power)
 
     # -- light -----------------------------------------------------------------------------
@@ -406,7 +406,7 @@ class Operations:
         together: Sequence[str] = (),
         receiver: bool = False,
     ) -> Ticket:
-        """Calibrate a heliostat, or only search for its beam, on the next free target, first.
+        """Calibrate a heliostat, or only search for its beam, before all others.
 
         With other heliostats (``together``) it is calibrated in one joint visit, as soon as all are
         ready. With ``receiver`` it is measured while it tracks the receiver, as soon as all of them
@@ -502,7 +502,8 @@ class Operations:
         reason
             Why.
         hours
-            Expected time of return to service; NaN if unknown. The lock remains beyond that time.
+            Expected time until return to service, h; NaN if unknown. The lock remains beyond that
+            time.
 
         Raises
         ------
@@ -533,7 +534,7 @@ class Operations:
     ) -> None:
         """Remove a person's own locks; no heliostat moves.
 
-        An engineer may remove the locks of an ``owner`` who cannot, by name and with a reason.
+        An engineer may remove the locks of an ``owner`` who cannot, naming the owner and a reason.
 
         Raises
         ------
@@ -650,7 +651,7 @@ class Operations:
         return ticket
 
     def aim(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Aim heliostats at points, where they stay; see `PlantController.aim`."""
+        """Aim heliostats at points, at which they remain aimed; see `PlantController.aim`."""
         ticket = self.plant.aim(person, token, points)
         self._aiming.by_person(ticket.heliostats, aimed=True)
         self._told(person, ticket)
@@ -728,12 +729,12 @@ class Operations:
         return ticket
 
     def emergency(self, person: Person, act: str = "DEFOCUS", reason: str = "") -> EmergencyOrder:
-        """Order a field-wide DEFOCUS or STOW with proof; anyone may order this.
+        """Order a field-wide DEFOCUS or STOW, whose execution is checked; anyone may order this.
 
         Raises
         ------
         InputError
-            Another act.
+            If ``act`` is neither DEFOCUS nor STOW.
         RefusedError
             See `PlantController.raise_emergency`.
         """

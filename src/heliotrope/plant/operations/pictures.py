@@ -25,15 +25,15 @@ from heliotrope.plant.operations.views import CalibrationEntry, CameraView, Pict
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, TargetLight
 
-#: Photographs of one visit that are kept at most: of a long search the last ones.
+#: Maximum number of photographs kept of one visit; of a long search, the last ones.
 _MOST = 24
-#: The same of a coded visit: of a long series, or several, the last ones.
+#: The same for a coded visit; of a long series or of several, the last ones.
 _MOST_CODED = 32
-#: Time between two looks for pictures that are too old, s.
+#: Interval between checks for pictures that are too old, s.
 _THIN_EVERY = 600.0
 _DAY = 86_400.0
 T = TypeVar("T")
-#: A heliostat of a coded visit, whether its beam was proven, its outcome, and that for people.
+#: A heliostat of a coded visit, whether its beam was identified, its outcome, and a text for users.
 _Member = tuple[str, bool, str, str]
 _TABLE = """
 CREATE TABLE IF NOT EXISTS picture (
@@ -47,14 +47,14 @@ CREATE TABLE IF NOT EXISTS party (
     outcome TEXT NOT NULL, text TEXT NOT NULL, PRIMARY KEY (identity, heliostat));
 CREATE INDEX IF NOT EXISTS party_of ON party (heliostat);
 """
-#: Pictures of a heliostat's day but its first one that was used, or else its first.
+#: Pictures of each heliostat and day, except the first used one, or the first if none was used.
 _SPARE = """
 SELECT identity FROM (
     SELECT identity, ROW_NUMBER() OVER (
         PARTITION BY heliostat, CAST(at / 86400 AS INTEGER) ORDER BY used DESC, at) AS place
     FROM picture WHERE at < ?) WHERE place > 1
 """
-#: Those of a heliostat's own visits, and of coded ones.
+#: Pictures of a heliostat's own visits and of coded visits.
 _FOUND = """
 SELECT identity, heliostat, target, at, used, reading, outcome, text FROM picture
 WHERE heliostat = :name
@@ -72,17 +72,17 @@ class PictureSettings:
     Attributes
     ----------
     whole
-        Age up to which every picture is kept, days; after it one a day of each heliostat, and of
-        the joint visits to each target.
+        Age up to which every picture is kept, days; after that, one per day for each heliostat and
+        for the joint visits to each target.
     last
-        Age at which the last ones go, days.
+        Age at which the remaining pictures are removed, days.
     most
-        Size of all pictures, bytes.
+        Maximum size of all pictures, bytes.
 
     Raises
     ------
     InputError
-        An age or a size that is not above 0, or ``whole`` above ``last``.
+        If an age or the size is not above 0, or ``whole`` is above ``last``.
     """
 
     whole: float = 30.0
@@ -110,16 +110,16 @@ class Pictures:
     Parameters
     ----------
     folder
-        Where they lie; it is made if it does not exist.
+        Folder of the pictures; created if it does not exist.
     settings
         See `PictureSettings`.
     disk
-        Runs everything that waits for the folder; None: it runs in the caller.
+        Runs all work that accesses the folder; None: the caller's thread does.
 
     Attributes
     ----------
     problem
-        Why the last picture was not kept, empty if it was.
+        Why the last picture could not be stored, empty if it was stored.
     """
 
     def __init__(
@@ -133,23 +133,23 @@ class Pictures:
         self.problem = ""
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write the pending pictures, and end."""
         self._disk.close()
 
     # -- a visit ---------------------------------------------------------------------------
 
     def begin(self, heliostat: str) -> None:
-        """Begin a visit: photographs of one that ended without a result are forgotten."""
+        """Begin a visit; photographs of an earlier visit without a result are discarded."""
         self._taken.pop(heliostat, None)
 
     def take(self, heliostat: str, view: CameraView, shot: Shot) -> None:
-        """Take a photograph of a visit."""
+        """Accept a photograph of a visit."""
         taken = self._taken.setdefault(heliostat, [])
         taken.append(_Taken(view, shot))
         del taken[:-_MOST]
 
     def conclude(self, entry: CalibrationEntry) -> None:
-        """Keep the photographs of a visit with its result."""
+        """Store the photographs of a visit with its result."""
         taken = self._taken.pop(entry.heliostat, [])
         if taken:
             self._put(taken, entry.heliostat, entry.outcome.name.lower(), entry.text, entry.at)
@@ -159,11 +159,11 @@ class Pictures:
         self._coded.pop(target, None)
 
     def take_coded(self, view: CameraView) -> None:
-        """Take a photograph of a coded visit."""
+        """Accept a photograph of a coded visit."""
         self._coded.setdefault(view.target, deque(maxlen=_MOST_CODED)).append(view)
 
     def conclude_coded(self, target: str, entries: Sequence[CalibrationEntry]) -> None:
-        """Keep the photographs of a coded visit once, with the result of each heliostat."""
+        """Store the photographs of a coded visit once, with the result of each heliostat."""
         views = self._coded.pop(target, None)
         if not views or not entries:
             return
@@ -178,7 +178,7 @@ class Pictures:
         self._put(taken, f"together on {target}", "joint visit", text, entries[-1].at, members)
 
     def keep(self, view: CameraView, shot: Shot, who: str) -> None:
-        """Keep a photograph that a person has asked for, under no heliostat."""
+        """Store a photograph that a user requested, without assigning it to a heliostat."""
         self._put([_Taken(view, shot)], "", "asked for", f"requested by {who}", view.at)
 
     def _put(
@@ -260,7 +260,7 @@ class Pictures:
     def find(
         self, heliostat: str, limit: int, then: Callable[[list[PictureRow] | Exception], None]
     ) -> None:
-        """Call ``then`` with the newest pictures of a heliostat ("": asked for by persons)."""
+        """Call ``then`` with the newest pictures of a heliostat ("": requested by users)."""
 
         def work() -> list[PictureRow]:
             with self._table() as table:
@@ -314,19 +314,19 @@ class PicturesError(HeliotropeError):
 
 
 class KeptCamera:
-    """A camera of targets whose photographs are kept.
+    """A camera of targets whose photographs are stored.
 
     Parameters
     ----------
     camera
-        With the last photograph of each target as its ``view``.
+        Camera that returns the last photograph of each target by ``view``.
     pictures
-        Takes the photographs.
+        Store of the photographs.
     """
 
     def __init__(self, camera: "ViewedCamera", pictures: Pictures) -> None:
         self._camera, self._pictures = camera, pictures
-        #: Versions of the photographs of joint visits that were kept last, by target.
+        #: Version of the last stored photograph of a joint visit, by target.
         self._kept = dict[str, int]()
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
@@ -339,7 +339,7 @@ class KeptCamera:
         return shot
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
-        """Take a photograph of a joint visit, which is kept once it is read."""
+        """Take a photograph of a joint visit, and store it once it is evaluated."""
         before = self._camera.view(target.name).version
         exposed = await self._camera.expose(target, view)
 
@@ -358,5 +358,5 @@ class ViewedCamera(LightCamera, Protocol):
     """A camera of targets that shows the last photograph of each."""
 
     def view(self, target: str) -> CameraView:
-        """Return the last photograph of a target, for people."""
+        """Return the last photograph of a target, for display."""
         ...

@@ -1,10 +1,10 @@
 """The flux that the field is expected to bring to its receivers.
 
-Every mirror stands where its reported step counts place it under its present calibration, so those
-that turn away or rest in stow shade and block as they stand. The light is that of
-`heliotrope.optics.receiver_flux`, and its uncertainty that of `heliotrope.aims.errors` by the
-covariance of each calibration. Both are computed beside the plant's loop (`plant.workers`) when
-somebody asks for them.
+Every mirror is in the pose that its reported step counts yield under its present calibration, so
+heliostats that are turned away or at stow shade and block in those poses.
+`heliotrope.optics.receiver_flux` computes the flux, and `heliotrope.aims.errors` its uncertainty
+from the covariance of each calibration. Both are computed outside the plant's event loop
+(`plant.workers`) on request.
 """
 
 import asyncio
@@ -37,9 +37,9 @@ from heliotrope.plant.operations.views import PredictedView
 from heliotrope.plant.refusals import RefusedError
 from heliotrope.plant.workers import Worker
 
-#: Time for which a prediction is shown, and longest wait for the next one, s.
+#: Time for which a prediction is shown, and longest wait for the next prediction, s.
 EVERY, PATIENCE = 5.0, 5.0
-#: Share of the power that may come from beams of wide errors where cells have an uncertainty.
+#: Largest fraction of the power from beams with large errors for which a cell has an uncertainty.
 WIDE = 0.02
 _LIGHT = FieldOptics()
 
@@ -54,7 +54,7 @@ class PredictedFlux:
     installed
         Expected error of a heliostat that was never calibrated, rad.
     worker
-        Place for the computation.
+        Runs the computation.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class PredictedFlux:
         self._computing: asyncio.Task[None] | None = None
 
     async def everywhere(self) -> dict[str, PredictedView]:
-        """Return the flux on each receiver, by name: the last one known after `PATIENCE`.
+        """Return the flux on each receiver, by name; after `PATIENCE` the last known flux.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class PredictedFlux:
         return self._views
 
     async def aclose(self) -> None:
-        """Give up a running computation."""
+        """Cancel a running computation."""
         if self._computing is not None:
             self._computing.cancel()
             await asyncio.gather(self._computing, return_exceptions=True)
@@ -117,15 +117,16 @@ class PredictedFlux:
         self._made_at = now
 
     def scene(self, now: float) -> Scene:
-        """Return the field as it stands: the mirrors on a receiver shine, the others cast shadows.
+        """Return the field as it stands: heliostats on a receiver bring light, others only shade.
 
-        The irradiance is measured where there is a sensor.
+        The irradiance is the measured one if there is a sensor.
         """
         plant, frame, beams = self._plant, self._viewer.frame(), self._plant.beams
         normal, center = beams.armature.pose(beams.drives.angles(plant.field.posed))
         middle = self._surfaces[0].center
         aims = np.where(np.isfinite(plant.aims).all(axis=-1, keepdims=True), plant.aims, middle)
-        # Two axes of the normal share its variance, and the beam turns by twice the angle.
+        # The variance is divided between two axes of the normal, and the beam rotates by twice the
+        # angle.
         unknown = 2.0 * self._installed**2 * np.eye(2)
         known = np.isfinite(self._book.spread).all(axis=(1, 2), keepdims=True)
         spread = np.where(known, self._book.spread, unknown)
@@ -144,9 +145,9 @@ class PredictedFlux:
 def predicted(scene: Scene, light: FieldOptics) -> list[PredictedView]:
     """Return the expected flux on the surfaces of a scene, with its uncertainty.
 
-    The mirrors' ``pointing`` is the covariance of their errors, which count as independent. Cells
-    have no uncertainty (NaN) where much of the light comes from heliostats whose errors are wider
-    than their images, as those that were never calibrated.
+    The mirrors' ``pointing`` is the covariance of their errors, which are taken to be independent.
+    Cells have no uncertainty (NaN) where much of the light comes from heliostats whose errors are
+    larger than their images, such as uncalibrated heliostats.
     """
     engine = light.engine(scene)
     views = flux_views(engine)
@@ -159,8 +160,8 @@ def _uncertain(view: FluxView, engine: FieldFlux) -> PredictedView:
     if not isinstance(surface, Mesh | Cavity):
         mirrors = engine.scene.mirrors
         count, pointing = len(mirrors), mirrors.pointing
-        # The beam of a wider error than its image is somewhere, as sharp as ever: its power is on
-        # the surface or not, and the derivatives of its blurred image say nothing of a cell.
+        # A beam whose error is larger than its image remains just as sharp: its power is either on
+        # the surface or off it, and the derivatives of a blurred image do not describe any cell.
         image = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
         wide = 0.5 * np.trace(pointing, axis1=1, axis2=2) > image
         alone, together = np.zeros((count, 0, 2)), np.zeros(count, dtype=np.int64)
@@ -191,7 +192,7 @@ def _from_outside(view: PredictedView, receiver: Receiver) -> PredictedView:
 def columns_from_outside(receiver: Receiver, right: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return where a map's columns lie as seen from outside, m, and their order, (W,) each.
 
-    The engine's, ``right``, run clockwise, a full cylinder's from the north.
+    The engine's columns, ``right``, run clockwise; on a full cylinder they start in the north.
     """
     if receiver.kind not in ("external_cylinder", "convex_cylinder"):
         return right, np.arange(len(right))

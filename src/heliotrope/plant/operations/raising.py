@@ -20,12 +20,12 @@ from heliotrope.plant.orders.guards import Asked
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import alarms
 
-#: Time before a heliostat is tried again whose beam has no free path, and one that was refused
-#: for another reason, s.
+#: Time before a heliostat is retried if its beam has no free path, and if it was refused for
+#: another reason, s.
 _BLOCKED, _REFUSED = 300.0, 5.0
-#: Time after which a heliostat that can only go on from stow is sent there, s.
+#: Time after which a heliostat that can only proceed from stow is sent to stow, s.
 _HALTED = 10.0
-#: Heliostats that were lost, or could not go on from where they were, after they had been raised.
+#: Heliostats that were lost, or could not proceed from where they were, after being raised.
 RAISING = RetryLaw(
     "raising",
     5,
@@ -36,7 +36,7 @@ RAISING = RetryLaw(
     memory=1800.0,
     alarm=alarms.RAISING_GIVEN_UP,
 )
-#: Heliostats that are asked in one step whether they may be given a command.
+#: Number of heliostats per step for which the guards of a command are evaluated.
 ASKED = 1000
 #: The next command of a heliostat on its way to the receiver, by its state.
 _NEXT = {states.STOWED: "APPROACH", states.DEFOCUSED: "IDLE", states.IDLE: "TRACK"}
@@ -46,7 +46,7 @@ Mask = npt.NDArray[np.bool_]
 
 
 class Raising:
-    """The way of wanted heliostats to the receiver, a few at a time.
+    """Raises wanted heliostats to the receiver, a few at a time.
 
     An uncalibrated beam goes to the receiver only if it would miss every target by a wide margin.
 
@@ -57,9 +57,9 @@ class Raising:
     person
         The person under whose name it commands.
     most
-        Heliostats that leave stow, or go to the receiver, at a time.
+        Number of heliostats that leave stow, or go to the receiver, at a time.
     patience
-        Time before the same command is given again, s.
+        Time before the same command is repeated, s.
     clearance
         Tracking error with which an uncalibrated beam must still miss all targets, rad.
     wanted
@@ -73,9 +73,10 @@ class Raising:
     wanted
         Which heliostats automatic control may move, (N,).
     left
-        Those that an emergency has taken out of it, (N,): they wait for a person's Resume.
+        Heliostats that an emergency removed from automatic control, (N,): they wait for an
+        operator's Resume.
     attempts
-        Heliostats that were raised in vain.
+        Failed attempts to raise heliostats.
     """
 
     def __init__(
@@ -98,12 +99,12 @@ class Raising:
         self._busy_until = np.full(count, -math.inf)
         self._told_in = np.full(count, -1, dtype=np.int16)
         self._halted_at = np.full(count, math.inf)
-        #: The row to ask first for each command.
+        #: The row at which checks start for each command.
         self._next: dict[str, int] = {}
         #: Why beams have no free path, by heliostat.
         self._blocked: dict[str, str] = {}
         self.attempts = Attempts(RAISING, log.take_alarm)
-        self._joins: list[Ticket] = []  # some of their heliostats still wait for their turn
+        self._joins: list[Ticket] = []  # tickets whose heliostats partly still wait for their turn
         limited = plant.design.aims.limit is not None
         designed = plant.default_aims() if plant.design.receivers else {}
         self.aims: dict[str, FloatArray] = {} if limited else dict(designed)
@@ -118,9 +119,10 @@ class Raising:
         self._clear = self._clear_of_targets(clearance, designed, room)
 
     def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
-        """Give heliostats to automatic control, or take them out of it.
+        """Put heliostats under automatic control, or remove them.
 
-        With ``by_person`` a person raises them: once lost, they are left to people.
+        With ``by_person`` an operator raises them; if lost afterwards, they are left to the
+        operators.
         """
         rows = [self._plant.field.place(name) for name in heliostats]
         self._by_people[rows] = by_person & (self._by_people[rows] | ~self.wanted[rows])
@@ -130,7 +132,7 @@ class Raising:
             self.attempts.done(name)
 
     def lose(self, lost: Mask) -> None:
-        """Leave lost heliostats (N,) that people had raised to people."""
+        """Leave lost heliostats (N,) that operators had raised to the operators."""
         self.wanted &= ~(lost & self._by_people)
         self._failed(np.flatnonzero(lost & self.wanted), "left the receiver without an order")
 
@@ -156,7 +158,7 @@ class Raising:
         return None
 
     def waits(self, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return the wanted heliostats that wait for more than their turn, and for what."""
+        """Return what wanted heliostats wait for, if it is not only their turn."""
         plant = self._plant
         found = plant.guards.reasons(Asked("APPROACH", tuple(heliostats)), refusals.NOT_NOW)
         asked = np.zeros(len(plant.field), dtype=np.bool_)
@@ -176,9 +178,9 @@ class Raising:
         return known
 
     def _asked(self, command: str, rows: Rows) -> Asked:
-        """Return a command to the heliostats of some rows (K,), as guards are asked about it.
+        """Return a command to the heliostats of some rows (K,), in the form that guards check.
 
-        Whether their paths are free is shown by the command.
+        Only the command itself shows whether their paths are free.
         """
         names = tuple(self._names[row] for row in rows)
         aims = [self.aims[name] for name in names] if command == "TRACK" else []
@@ -187,7 +189,8 @@ class Raising:
     def _first(self, command: str, rows: Rows) -> Rows:
         """Return the first rows (K,) of heliostats that may be given a command.
 
-        At most `ASKED` are asked; if all of them are blocked, the next step asks those after them.
+        At most `ASKED` are checked; if all of them are blocked, the next step checks the heliostats
+        after them.
         """
         asked = np.roll(rows, -int(np.searchsorted(rows, self._next.get(command, 0))))[:ASKED]
         blocked = self._plant.guards.reasons(self._asked(command, asked))
@@ -196,12 +199,12 @@ class Raising:
         return np.array(free[: self._most], dtype=np.intp)
 
     def give_up(self) -> None:
-        """Take all heliostats out of automatic control, until a person resumes."""
+        """Remove all heliostats from automatic control, until an operator resumes."""
         self.left |= self.wanted
         self.wanted[:] = False
 
     def resume(self) -> int:
-        """Take back the heliostats that an emergency has taken out; return their number."""
+        """Take back the heliostats that an emergency has removed; return their number."""
         names = [self._names[row] for row in np.flatnonzero(self.left)]
         self.want(names, wanted=True)
         return len(names)
@@ -225,23 +228,23 @@ class Raising:
         room = np.full(len(points), math.inf)
         for middle, reach in self._targets:
             room = np.minimum(room, np.linalg.norm(points - middle, axis=-1) - reach - about)
-        # The beam is off by twice as much as the normal; that error is two-dimensional.
+        # The beam error is twice that of the normal, which is two-dimensional.
         return np.asarray(math.sqrt(2.0) * clearance * slant < room)
 
     def _on_targets(self, points: FloatArray) -> Mask:
-        """Return a mask of the points (N, 3) on a target: a person has ended the visit there."""
+        """Return a mask of the points (N, 3) on a target, where an operator has ended the visit."""
         found = np.zeros(len(points), dtype=np.bool_)
         for middle, reach in self._targets:
             found |= np.linalg.norm(points - middle, axis=-1) <= reach
         return found
 
     def stuck(self, visiting: Collection[str], resting: Mask) -> Rows:
-        """Return the rows of wanted heliostats that only the way from stow brings on.
+        """Return the rows of wanted heliostats that can proceed only by way of stow.
 
-        A heliostat that has not come to standby by that way since it booted, or since it was at
-        stow, refuses to track; one that stores other parameters than the wanted ones may not move,
-        and they are written at stow; the path back to standby of one that defocused may be blocked.
-        Those that recover by themselves are given a while.
+        A heliostat refuses to track unless it has reached standby from stow since its last boot or
+        stow. A heliostat that stores parameters other than the desired ones may not move, and
+        parameters are written at stow. After a DEFOCUS, the path back to standby may be blocked.
+        Heliostats are given some time to recover by themselves.
         """
         plant, now = self._plant, self._plant.now()
         field = plant.field
@@ -264,14 +267,14 @@ class Raising:
         return found
 
     async def step(self, token: int, visiting: Callable[[], frozenset[str]], resting: Mask) -> None:
-        """Give the commands that may be given now.
+        """Issue the commands that may be issued now.
 
         Parameters
         ----------
         token
             Token of the command authority.
         visiting
-            Returns the heliostats that visit targets now.
+            Returns the heliostats in calibration visits now.
         resting
             Heliostats that are left where they are, (N,).
         """
@@ -280,7 +283,8 @@ class Raising:
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
         free = self.wanted & ~busy & ~resting
         free[[plant.field.place(name) for name in visiting()]] = False
-        # One that may not move now, as in a cluster with a wrong clock, keeps no other waiting.
+        # A heliostat that may not move now, as in a cluster with a wrong clock, does not delay
+        # others.
         unknown = plant.standby_unknown & plant.field.among((states.STOWED,), now)
         if len(rows := self._first("STANDBY", np.flatnonzero(free & unknown))):
             await self._rest_again(rows, token)
@@ -300,7 +304,7 @@ class Raising:
             await self._join(rows, token, visiting)
 
     async def _rest_again(self, rows: Rows, token: int) -> None:
-        """Give heliostats at stow their standby points, since they may have any."""
+        """Send heliostats at stow their standby points, because those they store are unknown."""
         plant = self._plant
         points = {plant.field.names[row]: plant.standbys[row].copy() for row in rows}
         given = self._give(
@@ -315,7 +319,7 @@ class Raising:
                 self.release(name)
 
     async def _join(self, rows: Rows, token: int, visiting: Callable[[], frozenset[str]]) -> None:
-        """Give heliostats their aims on the receiver, and send them there."""
+        """Assign heliostats their aims on the receiver, and send them there."""
         plant, aims = self._plant, dict(self.aims)
         given = self._give(
             rows,
@@ -326,7 +330,8 @@ class Raising:
             return
         names, ticket = given
         await ticket.end(10.0)
-        # Meanwhile a visit may have begun, whose aim must stay, or a person may have stowed one.
+        # By now a calibration visit may have begun, whose aim must stay, or an operator may have
+        # stowed a heliostat.
         away, place = visiting() | ticket.refusals.keys(), plant.field.place
         done = tuple(
             name
@@ -339,7 +344,7 @@ class Raising:
     def _give(
         self, rows: Rows, state: int, give: Callable[[tuple[str, ...]], Ticket]
     ) -> tuple[tuple[str, ...], Ticket] | None:
-        """Give a command to the heliostats whose beams have a clear way; the others wait."""
+        """Issue a command to the heliostats whose beams have a clear path; the others wait."""
         names = tuple(self._plant.field.names[row] for row in rows)
         while names:
             try:
@@ -348,7 +353,8 @@ class Raising:
                 wrong = error.refusals
             else:
                 told = [self._plant.field.place(name) for name in names]
-                # They get no further command until their state changes or patience ends.
+                # They receive no further command until their state changes or the patience has
+                # elapsed.
                 self._busy_until[told] = self._plant.now() + self._patience
                 self._told_in[told] = state
                 self._block(ticket.blocked, state)
@@ -358,7 +364,7 @@ class Raising:
         return None
 
     def _block(self, wrong: Mapping[str, str], state: int) -> None:
-        """Leave heliostats without a free path for a while, and try others again soon."""
+        """Postpone heliostats without a free path; retry other refused heliostats soon."""
         for name, text in wrong.items():
             row, blocked = self._plant.field.place(name), isinstance(text, refusals.NoFreePath)
             self._busy_until[row] = self._plant.now() + (_BLOCKED if blocked else _REFUSED)
@@ -368,7 +374,7 @@ class Raising:
                 self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
 
     def _look_at_blocked(self) -> None:
-        """Raise alarms of beams that were blocked when their turn came; end those that are over."""
+        """Raise alarms about beams blocked when their turn came; clear obsolete alarms."""
         for ticket in [ticket for ticket in self._joins if ticket.finished]:
             self._joins.remove(ticket)
             self._block(ticket.blocked, states.IDLE)

@@ -1,4 +1,4 @@
-"""The shift report: what a plant produced in a time span, what was missing, and what people did."""
+"""The shift report: production, unavailable heliostats and operators' work in a time span."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -21,13 +21,13 @@ from heliotrope.store.records import (
     VisitEntry,
 )
 
-#: Longest time of a report, and the one that is taken without a beginning, s.
+#: Longest time span of a report, and the default if no start is specified, s.
 LONGEST, SHIFT = 31 * 86_400.0, 8 * 3600.0
-#: Most rows of each list of a report, and points of a curve.
+#: Maximum number of rows in each list of a report, and of points of a curve.
 MOST, POINTS = 500, 400
-#: A row of figures stands until the next one, at most this long, s.
+#: A record of figures is valid until the next one, at most for this time, s.
 _STANDS = 1.5 * EVERY
-#: Why a heliostat is not available, by the figure that counts it.
+#: Why heliostats are not available, by the name of the figure that counts them.
 LACKS = {
     "faulty": "fault or no parameters",
     "unheard": "not heard",
@@ -37,7 +37,7 @@ LACKS = {
 
 @dataclass(frozen=True)
 class Production:
-    """What a receiver got by prediction: energy (J), largest power (W) and when (POSIX s)."""
+    """Predicted production of a receiver: energy (J), peak power (W) and its time (POSIX s)."""
 
     receiver: str
     energy: float
@@ -57,38 +57,38 @@ class FieldErrors:
 
 @dataclass(frozen=True)
 class ShiftReport:
-    """The report of a time.
+    """The report for a time span.
 
     Attributes
     ----------
     plant, since, until, made
-        Name of the plant, the time, and when this was made, POSIX s.
+        Name of the plant, the time span, and when this report was made, POSIX s.
     recorded
-        Time within it for which figures are kept, s.
+        Part of the time span for which figures are stored, s.
     production
         Predicted energy into each receiver.
     sunshine
         Direct sunlight, J/m²; NaN without a sensor.
     daylight
-        Time with the sun above the horizon, s.
+        Time for which the sun is above the horizon, s.
     availability
-        Share of the heliostats that were available, over the daylight; NaN without.
+        Fraction of the heliostats that were available during daylight; NaN without daylight.
     lacks
-        Heliostats that were not, s of daylight summed over them, by reason.
+        Unavailable time in daylight, summed over heliostats, s, by reason.
     errors
-        Predicted errors of the field at the beginning and the end; () where none is kept.
+        Predicted errors of the field at the start and the end; () if none are stored.
     outcomes
         Number of visits by outcome.
     failed
         Visits without a new calibration, the latest first.
     alarms
-        Alarms active within the time, the latest first.
+        Alarms active within the time span, the latest first.
     locks
-        Locks that stand now.
+        Locks in force now.
     work, notes
-        What persons ordered, and what they noted, oldest first.
+        Orders and notes of operators, oldest first.
     power
-        Curve of the power into all receivers: POSIX s and W.
+        Curve of the total power into all receivers: POSIX s and W.
     """
 
     plant: str
@@ -112,12 +112,12 @@ class ShiftReport:
 
 
 def period(since: float, until: float, now: float) -> tuple[float, float]:
-    """Return the time of a report, POSIX s; 0 means now, or one shift before the end.
+    """Return the time span of a report, POSIX s; 0 means now, or one shift before the end.
 
     Raises
     ------
     InputError
-        A time that ends before it begins, or is longer than a month.
+        If the time span ends before it begins, or is longer than a month.
     """
     until = min(until or now, now)
     since = since or until - SHIFT
@@ -132,7 +132,7 @@ def period(since: float, until: float, now: float) -> tuple[float, float]:
 def report(
     plant: str, records: Records, since: float, until: float, now: float, automatic: str
 ) -> ShiftReport:
-    """Return the report of a time; see `period`.
+    """Return the report for a time span; see `period`.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def report(
     since, until, now
         POSIX s.
     automatic
-        The name of automatic control, whose work no person did.
+        Name of automatic control, whose orders are not listed as work of operators.
     """
     rows = records.figures(since, until)
     lasted = _lasted(rows, until)
@@ -175,18 +175,18 @@ def report(
 
 
 def _lasted(rows: Sequence[PlantFigures], until: float) -> FloatArray:
-    """Return how long each row of figures stands, s, (R,)."""
+    """Return for how long each record of figures is valid, s, (R,)."""
     times = [*(row.at for row in rows), until]
     return np.array([min(b - a, _STANDS) for a, b in pairwise(times)])
 
 
 def _of(rows: Sequence[PlantFigures], name: str) -> FloatArray:
-    """Return a figure in each row, (R,); NaN where it is not known."""
+    """Return a figure from each record, (R,); NaN where it is unknown."""
     return np.array([row.values.get(name, np.nan) for row in rows])
 
 
 def _integral(values: FloatArray, lasted: FloatArray) -> float:
-    """Return the integral over time where a figure is known; NaN where it never is."""
+    """Return the integral of a figure over the time in which it is known; NaN if it never is."""
     known = np.isfinite(values)
     return float((values[known] * lasted[known]).sum()) if known.any() else float("nan")
 
@@ -208,7 +208,7 @@ def _production(rows: Sequence[PlantFigures], lasted: FloatArray, receiver: str)
 
 
 def _availability(rows: Sequence[PlantFigures], day: FloatArray) -> float:
-    """Return the share of heliostats that were available, over the daylight."""
+    """Return the fraction of heliostats that were available during daylight."""
     able = _of(rows, "available")
     count = able + sum(_of(rows, name) for name in LACKS)
     whole = _integral(count, day)

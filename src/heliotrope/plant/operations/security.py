@@ -1,8 +1,8 @@
 """Security events of a plant: recorded as events, forwarded, and monitored for patterns.
 
-Anyone can cause any number of some kinds of event, so events of one kind and person are recorded at
-most `MOST` times in a `SPAN`; the rest are counted, and one event states the count. The events of
-one person never displace those of another.
+Anyone can cause any number of events of some kinds. Events of one kind and user are therefore
+recorded at most `MOST` times in a `SPAN`; the rest are counted, and one event states the count. The
+events of one user never displace those of another.
 """
 
 from collections import deque
@@ -14,15 +14,15 @@ from heliotrope.links.clock import Clock
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.safety import AlarmKind, Severity, alarms
 
-#: Kind of these events in the store and in the page.
+#: Kind of these events in the store and on the page.
 KIND = "security"
-#: Most events of one kind and person that are recorded singly in a span.
+#: Maximum number of events of one kind and user that are recorded individually in a span.
 MOST = 30
-#: The same of all users together.
+#: The same for all users together.
 MOST_OF_ALL = 300
-#: That span, s.
+#: Length of a span, s.
 SPAN = 60.0
-#: Refused orders within a span, s, that raise an alarm.
+#: Number of refused orders that raise an alarm, and the span in which they count, s.
 ORDERS, ORDERS_SPAN = 5, 300.0
 #: An alarm ends after this time without a cause, s.
 QUIET = 600.0
@@ -95,13 +95,13 @@ class _Span:
 
 
 class EventCounter:
-    """Says which security events are recorded singly, and counts the others by kind and person."""
+    """Decides which security events are recorded individually; counts the rest by kind and user."""
 
     def __init__(self) -> None:
         self._spans: dict[tuple[SecurityEvent, str | None], _Span] = {}
 
     def admits(self, kind: SecurityEvent, who: str, now: float, count: int = 1) -> bool:
-        """Whether an event, or a sum of ``count``, is recorded by itself; if not, it is counted."""
+        """Whether an event, or a total of ``count``, is recorded individually and not counted."""
         person, everybody = self._span((kind, who), now), self._span((kind, None), now)
         if person.recorded < MOST and everybody.recorded < MOST_OF_ALL:
             person.recorded += 1
@@ -111,11 +111,11 @@ class EventCounter:
         return False
 
     def count(self, kind: SecurityEvent, who: str, now: float, count: int) -> None:
-        """Count events for the sum of their kind and person."""
+        """Add events to the total of their kind and user."""
         self._span((kind, who), now).more += count
 
     def sums(self, now: float, *, all_: bool = False) -> list[tuple[SecurityEvent, str, int]]:
-        """Return kind, person and number of the events counted in spans that are over, or all."""
+        """Return kind, user and number of the events counted in expired spans, or in all spans."""
         over = [key for key, span in self._spans.items() if all_ or now - span.begun >= SPAN]
         spans = [(*key, self._spans.pop(key).more) for key in over]
         return [(kind, who, more) for kind, who, more in spans if who is not None and more]
@@ -133,14 +133,14 @@ class SecurityLog:
     Parameters
     ----------
     logbook
-        Logbook that takes events and alarms.
+        Logbook of events and alarms.
     clock
         Clock of the plant.
 
     Attributes
     ----------
     forward
-        Function that takes each note that is recorded; None: no function.
+        Function called with each recorded note; None: no function.
     """
 
     def __init__(self, logbook: Logbook, clock: Clock) -> None:
@@ -169,7 +169,7 @@ class SecurityLog:
             self._record(made)
 
     def close(self) -> None:
-        """Record how many events were counted so far."""
+        """Record the totals of events counted so far."""
         self._sum_up(all_=True)
 
     def _sum_up(self, *, all_: bool = False) -> None:
@@ -215,6 +215,6 @@ def _sum_of(more: int) -> str:
 
 
 def plain(text: str) -> str:
-    """Return a stranger's text as one line of bounded length."""
+    """Return an untrusted text as one printable line of bounded length."""
     shown = "".join(c if c.isprintable() else "?" for c in text)
     return shown if len(shown) <= _LONGEST else shown[: _LONGEST - 1] + "…"

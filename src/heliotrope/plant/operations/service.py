@@ -20,7 +20,7 @@ from heliotrope.store.records import Kind, Lockout
 
 #: What is locked: its kind and name.
 Place = tuple[Kind, str]
-#: Orders to stow, until a heliostat out of service is seen there.
+#: Orders to stow, repeated until a heliostat out of service reports stow.
 PARKING = RetryLaw(
     "stow of a heliostat out of service",
     30,
@@ -33,14 +33,14 @@ PARKING = RetryLaw(
 
 
 class Service:
-    """Persons' locks, and the heliostats that are in stow because of them.
+    """Personal locks, and the heliostats that are at stow because of them.
 
     Parameters
     ----------
     plant
         The controller, which refuses their motion.
     keeping
-        Keeps them over a restart.
+        Stores the locks, so that they survive a restart.
     tell
         Called with each alarm.
 
@@ -55,8 +55,8 @@ class Service:
     ) -> None:
         self._plant, self._keeping, self.attempts = plant, keeping, Attempts(PARKING, tell)
         plant.lockouts.put(keeping.lockouts())
-        #: What is locked, by heliostat that it has sent to stow and that was not seen there yet.
-        #: Their aims do not show it: a visit that ends gives others back.
+        #: Locked places, by the heliostat that the lock has sent to stow and that has not reported
+        #: stow yet. Aims do not show this, because the end of a visit restores other aims.
         self._unparked: dict[str, frozenset[Place]] = {}
         self._send_off(plant.lockouts)
 
@@ -66,9 +66,10 @@ class Service:
         return tuple(self._plant.lockouts)
 
     def rows(self) -> npt.NDArray[np.bool_]:
-        """Return a mask of the heliostats that persons' locks keep in stow, or sent there, (N,).
+        """Return a mask of the heliostats that personal locks keep at stow or sent to stow, (N,).
 
-        They are locked themselves, their beams are aimed at something that is, or the tower is.
+        The heliostats are locked themselves, their beams are aimed at a locked object, or the tower
+        is locked.
         """
         locks, field = self._plant.lockouts, self._plant.field
         found = np.full(len(field), bool(locks.on(Kind.TOWER, TOWER)))
@@ -78,7 +79,7 @@ class Service:
         return found
 
     def closed(self, target: str) -> str | None:
-        """Return the reason why no beam may be sent to a target, None if one may."""
+        """Return the reason why no beam may be sent to a target, None if beams may."""
         locks = self._plant.lockouts
         return locks.text(Kind.TARGET, target) or locks.text(Kind.TOWER, TOWER) or None
 
@@ -102,7 +103,7 @@ class Service:
         return concerned
 
     def _send_off(self, locks: Iterable[Lockout]) -> tuple[str, ...]:
-        """Note the heliostats that must go to stow under some locks, and return them."""
+        """Record the heliostats that must go to stow under some locks, and return them."""
         field, found = self._plant.field, np.zeros(len(self._plant.field), dtype=np.bool_)
         for lock in locks:
             rows = self._under(lock)
@@ -113,7 +114,7 @@ class Service:
         return tuple(field.names[row] for row in np.flatnonzero(found))
 
     def _under(self, lock: Lockout) -> npt.NDArray[np.bool_]:
-        """Return a mask of the heliostats that must be in stow under one lock now, (N,)."""
+        """Return a mask of the heliostats that must be at stow under one lock now, (N,)."""
         field, found = self._plant.field, np.zeros(len(self._plant.field), dtype=np.bool_)
         if lock.kind is Kind.HELIOSTAT:
             found[field.place(lock.name)] = True
@@ -150,14 +151,16 @@ class Service:
         return tuple(removed)
 
     def park(self) -> None:
-        """Send heliostats to stow that were taken out and have not been seen there yet.
+        """Stow heliostats that were taken out of service and have not reported stow yet.
 
-        Once a heliostat was seen in stow, nothing is sent to it again: somebody may be at it.
+        Once a heliostat has reported stow, no order is sent to it again, because someone may be
+        working on it.
         """
         field, now = self._plant.field, self._plant.now()
         if not self._unparked:
             return
-        # A status from before an order says nothing: it may have been on its way from stow.
+        # A status from before the order does not count, because the heliostat may have been leaving
+        # stow.
         there = field.among((states.STOWED,), now) & self._plant.ledger.reported()
         for name in [name for name in self._unparked if there[field.place(name)]]:
             self._done(name)
@@ -169,19 +172,19 @@ class Service:
             self.attempts.failed(name, field.of(name, now).condition, now)
 
     def _done(self, name: str) -> None:
-        """Note that a heliostat need not go to stow any more."""
+        """Record that a heliostat no longer needs to go to stow."""
         del self._unparked[name]
         self.attempts.done(name)
 
     def _stow(self, who: str, heliostats: Sequence[str]) -> None:
-        """Send heliostats to stow; each is checked again after a while."""
+        """Send heliostats to stow; each is checked again later."""
         now = self._plant.now()
         self._plant.stow(who, heliostats)
         for name in heliostats:
             self.attempts.failed(name, self._plant.field.of(name, now).condition, now)
 
     def progress(self, places: Sequence[Place], heliostats: Sequence[str]) -> Mapping[str, Step]:
-        """Return how far heliostats are on their way to stow, where they are sent by locks.
+        """Return the progress of heliostats that locks send to stow.
 
         Parameters
         ----------

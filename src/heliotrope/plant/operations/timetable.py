@@ -1,8 +1,8 @@
 """The timetable of a running plant: calibrations requested at times of day or at intervals.
 
-An entry that is due requests its heliostats as an operator does, so they come before all that the
-schedule would choose. The timetable in the plant file is in force until an operator activates
-another one, which survives a restart.
+When an entry is due, it requests its heliostats as an operator would, so they precede all
+heliostats that the schedule would choose. The timetable in the plant file is in force until an
+operator activates another one, which survives a restart.
 """
 
 import json
@@ -22,13 +22,13 @@ from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.refusals import by_reason
 from heliotrope.store.records import TimetableRecord
 
-#: Asks for the calibration of a heliostat on a target, "" for any.
+#: Function that requests the calibration of a heliostat on a target, "" for any.
 Ask = Callable[[str, str], None]
 
 
 @dataclass
 class _Turn:
-    """The last time that an entry was due, POSIX s, and what came of it."""
+    """The last time that an entry was due, POSIX s, and its outcome."""
 
     at: float = float("nan")
     text: str = ""
@@ -40,11 +40,11 @@ class Timetable:
     Parameters
     ----------
     plant
-        Gives the time and the names.
+        Supplies the time and the names.
     log
-        Takes events.
+        Logbook for events.
     keeping
-        Keeps the timetables of persons.
+        Stores the timetables of operators.
     """
 
     def __init__(self, plant: PlantController, log: Logbook, keeping: Keeping) -> None:
@@ -54,7 +54,7 @@ class Timetable:
         self._looked = self._now()
 
     def recall(self) -> None:
-        """Restore the timetable that a person had put in force before a restart."""
+        """Restore the timetable that an operator had put in force before a restart."""
         kept = self._keeping.timetable()
         if kept is None or not kept.document:
             return
@@ -78,7 +78,7 @@ class Timetable:
         RefusedError
             If the person is a viewer.
         InputError, UnknownNameError
-            If it cannot be, or names what the plant does not have.
+            If the timetable is invalid, or names something that the plant does not have.
         """
         person.must_be(Role.OPERATOR, "timetable")
         made = self._plant.design.timetable if entries is None else tuple(entries)
@@ -92,7 +92,7 @@ class Timetable:
         self._plant.note(person, "TIMETABLE", f"{names}{origin}")
 
     def step(self, ask: Ask) -> None:
-        """Ask for the heliostats of the entries that have come due since the last step."""
+        """Request the heliostats of the entries that have come due since the last step."""
         since, self._looked = self._looked, self._now()
         for entry in self._entries:
             if entry.due(since, self._looked):
@@ -135,7 +135,7 @@ class Timetable:
         text = f"requested {asked} of {len(entry.heliostats)} heliostats"
         text += f"; not {by_reason(refused)}" if refused else ""
         before = self._turns.get(entry.name, _Turn())
-        # By night each turn ends alike, and one event says so.
+        # At night every occurrence of an entry ends the same way, so one event is enough.
         if text != before.text:
             about = entry.heliostats
             self._log.event("calibration", entry.name, f"timetable: {text}", heliostats=about)

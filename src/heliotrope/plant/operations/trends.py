@@ -12,23 +12,23 @@ from heliotrope.geometry import FloatArray
 from heliotrope.plant.operations.history import UNITS
 from heliotrope.store.records import Records, VisitEntry
 
-#: Longest time of a trend, s.
+#: Longest time span of a trend, s.
 LONGEST = 400 * 86_400.0
-#: Units of what the archive of telemetry has of each heliostat.
+#: Units of the quantities in the telemetry archive of each heliostat.
 TELEMETRY = {"primary": "steps", "secondary": "steps", "age": "s", "fault": ""}
-#: What a visit leaves of its heliostat.
+#: Quantities of a heliostat that each calibration visit records.
 VISITS: dict[str, Callable[[VisitEntry], float]] = {
     "error_before": lambda visit: visit.error_before,
     "error_after": lambda visit: visit.error_after,
     "sigma_after": lambda visit: visit.sigma_after,
 }
-#: Names of the figures that are listed are those kept lately, s.
+#: The names listed are those of figures stored within this time, s.
 _LATELY = 86_400.0
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that has a trend: its name, its unit, and whether it is one of each heliostat."""
+    """A quantity that has a trend: its name, its unit, and whether each heliostat has its own."""
 
     name: str
     unit: str
@@ -42,11 +42,11 @@ class Trend:
     Attributes
     ----------
     quantity, unit, heliostat
-        Its name and unit, and the heliostat; "": of the plant.
+        Name and unit of the quantity, and the heliostat; "": the plant.
     at
         Middle of each interval with values, POSIX s, (K,).
     low, mean, high
-        Least, mean and largest value in it, (K,).
+        Minimum, mean and maximum in each interval, (K,).
     """
 
     quantity: str
@@ -81,23 +81,23 @@ def trend(
     until: float,
     points: int,
 ) -> Trend:
-    """Return a quantity over a time.
+    """Return a quantity over a time span.
 
     Parameters
     ----------
     records, archive
         The store, and the folder of the telemetry; None: there is none.
     quantity, heliostat
-        Its name, and the heliostat; "": of the plant.
+        Name of the quantity, and the heliostat; "": the plant.
     since, until
         POSIX s.
     points
-        Most points.
+        Maximum number of points.
 
     Raises
     ------
     InputError
-        A time that is none, or telemetry where none is kept.
+        If the time span is invalid, or telemetry is requested where none is archived.
     UnknownNameError
         If there is no such quantity.
     """
@@ -128,7 +128,7 @@ def trend(
 def thinned(
     at: FloatArray, values: FloatArray, since: float, until: float, points: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return times, and least, mean and largest values in equal intervals that have some, (K,)."""
+    """Return times, minima, means and maxima of the equal intervals that contain values, (K,)."""
     known = np.isfinite(values)
     at, values = at[known], values[known]
     if len(at) <= points:

@@ -31,9 +31,9 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
 
-#: Wait for the answer of a local controller, s.
+#: Longest wait for the reply of a local controller, s.
 _PATIENCE = 5.0
-#: Questions of a person to local controllers: 1/s, and at once.
+#: Queries of one user to local controllers: rate, 1/s, and burst.
 ASKED = (0.2, 5.0)
 
 
@@ -72,7 +72,7 @@ class ParametersView:
     stored
         Whether the local controller stores what is in use, in words.
     parameters
-        Each one.
+        Each parameter.
     earlier
         Versions before the one in use, newest first.
     approval
@@ -89,14 +89,15 @@ class ParametersView:
 
 @dataclass(frozen=True)
 class PreparedChange:
-    """Credible other parameters of a heliostat, ready to be written.
+    """Checked new parameters of a heliostat, ready to be written.
 
     Attributes
     ----------
     record
-        The calibration with them; time, person and version are those of the writing.
+        The calibration with the new parameters; time, person and version are set when it is
+        written.
     items
-        What changes on the board, bytes by item.
+        Items that change on the board, with their bytes.
     shown, reason
         The change in words, and the author's reason.
     """
@@ -116,12 +117,12 @@ class SecondPerson:
 
     @property
     def text(self) -> str:
-        """Both, for audit and event."""
+        """Both names, for the audit log and the event."""
         return f"requested by {self.author}, approved by {self.approver}"
 
 
 class TypedParameters:
-    """Parameters of heliostats, for people.
+    """Parameters of heliostats, for operators.
 
     Parameters
     ----------
@@ -148,8 +149,9 @@ class TypedParameters:
     async def view(self, heliostat: str, who: Person) -> ParametersView:
         """Return the parameters of a heliostat, and what its local controller stores.
 
-        An operator asks the local controller, at most as often as `ASKED` says, since one question
-        is some twenty messages on the bus. Everybody else gets the plant's own last comparison.
+        For an operator the local controller is queried, at most as often as `ASKED` allows, since
+        one query takes some twenty messages on the bus. Other users see the plant's last
+        comparison.
         """
         record, group = self._plant.beliefs.record(heliostat), self._plant.design.find(heliostat)[0]
         stored = await self._stored(heliostat, who)
@@ -220,9 +222,10 @@ class TypedParameters:
     def beam_change(
         self, heliostat: str, first: Mapping[str, float], second: Mapping[str, float]
     ) -> tuple[float, float]:
-        """Return by how far a beam moves at its aim from one set of parameters to another, m.
+        """Return how far a beam moves at its aim between two sets of parameters, m.
 
-        RMS and largest over the suns of this day; NaN where it tracks none. See `beam_change`.
+        RMS and maximum over the sun positions of this day; NaN if it can track none. See
+        `beam_change`.
         """
         nominal = self._plant.beliefs.nominal(heliostat)
         machines = [nominal.with_parameters(each) for each in (first, second)]
@@ -275,7 +278,7 @@ class TypedParameters:
         values: Mapping[str, float],
         reason: str,
     ) -> Ticket:
-        """Set parameters of one heliostat that is where they may be written.
+        """Set parameters of one heliostat that is in a pose in which they may be written.
 
         Parameters
         ----------
@@ -296,7 +299,7 @@ class TypedParameters:
     async def restore(
         self, person: Person, token: int, heliostat: str, version: int, reason: str
     ) -> Ticket:
-        """Bring back an earlier version of a heliostat's parameters; see `change`."""
+        """Restore an earlier version of a heliostat's parameters; see `change`."""
         return self.write(person, token, await self.prepare_version(heliostat, version, reason))
 
     def prepare(self, heliostat: str, values: Mapping[str, float], reason: str) -> PreparedChange:
@@ -305,14 +308,14 @@ class TypedParameters:
         Parameters
         ----------
         heliostat, values
-            Name, and the new values by parameter, rad, m or 1; the others stay.
+            Name, and the new values by parameter, rad, m or 1; other parameters stay the same.
         reason
-            Kept with the version and in the audit.
+            Stored with the version and in the audit log.
 
         Raises
         ------
         InputError
-            Values that are not credible, no reason, or nothing that changes.
+            If values are implausible, the reason is missing, or nothing changes.
         UnknownNameError
             If there is no such heliostat or parameter.
         """
@@ -352,7 +355,7 @@ class TypedParameters:
         values: Mapping[str, float],
         typed: Collection[str],
     ) -> HeliostatCalibration:
-        """Return a record of values; those typed are as uncertain as those of an installation."""
+        """Return a record of values; typed values have the uncertainty of a new installation."""
         last, names = self._plant.beliefs.record(heliostat), tuple(values)
         prior = np.array([mechanism.parameter(name).prior for name in names])
         covariance = np.diag(prior**2)
@@ -388,7 +391,7 @@ class TypedParameters:
     ) -> Ticket:
         """Write a change to the heliostat's board; see `change`.
 
-        With ``second``, version, audit and event name its author and who approved it.
+        With ``second``, the version, the audit log and the event name the author and the approver.
         """
         name, approved = change.record.heliostat, "" if second is None else f"; {second.text}"
         last = self._plant.beliefs.record(name)

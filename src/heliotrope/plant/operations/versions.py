@@ -11,7 +11,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.sun import Site
 
-#: Suns of a day at which beams are compared: time between them, s, and lowest elevation, rad.
+#: Sun positions of a day for comparing beams: interval, s, and lowest elevation, rad.
 _STEP, _LOWEST = 1800.0, np.radians(10.0)
 _DAY = 86_400.0
 
@@ -54,8 +54,9 @@ class ParameterComparison:
     parameters
         Each parameter in both.
     beam_rms, beam_most
-        Change of the beam at its aim, m, RMS and largest over the suns of this day above 10°: what
-        the first brings to its aim misses it by that under the second. NaN where it tracks none.
+        How far a beam that the first version puts on its aim misses the aim under the second
+        version, m: RMS and maximum over this day's sun positions above 10°. NaN if it can track
+        none.
     """
 
     heliostat: str
@@ -68,7 +69,7 @@ class ParameterComparison:
 
 
 def suns_of_day(at: float, site: Site) -> FloatArray:
-    """Return unit vectors to the suns of a day (UTC, with a time in it, POSIX s) above 10°."""
+    """Return sun vectors above 10° of elevation for the UTC day that contains a time, POSIX s."""
     times = at // _DAY * _DAY + np.arange(0.0, _DAY, _STEP)
     found = sun.vector(times, site)
     return as_float(found[found[:, 2] > np.sin(_LOWEST)])
@@ -77,16 +78,16 @@ def suns_of_day(at: float, site: Site) -> FloatArray:
 def beam_change(
     first: Mechanism, second: Mechanism, suns: FloatArray, aim: FloatArray
 ) -> FloatArray:
-    """Return by how far a beam misses its aim, m, (T,): NaN where the first does not track.
+    """Return how far a beam misses its aim, m, (T,); NaN where the first mechanism cannot track.
 
     Parameters
     ----------
     first
-        The mechanism that sets the counts, batch shape (1,).
+        The mechanism from which the counts are computed, batch shape (1,).
     second
-        The mechanism that turns the mirror, batch shape (1,).
+        The mechanism that actually moves the mirror, batch shape (1,).
     suns, aim
-        Unit vectors to the sun, (T, 3), and the aim, m, (3,), ENU.
+        Sun vectors, (T, 3), and the aim, m, (3,), ENU.
     """
     if not len(suns):
         return np.zeros(0)

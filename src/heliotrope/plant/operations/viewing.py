@@ -22,9 +22,9 @@ from heliotrope.plant.operations.views import (
 from heliotrope.safety import FluxProof
 from heliotrope.store.records import Kind
 
-#: Life of a frame, s of the plant's clock.
+#: Time for which a frame is reused, s of plant time.
 _EVERY = 1.0
-#: An aim this many half diagonals from the middle of a surface is still on it.
+#: An aim at up to this many half diagonals from the centre of a surface counts as on it.
 _NEAR = 1.0
 #: Supply voltage of a board that has not reported it yet, mV.
 _UNTOLD = 0
@@ -98,7 +98,7 @@ class Viewer:
         )
 
     def _on(self, now: float) -> npt.NDArray[np.uint8]:
-        """Return the place of each beam in `aim_names`, (N,)."""
+        """Return the index of each beam's aim in `aim_names`, (N,)."""
         aims, found = self._plant.aims, np.zeros(len(self._plant.field), dtype=np.uint8)
         on = self._plant.field.among(states.ON_AIM, now) & np.isfinite(aims).all(axis=-1)
         found[on] = len(self.aim_names) - 1
@@ -182,7 +182,7 @@ class Viewer:
         return found
 
     def emergency(self) -> EmergencyView:
-        """Return the last emergency order with its proof."""
+        """Return the last emergency order, and whether it has been carried out."""
         plant, order = self._plant, self._plant.sentinel.order
         if order is None:
             return EmergencyView(False, "", "", "", 0.0, 0, 0, 0, (), "no emergency so far")
@@ -193,7 +193,8 @@ class Viewer:
                 False, order.act.name, order.who, order.reason, ago, 0, 0, 0, (), over
             )
         report = order.report(plant.now(), plant.drive_checks.shown)
-        # The orders that stand, and not who began: that person may have withdrawn.
+        # List the orders in force, not the one that began the emergency, which may have been
+        # withdrawn.
         causes = plant.sentinel.causes() or {order.who: order.reason}
         count = len(order.ticket.heliostats)
         return EmergencyView(

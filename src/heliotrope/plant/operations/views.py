@@ -33,7 +33,7 @@ class FieldFrame:
     state
         States of `lcu.states`, `STALE_STATE` where unknown, uint8, (N,).
     fault, flags
-        Codes of `lcu.names`, uint8 and uint32, (N,).
+        Codes from `lcu.names`, uint8 and uint32, (N,).
     age
         Age of all values of the row, s, float32, (N,); infinite if never heard.
     counts
@@ -48,11 +48,11 @@ class FieldFrame:
     sightings
         Number of known sightings, int32, (N,).
     cluster
-        Place in `FieldState.clusters`, int16, (N,).
+        Index in `FieldState.clusters`, int16, (N,).
     on
-        Place in `Viewer.aim_names` of the aim of each, uint8, (N,); 0: none.
+        Index of each aim in `Viewer.aim_names`, uint8, (N,); 0: none.
     held
-        Whether it is out of service, bool, (N,).
+        Whether each heliostat is out of service, bool, (N,).
     truth_error
         True tracking error, known to a twin only, rad, float32, (N,); None for a real plant.
     """
@@ -96,7 +96,7 @@ class ParameterView:
 
 @dataclass(frozen=True)
 class DriveView:
-    """One drive: count and goal in steps, the angle of its joint and of its goal in rad."""
+    """One drive: present count and target count, steps; present and target joint angle, rad."""
 
     count: int
     goal: int
@@ -120,7 +120,7 @@ class HeliostatView:
     Attributes
     ----------
     name, cluster, row
-        Names, and the row in all arrays.
+        Names, and the index in all arrays.
     position
         ENU, m, (3,).
     width, height
@@ -136,9 +136,9 @@ class HeliostatView:
     on
         Receiver or target that it aims at, "" for none.
     parameters
-        Of its mechanism, by name.
+        Parameters of its mechanism, by name.
     calibration
-        The calibration believed now; None before the first.
+        The calibration in force; None before the first.
     error
         Predicted tracking error, rad; NaN if never calibrated.
     truth_error
@@ -191,21 +191,21 @@ class ClusterRow:
     Attributes
     ----------
     name
-        Of the cluster.
+        Name of the cluster.
     alive
-        Whether its status is younger than the limit.
+        Whether the age of its status is below the limit.
     age
-        Age of its status, s; infinite if none came.
+        Age of its status, s; infinite if none was received.
     connected
         Whether its link is up.
     heliostats, live
-        Its heliostats, and those heard within the limit.
+        Number of its heliostats, and of those that reported within the limit.
     cycle
         Duration of the last poll of its bus, s; NaN if unknown.
     answered
-        Share of its polls that its heliostats have answered since it began; NaN if unknown.
+        Fraction of polls answered by its heliostats since it started; NaN if unknown.
     refused
-        Messages from it that could not be read.
+        Number of unreadable messages from the cluster.
     time_quality, time_error
         Quality of its clock, and the error bound, s.
     settings
@@ -213,9 +213,9 @@ class ClusterRow:
     lease_left
         Remaining lease at its last status, s; NaN if unknown.
     acts
-        Acts that its safety table demands.
+        Actions that its safety table demands.
     problem
-        Problem of its link, "" if none.
+        Problem with its link, "" if none.
     """
 
     name: str
@@ -237,7 +237,7 @@ class ClusterRow:
 
 @dataclass(frozen=True)
 class AlarmRow(Alarm):
-    """The latest state of a condition of a subject.
+    """The latest state of an alarm condition for a subject.
 
     Attributes
     ----------
@@ -258,8 +258,9 @@ class AlarmRow(Alarm):
 class PredictedView(FluxView):
     """The flux that is expected on a receiver, and its uncertainty.
 
-    Standard deviations are those by the errors of the heliostats' calibrations: see
-    `heliotrope.aims.errors`. Irradiance, reflectivity and soiling come on top.
+    Standard deviations cover only the errors of the heliostats' calibrations: see
+    `heliotrope.aims.errors`. The uncertainty of irradiance, reflectivity and soiling comes in
+    addition.
 
     Attributes
     ----------
@@ -270,8 +271,8 @@ class PredictedView(FluxView):
     peak, peak_sigma
         Flux in the hottest cell and its standard deviation, W/m².
     measured
-        What a camera measures now in the cells, W/m², (H, W), or another sensor as the mean, ();
-        None: nothing is measured.
+        Flux in the cells now measured by a camera, W/m², (H, W), or mean flux measured by another
+        sensor, (); None: nothing is measured.
     """
 
     sigma: FloatArray
@@ -290,9 +291,9 @@ class EventRow:
     at, kind, who, text
         POSIX s; command, calibration, authority or plant; person; one line.
     number
-        Of the event, since the start of the plant.
+        Number of the event, since the start of the plant.
     heliostats
-        How many heliostats it is about, where the text does not name them all; else 0.
+        Number of heliostats concerned if the text does not name all of them; otherwise 0.
     """
 
     at: float
@@ -328,13 +329,13 @@ class BusFrame:
     whom
         The heliostat at the other end, or "all"; "" if the frame is damaged.
     kind, sequence
-        Name of the message, or "damaged"; its number.
+        Name of the message, or "damaged"; its sequence number.
     size
         Bytes on the bus.
     signed
-        Whether it is signed with the key of the bus.
+        Whether it is signed with the bus key.
     text
-        Its fields; the bytes as hexadecimal digits if they cannot be read.
+        Its fields; the bytes in hexadecimal if the frame cannot be decoded.
     """
 
     at: float
@@ -348,7 +349,7 @@ class BusFrame:
 
 
 class Button(StrEnum):
-    """What a person can do at once about a heliostat that does not track."""
+    """What an operator can do at once about a heliostat that does not track."""
 
     NONE = ""
     AUTOMATIC = "automatic"
@@ -378,15 +379,15 @@ class Explanation:
     heliostat, tracks
         Its name, and whether its beam is on a receiver.
     text
-        What it does and why: one sentence.
+        What the heliostat does and why, in one sentence.
     follows, remedy
-        What happens next by itself, and what a person can do.
+        What happens next by itself, and what an operator can do.
     button
-        The command that does this.
+        Command for this remedy.
     order
-        The last command to it since the start; None: there was none.
+        The last command to the heliostat since the start; None: no command yet.
     alarms
-        What is reported about it now.
+        Active alarms about the heliostat.
     """
 
     heliostat: str
@@ -401,10 +402,9 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Running:
-    """A visit under way.
+    """A calibration visit in progress.
 
-    Heliostat, target, what is being done, its beginning (POSIX s), and in a joint visit the other
-    heliostats.
+    Heliostat, target, present stage, start (POSIX s), and the other heliostats of a joint visit.
     """
 
     heliostat: str
@@ -419,14 +419,14 @@ class Running:
         return (self.heliostat, *self.others)
 
     def without(self, heliostats: Collection[str]) -> "Running | None":
-        """Return the visit without some heliostats, None if it has no others."""
+        """Return the visit without some heliostats, None if none remain."""
         left = tuple(name for name in self.heliostats if name not in heliostats)
         return replace(self, heliostat=left[0], others=left[1:]) if left else None
 
 
 @dataclass(frozen=True)
 class CalibrationEntry:
-    """The result of one visit.
+    """The result of one calibration visit.
 
     Attributes
     ----------
@@ -440,17 +440,17 @@ class CalibrationEntry:
         Beam error over all sightings of the heliostat, under the earlier calibration and after the
         fit, rad RMS; NaN without a fit.
     measured
-        Beam error of this visit's photographs under the earlier calibration, rad RMS; NaN without.
+        Beam error of this visit's photographs under the earlier calibration, rad RMS; NaN if none.
     predicted
-        Predicted standard deviation of the normal after it, rad; NaN if never calibrated.
+        Predicted standard deviation of the normal after the visit, rad; NaN if never calibrated.
     truth_before, truth_after
         True tracking error, known to a twin only, rad; NaN for a real plant.
     sightings, new
-        Sightings known of the heliostat, and how many of them this visit brought.
+        Number of known sightings of the heliostat, and how many of them are from this visit.
     text
-        The outcome for people.
+        The outcome in words.
     version
-        Version of the new calibration; 0 without.
+        Version of the new calibration; 0 if there is none.
     """
 
     at: float
@@ -487,7 +487,7 @@ class QualityPoint:
     median, percentile_90
         Median and 90th percentile of their predicted tracking error, rad.
     truth_median, truth_percentile_90
-        The same of the true error, known to a twin only; NaN for a real plant.
+        The same for the true error, known to a twin only; NaN for a real plant.
     """
 
     at: float
@@ -507,21 +507,23 @@ class CalibrationView:
     on
         Whether calibration is running; if not, ``reason`` says why.
     done, waiting, failed
-        Calibrated heliostats, the others, and visits without a new calibration.
+        Number of calibrated heliostats, of the remaining heliostats, and of visits without a new
+        calibration.
     running
-        Visits under way.
+        Visits in progress.
     results
         Results of the last visits, newest first.
     quality
         Quality over time, oldest first.
     asked
-        Heliostats that persons want calibrated next.
+        Heliostats whose calibration operators have requested.
     field
         Errors of all heliostats over time, oldest first.
     outlooks
-        Predictions of these for this day: the first of the day, and the last.
+        Predictions of these errors for this day: the first of the day, and the latest.
     choice
-        Why automatic control chose the last visit, or why it begins none; "" before its first.
+        Why automatic control chose the last visit, or why it starts none; "" before the first
+        visit.
     """
 
     on: bool
@@ -540,22 +542,22 @@ class CalibrationView:
 
 @dataclass(frozen=True)
 class PictureRow:
-    """A kept photograph.
+    """A stored photograph.
 
     Attributes
     ----------
     identity
-        Its number.
+        Number of the photograph.
     heliostat, target
-        Names; no heliostat where a person asked for it.
+        Names; heliostat "" if a user requested the photograph.
     at
-        Middle of the exposure, POSIX s: that of its sighting.
+        Mid-exposure time, POSIX s, which is also the time of its sighting.
     used
         Whether its beam could be used.
     reading
         The findings of the software, line by line.
     outcome, text
-        The result of its visit, and the same for people.
+        The outcome of its visit, as a code and in words.
     """
 
     identity: int
@@ -570,22 +572,22 @@ class PictureRow:
 
 @dataclass(frozen=True)
 class FlightView:
-    """A flight of a drone that the plant has taken.
+    """A drone flight that the plant has imported.
 
     Attributes
     ----------
     name, at, person
-        Name, when it was taken (POSIX s), and who gave it.
+        Name, when it was imported (POSIX s), and who supplied it.
     orientations, heliostats
-        Number of its orientations, and of its heliostats.
+        Number of measured orientations and of heliostats.
     in_use, at_stow, at_target, unchanged
-        Heliostats whose parameters count it, those that get new ones when they next stand at stow,
-        those whose large change waits for a photograph on a target, and those whose fit was
-        rejected or became no better.
+        Number of heliostats whose parameters in use include the flight, that receive new parameters
+        when next at stow, whose large change waits for a photograph on a target, and whose fit was
+        rejected or was no better.
     shared
-        The errors that its rows share: name, value and standard deviation.
+        The errors shared by all records of the flight: name, value and standard deviation.
     problems
-        Why fits were rejected: a line for each heliostat, the first ten.
+        Why fits were rejected: one line per heliostat, at most ten.
     """
 
     name: str
@@ -603,7 +605,7 @@ class FlightView:
 
 @dataclass(frozen=True)
 class LearningView:
-    """The hyperparameters of a group of mirrors that are in force.
+    """The hyperparameters in force for a heliostat group.
 
     Attributes
     ----------
@@ -612,15 +614,15 @@ class LearningView:
     version
         1, 2, ...; 0 while the defaults are in force.
     at, person
-        When it was learnt (POSIX s, NaN by default), and who ordered it.
+        When they were learnt (POSIX s; NaN for the defaults), and who requested it.
     heliostats, sightings
-        Numbers of each that it was learnt from.
+        Number of heliostats and sightings from which they were learnt.
     gain
-        Rise of a photograph's log probability density, foretold from those before it.
+        Increase in the log probability density of a photograph predicted from the earlier ones.
     drift
         Drift, steps and noise in force, in words.
     said
-        How the last attempt ended, or that one is under way.
+        How the last attempt ended, or that one is in progress.
     """
 
     group: str
@@ -641,19 +643,20 @@ class TimetableRow:
     Attributes
     ----------
     name
-        Unique.
+        Unique name.
     heliostats, target
-        Names; target "": any that is free.
+        Names; target "": any free target.
     at
         Times of day with their zone, as "08:30Z".
     every_s
         Interval, s, from midnight UTC; None: there is none.
     next, last
-        When it is due, and when it was, POSIX s; NaN before the first time.
+        When the entry is due next, and was due last, POSIX s; NaN before the first time.
     text
-        What came of the last time.
+        Outcome of the last time.
     rule
-        "" for times; "first" or "never": what automatic control chooses of them.
+        "" for times; "first" or "never": whether automatic control chooses these heliostats first
+        or never.
     """
 
     name: str
@@ -680,11 +683,11 @@ class CameraView:
     at
         POSIX s.
     jpeg
-        The picture with what was read in it drawn in; b"" before the first.
+        The picture with the findings drawn in; b"" before the first.
     reading
-        The software's reading of it, line by line.
+        The software's findings, line by line.
     centroid
-        Of the beam, right of and above the target's centre, m; None if not seen.
+        Beam centroid, right of and above the target's centre, m; None if not seen.
     """
 
     target: str
@@ -697,35 +700,37 @@ class CameraView:
 
 @dataclass(frozen=True)
 class EmergencyView:
-    """The last order to the whole field, with its proof.
+    """The last order to the whole field, and whether it has been carried out.
 
     Attributes
     ----------
     on
         Whether it is active.
     act, who, reason
-        DEFOCUS or STOW; the persons whose orders stand, and the safety table; and why, or how it
-        ends once every order is withdrawn. When it is over: who gave it, and why. "" if there was
-        no order.
+        DEFOCUS or STOW; the users whose orders are in force, and the safety table; and the reason,
+        or how the emergency ends once every order is withdrawn. After the emergency: who gave the
+        order, and why. "" if there was no order.
     seconds
         Time since the order, s.
     heliostats, acknowledged, done
-        Heliostats ordered, those that acknowledged it, and those proven to have carried it out.
+        Number of heliostats ordered, that acknowledged the order, and that have verifiably carried
+        it out.
     not_done
-        Names of the first heliostats not proven to have carried it out.
+        Names of the first heliostats that have not verifiably carried it out.
     text
-        The same for people.
+        The same in words.
     calls
-        The orders of persons that have not been withdrawn, one for each person.
+        The orders of users that have not been withdrawn, one per user.
     measured
-        Whether a sensor shows since the order that the flux on the receiver is below its limit.
+        Whether a sensor has shown since the order that the flux on the receiver is below its limit.
     followed
-        Number of the heliostats done whose mirrors were seen to follow their drives earlier today,
-        by what showed it.
+        Number of heliostats done whose mirrors demonstrably followed their drives earlier today, by
+        type of evidence.
     believed, believed_count
-        Names of the first heliostats done by their reports alone, and the number of all of them.
+        Names of the first heliostats counted as done only by their reports, and the number of all
+        such heliostats.
     basis
-        What is measured and what is believed, for people.
+        What is measured and what is believed, in words.
     """
 
     on: bool
@@ -753,32 +758,32 @@ class Summary:
     Attributes
     ----------
     name
-        Of the plant.
+        Name of the plant.
     at
-        Time of the plant, UTC.
+        Plant time, UTC.
     heliostats, clusters
-        Number of each.
+        Number of heliostats and of clusters.
     states
-        Number of heliostats in each state; those not heard under "stale".
+        Number of heliostats in each state; silent heliostats under "stale".
     clusters_alive
-        Number of clusters heard.
+        Number of clusters that report.
     holder, role
-        Person with the command authority; "" if nobody has it.
+        User with the command authority; "" if nobody has it.
     waiting
-        Heliostats waiting to join the receiver.
+        Number of heliostats waiting to join the receiver.
     alarms
         Number of alarms active or unacknowledged.
     emergency
         Whether an emergency is active.
     resume
-        Why automatic control waits for a person's Resume, "" if it does not.
+        Why automatic control waits for an operator's Resume, "" if it does not.
     pace
-        Seconds of the plant's time per second over the last half minute: 1 for a real plant.
+        Seconds of plant time per second over the last half minute: 1 for a real plant.
     readings
-        Newest readings of sensors, by name, in the units of the safety table (`dni`: W/m²); NaN
-        where there is none, or an old one.
+        Newest sensor readings, by name, in the units of the safety table (`dni`: W/m²); NaN if
+        missing or too old.
     extra
-        More rows, such as the speed of a twin.
+        Additional rows, such as the speed of a twin.
     """
 
     name: str

@@ -19,8 +19,8 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.orders.authority import Person
 from heliotrope.plant.orders.tickets import Ticket
 
-#: Largest turn of the mirror's normal that LOCK POSITION may declare, rad: a beam that is off by
-#: more than twice as much is another heliostat's, or the aim is another.
+#: Largest rotation of the mirror's normal that LOCK POSITION may declare, rad. A beam that is off
+#: by more than twice this angle belongs to another heliostat, or the heliostat has another aim.
 MOST_TURN = 0.1
 
 
@@ -50,9 +50,9 @@ def zero(
     Raises
     ------
     RefusedError
-        If it is not accepted; in that case nothing is sent.
+        If the order is not accepted, in which case nothing is sent.
     InputError
-        If values do not fit.
+        If the values are not two valid counts.
     UnknownNameError
         If there is no such heliostat.
     """
@@ -64,9 +64,9 @@ def zero(
 def lock_position(
     plant: PlantController, person: Person, token: int, heliostats: Sequence[str]
 ) -> tuple[Ticket, str]:
-    """Declare that the beam of one locked heliostat is at its aim now; its counts become that.
+    """Declare that the beam of one locked heliostat is at its aim now, and set its counts.
 
-    Nothing moves. Bring the beam to its aim by JOG and lock it before.
+    Nothing moves. First move the beam to its aim by JOG and lock the heliostat.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def lock_position(
     person, token
         The person commanding, and the token of the command authority.
     heliostats
-        The name of one.
+        The name of one heliostat.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def lock_position(
     Raises
     ------
     RefusedError
-        If it is not accepted; nothing is sent then.
+        If the order is not accepted, in which case nothing is sent.
     UnknownNameError
         If there is no such heliostat.
     """

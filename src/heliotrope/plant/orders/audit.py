@@ -1,4 +1,4 @@
-"""The audit: exactly one record per accepted command, with who, what, when and the result.
+"""The audit log: exactly one record per accepted command: who, what, when, and the result.
 
 A record is begun before its command is sent; if the record cannot be begun, the command is not
 sent. DEFOCUS and STOW never wait: they are sent first, and their records are retried until they are
@@ -28,7 +28,7 @@ from typing import Any, Protocol
 from heliotrope.errors import FormatError, HeliotropeError, InputError
 from heliotrope.store.digests import AUDIT, GENESIS, Head, digest_of
 
-#: A disk with less free space than this (bytes) counts as full: no record may end half-way.
+#: Free disk space below which the disk counts as full, so that no record is truncated, bytes.
 LEAST_FREE = 1 << 20
 #: Result of a record that was open when the plant stopped.
 STOPPED = "unknown, because the plant stopped before the result arrived"
@@ -93,7 +93,7 @@ class Audit(Protocol):
 
 
 class Forgetful:
-    """An audit that stores nothing, for plants that are only inspected."""
+    """An audit log that stores nothing, for plants that are only inspected."""
 
     def begin(self, record: Record) -> None:
         """Accept a record."""
@@ -117,9 +117,9 @@ class JsonLines:
     Parameters
     ----------
     path
-        Path, created if it does not exist. Only one process at a time may hold it.
+        The file, created if it does not exist. Only one process at a time may open it.
     started
-        UTC, written to records that are completed now because the plant had stopped.
+        Start time, UTC, written to records that are completed now because the plant had stopped.
 
     Raises
     ------
@@ -202,7 +202,7 @@ class JsonLines:
         Raises
         ------
         AuditError
-            If not.
+            If it could not.
         """
         try:
             os.fsync(self._file)
@@ -311,13 +311,13 @@ def _fields(line: bytes) -> dict[str, Any] | None:
 
 
 def _before(data: bytes) -> str:
-    """Return the digest that precedes the first line with one; it covers all lines without."""
+    """Return the digest that precedes the first one in the file; it covers all lines without."""
     older = data.rstrip(b"\n")
     return hashlib.sha256(older).hexdigest() if older else GENESIS
 
 
 def _last_digest(data: bytes) -> str:
-    """Return the digest of the last complete line with one, whether or not the chain fits."""
+    """Return the digest of the last complete line that has one, even if the chain is broken."""
     for line in reversed(data.split(b"\n")):
         fields = _fields(line)
         if fields is not None and isinstance(fields.get("digest"), str):
@@ -326,7 +326,7 @@ def _last_digest(data: bytes) -> str:
 
 
 def verify(path: str | Path, known: Iterable[Head] = ()) -> Head:
-    """Check the hash chain of an audit's file, and that known heads are in it; return its head.
+    """Check the hash chain of an audit file, and that known heads are in it; return its head.
 
     Raises
     ------

@@ -65,9 +65,9 @@ class Role(IntEnum):
         }[self]
 
 
-#: Bus commands that an operator may give; all others require an engineer.
+#: Bus commands that an operator may issue; all others require an engineer.
 OPERATOR_COMMANDS = messages.BY_OPERATORS
-#: Tokens of mandates are above those of the wire, which have 32 bits.
+#: Mandate tokens are larger than the wire tokens, which have 32 bits.
 _MANDATES = 1 << 32
 
 
@@ -123,7 +123,7 @@ class Grant:
     token
         Token, 1 to 2^32 - 1.
     since, kept
-        When it was taken and last renewed, monotonic s.
+        When the authority was taken and last renewed, monotonic s.
     """
 
     holder: Person
@@ -149,7 +149,7 @@ class Mandate:
     taken
         Why heliostats were removed, by name.
     blameless
-        Removed heliostats whose removal they did not cause themselves: by an operator's order or an
+        Heliostats that did not cause their removal themselves: removed by an operator's order or an
         emergency.
     ended
         Why all commands under it are refused; "" while it is valid.

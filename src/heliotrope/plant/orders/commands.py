@@ -1,4 +1,4 @@
-"""Operator commands: authorised, proven, recorded, and sent, at once or in turn."""
+"""Operator commands: authorised, checked, recorded, and sent, at once or in turn."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -31,8 +31,8 @@ from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
 
 #: Disk work, and the disk work that reverts it.
 Storing = tuple[Work, Callable[..., object]]
-#: A new point within this distance of the last one brings no light to a receiver if both are this
-#: far off all receivers, m.
+#: Distance from all receivers, m. If two points are this far off and also this close together,
+#: moving between them brings no light to a receiver.
 _BESIDE = 3.0
 
 
@@ -93,7 +93,7 @@ class Commands:
     unacknowledged
         Assigned points, and whether they were acknowledged.
     proofs
-        Proofs of where beams may go.
+        Checks where beams may go.
     design
         The plant, with its targets and receivers.
     required
@@ -192,7 +192,7 @@ class Commands:
         store: tuple[Work, Work] | None = None,
         blocked: Mapping[str, str] = MappingProxyType({}),
     ) -> Ticket:
-        """Return the ticket of a command that may be issued; its record is on the way to the disk.
+        """Return the ticket of a command that may be issued; its record goes to the disk.
 
         The ticket ends at once for ``blocked`` heliostats. An operator's command removes the others
         from their visits. While a visit verifies new parameters, no operator may send the beam to
@@ -236,7 +236,7 @@ class Commands:
         return self._proofs.points.holding(self._locks.record(heliostats, visit=visit))
 
     def _note_lock(self, heliostats: tuple[str, ...], token: int) -> None:
-        """Note the owner of a lock: a visit, for which the plant unlocks later, or a person."""
+        """Record the owner of a lock: an operator, or a visit, whose lock the plant removes."""
         if self._authority.mandate_of(token) is None:
             self._locks.forget(heliostats)
         else:
@@ -250,7 +250,7 @@ class Commands:
         Raises
         ------
         BeamError
-            If none may.
+            If none of them may.
         """
         asked = Asked(name, names, token=token)
         able, refused = self._guards.passed(asked, NOT_NOW, BEAM_REFUSED)
@@ -332,7 +332,7 @@ class Commands:
         return self.give_points(NewPoints(name, names, targets, token, store, note), accept)
 
     def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Move beams a little on their receiver, for a measurement; their aims stay assigned.
+        """Move beams slightly on their receiver for a measurement; their aims stay assigned.
 
         The plant returns the beams to their aims by itself; see `movements`. They need not wait for
         a turn, because they bring no additional light to the receiver.
@@ -412,15 +412,15 @@ class Commands:
     def give_points(
         self, new: NewPoints, accept: Callable[[tuple[Work, Work] | None], Ticket]
     ) -> Ticket:
-        """Issue proven points; each point is stored, and assigned when it is sent.
+        """Issue points that have been checked; each is stored, and assigned when it is sent.
 
         Parameters
         ----------
         new
             The points.
         accept
-            Returns their ticket. It is passed work that stores, with the record of the ticket, the
-            points that need not wait for a turn.
+            Returns the ticket of the points. Its argument is the disk work that stores, together
+            with the ticket's record, the points that need not wait for a turn.
         """
         waiting = self._joins(new)
         early = tuple(n for n in new.names if n not in waiting)
@@ -495,7 +495,7 @@ class Commands:
         )
 
     def prove_points(self, name: str, names: tuple[str, ...], places: FloatArray) -> None:
-        """Prove that heliostats (K,) may be assigned points (K, 3) now.
+        """Check that heliostats (K,) may be assigned points (K, 3) now.
 
         Raises
         ------
@@ -514,7 +514,8 @@ class Commands:
         """Return a mask of the heliostats that new points (K, 3) keep off receivers, (K,).
 
         The aim and the new point lie on the same target, or near each other and off every receiver.
-        The second case is that of a beam that misses its target and is therefore sent beside it.
+        The second case occurs if a beam misses its target and is therefore sent to a point beside
+        it.
         """
         aims = self._proofs.points.aims[rows]
         stays = np.linalg.norm(places - aims, axis=-1) <= _BESIDE

@@ -27,7 +27,7 @@ class JoinDispatcher(Part):
     """Sends heliostats whose turn has come, if the paths of their beams are clear now.
 
     The sun has moved since the aim was accepted, and the heliostat may point anywhere. The sweep
-    from its present direction to its aim is therefore proven at the moment it begins.
+    from its present direction to its aim is therefore checked at the moment it begins.
 
     Parameters
     ----------

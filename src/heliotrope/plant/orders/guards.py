@@ -3,7 +3,7 @@
 Each entry names the refusal, the commands that it blocks, and the check that returns the reason for
 each heliostat. The table is evaluated when a command is accepted, when its record is written, and
 when its turn comes. If there are several reasons, the first in the table is reported. Whether the
-beams may go to their points is proven afterwards; see `PathProofs`.
+beams may go to their points is checked afterwards; see `PathProofs`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -39,8 +39,7 @@ class Asked:
     name, heliostats
         The command, and K heliostats.
     points
-        Points to which it sends their beams, ENU, m, (K, 3); None: to their aims, if to a surface
-        at all.
+        Points to which it sends their beams, ENU, m, (K, 3); None: to their aims, or to no surface.
     token
         Token of the authority holder or of a mandate; None: the plant itself issues the command.
     """
@@ -202,7 +201,7 @@ TO_AIMS = messages.JOINING | {"AIM"}
 
 #: All guards; the first that blocks a heliostat supplies the reason.
 GUARDS: tuple[Guard, ...] = (
-    # ZERO and PARAMETERS are not harmless, because they may change where the next STOW leads.
+    # ZERO and PARAMETERS are not harmless, because they may change where the next STOW ends.
     Guard(
         OUT_OF_SERVICE,
         _ORDERS - messages.HARMLESS,
@@ -214,7 +213,7 @@ GUARDS: tuple[Guard, ...] = (
         (_ORDERS | messages.SAFE) - messages.STOPS,
         _cluster(lambda plant, name: plant.sentinel.refusal((name,))),
     ),
-    # The sun is needed to track it and to stand at standby, but not for work on the heliostats.
+    # The sun is needed for tracking and for standby, but not for work on the heliostats.
     Guard(
         NOT_NOW,
         messages.JOINING | messages.TO_STANDBY,
@@ -238,7 +237,7 @@ GUARDS: tuple[Guard, ...] = (
         _each(lambda plant, name: plant.given.unknown("STANDBY", name)),
     ),
     Guard(BEAM_REFUSED, messages.TO_STANDBY, _alarm(UNPROVEN)),
-    # Beams that went astray and are now off would go astray again.
+    # Stray beams that have been moved off would stray again.
     Guard(BEAM_REFUSED, messages.TO_STANDBY, _alarm("pointing_disagrees", states.AWAY)),
     # A heliostat that is being ordered off is not stopped.
     Guard(BEAM_REFUSED, messages.RELEASES, _alarm("beam_unsent")),

@@ -1,8 +1,7 @@
 """The queue of heliostats that join the receiver, with a limited rate and a limited wait.
 
-An APPROACH of a large number of heliostats is queued too, because the proof of 10,000 paths from
-stow takes 0.6 s, in which no lease could be renewed. It is therefore processed in slices, one per
-beat.
+An APPROACH of a large number of heliostats is queued too, because checking 10,000 paths from stow
+takes 0.6 s, in which no lease could be renewed. It is therefore processed in slices, one per beat.
 """
 
 from collections import deque
@@ -14,7 +13,7 @@ from heliotrope.links.messages import Stage
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import JoinLimiter
 
-#: Heliostats in a slice; proving their paths takes 30 ms.
+#: Number of heliostats in a slice; checking their paths takes 30 ms.
 SLICE = 500
 #: Returns which of some heliostats may go now; the ticket ends for the others.
 Clear = Callable[[tuple[str, ...]], tuple[str, ...]]
@@ -31,7 +30,7 @@ def in_slices(name: str, heliostats: Sequence[str]) -> bool:
 
 @dataclass
 class JoiningJob:
-    """A command whose heliostats go one after the other, and the heliostats still waiting.
+    """A command whose heliostats start one after the other, and the heliostats still waiting.
 
     Attributes
     ----------
@@ -58,7 +57,7 @@ class JoiningJob:
 class JoinQueue:
     """The waiting heliostats: first come, first served, as fast as a `JoinLimiter` admits.
 
-    Of the heliostats that leave stow, one slice goes at each check.
+    Of the heliostats that leave stow, one slice starts at each check.
 
     Parameters
     ----------

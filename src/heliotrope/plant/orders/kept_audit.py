@@ -1,4 +1,4 @@
-"""The audit and the assigned points in the plant's store.
+"""The audit log and the assigned points in the plant's store.
 
 `KeptAudit` is an `audit.Audit`, `KeptPoints` an `assigned.Assigned`, both based on a
 `store.Keeper`. They wait for the disk, so a plant uses them in the thread of its `disk.Disk`.
@@ -34,7 +34,7 @@ ASKED = 1.0
 
 
 class KeptAudit:
-    """An audit in a store.
+    """An audit log in a store.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ Left = Callable[[int, Iterable[str]], frozenset[str]]
 
 @dataclass(frozen=True)
 class _Moved:
-    """A beam away from its aim: the aim, and the token that keeps it away and until when.
+    """A beam away from its aim: the aim, the token that keeps the beam away, and until when.
 
     ``small``: the beam is on the same receiver as its aim; ``pause``: before the next attempt, s.
     """
@@ -87,11 +87,11 @@ class Movements:
         Parameters
         ----------
         names, rows
-            Names and rows, (K,).
+            Names and indices, (K,).
         aims, wanted
             Their aims, and the points, ENU, m, (K, 3).
         tracking
-            Whether they track, (K,).
+            Whether the heliostats track, (K,).
 
         Raises
         ------
@@ -119,7 +119,7 @@ class Movements:
             raise BeamError("AIM", blocked)
 
     def take(self, names: Sequence[str], aims: FloatArray, token: int, now: float) -> None:
-        """Note that beams are moved; ``aims`` (K, 3) are those of heliostats not moved before."""
+        """Record that beams are moved; ``aims`` (K, 3) count for heliostats not moved before."""
         for name, present in zip(names, aims, strict=True):
             aim = np.array(self.aim(name, present))
             self._moved[name] = _Moved(aim, token, now + LIFE, small=True)
@@ -150,7 +150,7 @@ class Movements:
         return {"LENT": found}
 
     def small(self, names: Sequence[str]) -> frozenset[str]:
-        """Return the heliostats that were moved a little, and need no turn on the way back."""
+        """Return the heliostats that were moved only slightly, and so need no turn to return."""
         return frozenset(name for name in names if self._moved[name].small)
 
     def forget(self, heliostats: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""Parameters of local controllers: compared with the wanted ones on connection, then sent."""
+"""Parameters of local controllers: compared with the desired ones on connection, then sent."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +31,7 @@ from heliotrope.plant.orders.queue import PlantOrders
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import Alarm, alarms
 
-#: States in which a local controller stands still and so accepts items that change the pose.
+#: States in which a heliostat is at rest, so that items that change its pose are accepted.
 TAKES_POSE = POSE
 #: Pause before another attempt, s.
 AGAIN = 30.0
@@ -46,11 +46,11 @@ _SUNS = tuple(
 
 
 def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
-    """Return the largest angle by which new parameters turn a beam from its aim, rad.
+    """Return the largest angle by which new parameters rotate a beam off its aim, rad.
 
-    The heliostat is assumed to be as the present parameters say, and its local controller to aim by
-    the new ones, for sun directions all around. Infinite if the new parameters reach none of the
-    poses, or do not reach an aim that the present ones reach.
+    The present parameters are assumed to describe the heliostat, while its local controller aims
+    with the new parameters, for sun directions all around. The angle is infinite if no pose can be
+    reached with the new parameters, or if an aim can be reached only with the present ones.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def stored_items(answer: Answer) -> dict[str, bytes]:
 
 
 class ParameterSync(Part):
-    """Compares the stored parameters with the wanted ones, and writes those that differ.
+    """Compares the stored parameters with the desired parameters, and writes those that differ.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class ParameterSync(Part):
     tell
         Called with each alarm.
     proofs
-        Proves that a beam is clear where parameters are written, and at stow.
+        Checks that a beam is clear where parameters are written, and at stow.
     blocked
         Function that returns why nothing may be written to a heliostat, None if it may.
     token
@@ -181,8 +181,8 @@ class ParameterSync(Part):
     def differing(self, heliostat: str) -> str | None:
         """Return how the parameters of a heliostat differ or may differ, None if they agree.
 
-        They may differ if they have not been compared since its cluster connected, or its board
-        started.
+        They may differ if the heliostat has not been compared since its cluster connected or its
+        board started.
         """
         ticket = self._tickets.get(heliostat)
         items = self._wanted.missing.get(heliostat, ())

@@ -1,4 +1,4 @@
-"""Accepted commands in progress: their records, their messages, and their results."""
+"""Accepted commands in progress: their records, messages and results."""
 
 import struct
 from collections import deque
@@ -31,20 +31,20 @@ REPEAT = 1.0
 GRACE = 3.0
 #: A command whose record is not on the disk within this time is not sent, s.
 RECORDING = 2.0
-#: Number of owed records that are written together, and the time after which the rest must wait, s,
-#: because new commands wait behind them.
+#: Number of overdue records that are written together, and the time after which the remainder must
+#: wait, s, because new commands wait behind them.
 _BATCH, _TURN = 256, 0.5
 #: Clusters receive a new token within this time, s.
 _HEARD = 3.0
 #: Commands that move nothing by themselves: an emergency does not overtake them.
 _STILL = messages.POINTS | {"PARAMETERS"}
-#: Time allowed at the end of the plant's run for the owed records, s.
+#: Time allowed at the end of the plant's run for the overdue records, s.
 _LAST = 10.0
 
 
 @dataclass
 class _Under:
-    """One message under way.
+    """One message in transit.
 
     It was issued with the token ``given`` and sent with ``token``; ``again`` sends it again.
     """
@@ -114,9 +114,9 @@ class PlantOrders(Part):
     clock, authority
         As given.
     confirmed_at
-        Last time that the audit confirmed that it can write, monotonic s.
+        Last time that the audit log confirmed that it can write, monotonic s.
     problem
-        Why it cannot write, empty if it can.
+        Why the audit log cannot write, empty if it can.
     latest
         Ticket of the last command; None before the first.
     last
@@ -300,8 +300,8 @@ class PlantOrders(Part):
     def when_recorded(self, ticket: Ticket, send: Callable[[bool], None]) -> None:
         """Call ``send`` once the ticket's record is on disk; never, if that takes too long.
 
-        The argument of ``send`` is whether the command had to wait. If so, whatever was proven when
-        it was accepted must be proven again, and heliostats that have ended in the meantime
+        The argument of ``send`` is whether the command had to wait. If so, all checks made when it
+        was accepted must be repeated, and heliostats that have ended in the meantime
         (`Ticket.waiting`) are left out. It may raise `RefusedError`, which ends the ticket.
         """
         recording = self._recording.get(ticket.identity)
@@ -338,11 +338,11 @@ class PlantOrders(Part):
         self._owe_result(ticket.identity, "done")
 
     def owe(self, work: Work) -> None:
-        """Hand work to the disk, to be done after the owed records; it may be repeated."""
+        """Hand work to the disk, to be done after the overdue records; it may be repeated."""
         self._owed.append(work)
 
     def pay(self) -> None:
-        """Hand the oldest owed records to the disk, unless earlier ones are still being written."""
+        """Hand the oldest overdue records to the disk, unless others are still being written."""
         if self._paying:
             return
         batch, done = tuple(islice(self._owed, _BATCH)), [0]
@@ -546,7 +546,7 @@ class PlantOrders(Part):
     # Reports of clusters.
 
     def take(self, cluster: str, progress: Progress) -> tuple[Ticket, tuple[str, ...]] | None:
-        """Handle a cluster's report; return its ticket and heliostats, None if not known."""
+        """Handle a cluster's report; return its ticket and heliostats, None if unknown."""
         under = self._under.get(progress.identity)
         if under is None or under.cluster != cluster:
             return None
@@ -633,7 +633,7 @@ class PlantOrders(Part):
         await self._until(self._settled, until)
 
     def _settled(self) -> bool:
-        """Whether the owed records are written or cannot be; starts the next batch."""
+        """Return whether the overdue records are written or cannot be; start the next batch."""
         if self.owing:
             self.pay()
         return not (self._paying or self.owing)

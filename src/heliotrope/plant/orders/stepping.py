@@ -23,7 +23,7 @@ _AGAIN = 3.0
 
 
 class Stepping:
-    """How local controllers must step.
+    """The step mode that local controllers must use.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ class Stepping:
         #: visit.
         self._needed = Counter[str]()
         self._rough = {*self._rests, *held}
-        #: Heliostats that may not be stepping as required.
+        #: Heliostats that may not be using the required steps.
         self._open = set(self._rough)
-        #: When an order was last attempted for each, monotonic s.
+        #: When an order was last attempted for each heliostat, monotonic s.
         self._tried: dict[str, float] = {}
 
     @contextmanager
@@ -66,7 +66,7 @@ class Stepping:
             self._needed.subtract(names)
 
     def ordered(self, heliostats: Iterable[str], rough: bool) -> None:
-        """Note how an operator wants heliostats to step when no visit needs them."""
+        """Record the step mode that an operator orders for the time without visits."""
         if rough:
             self._rough.update(heliostats)
             self._open.update(heliostats)
@@ -75,7 +75,7 @@ class Stepping:
 
     @property
     def lent(self) -> frozenset[str]:
-        """Heliostats that return to coarse steps after a visit, though not by the plant file."""
+        """Heliostats that return to coarse steps after a visit without a plant-file entry."""
         return frozenset(self._open & self._rough - self._rests)
 
     def record(self, heliostats: Iterable[str]) -> Held:
@@ -109,10 +109,10 @@ class Stepping:
         return {rough: tuple(names) for rough, names in found.items() if names}
 
     def tried(self, heliostats: Collection[str], now: float) -> None:
-        """Note that heliostats have been ordered to step as required, or could not be ordered."""
+        """Record that the required step mode has been ordered, or could not be ordered."""
         self._tried.update(dict.fromkeys(heliostats, now))
 
     def _reported(self, now: float) -> tuple[Mask, Mask]:
-        """Return masks of heliostats that reported since the last order, and that step coarsely."""
+        """Return masks of heliostats that reported since the order, and that use coarse steps."""
         known = self._field.live(now) & self._ledger.reported(STEPPING)
         return known, np.asarray(self._field.rows["flags"] & meanings.ROUGH != 0)

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable
 
 from heliotrope.plant.orders.tickets import Ticket
 
-#: Why a heliostat in the queue is not moved in the meantime.
+#: Why a heliostat in the queue is not moved while it waits.
 WAITS = "it is waiting its turn to go to stow"
 
 
@@ -19,7 +19,7 @@ class StowQueue:
     Parameters
     ----------
     rate
-        Heliostats per second, and at once after a pause; 0: no heliostat waits.
+        Heliostats that start per second, and at once after a pause; 0: no heliostat waits.
     """
 
     def __init__(self, rate: float) -> None:

@@ -1,6 +1,6 @@
 """Points that were sent to local controllers, and whether they were accepted.
 
-The plant proves and records a point before it is sent, and counts on it once it is sent. A local
+The plant checks and records a point before it is sent, and relies on it once it is sent. A local
 controller that is busy refuses it, and continues with the previous point.
 """
 
@@ -59,7 +59,7 @@ class Unacknowledged(Part):
         last, took = self._tickets[ticket.name], self._took[ticket.name]
         for name in heliostats:
             if name not in last and took.get(name, ticket) is not ticket:
-                last[name] = None  # it arrived after the point that was sent later
+                last[name] = None  # the earlier point arrived after the later one
         names = [n for n in dict.fromkeys(heliostats) if last.get(n) is ticket]
         names = [n for n in names if ticket.stage(n) is not Stage.REFUSED]
         for name in names:

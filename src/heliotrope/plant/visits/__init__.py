@@ -1,4 +1,4 @@
-"""Visits of a heliostat to a calibration target.
+"""Calibration visits: a heliostat goes to a target, is photographed, and returns.
 
 Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (directly, or
 with a search for the beam: `Centring`), fits them, and updates the plant's belief if the

@@ -89,7 +89,7 @@ class CycleResult:
     record
         The new calibration; None if nothing changed.
     verdict
-        What a joint visit proves about the heliostat; None for a single visit.
+        What a joint visit reveals about the heliostat; None for a single visit.
     """
 
     heliostat: str
@@ -105,7 +105,7 @@ class CycleResult:
     verdict: Verdict | None = None
 
     def then(self, again: "CycleResult") -> "CycleResult":
-        """Return the result of a visit that also learnt from its verification, ``again``."""
+        """Return the result combined with that of learning from the verification, ``again``."""
         new, known = self.new + again.new, max(self.known, again.known)
         if again.record is None:
             return replace(self, known=known, new=new)
@@ -128,12 +128,12 @@ def refused(mandate: Mandate, heliostat: str, text: str) -> CycleResult:
 
 @dataclass(frozen=True)
 class Leaving:
-    """How a heliostat that tracks a receiver leaves it, which it does only for new parameters.
+    """How a heliostat that tracks a receiver leaves the receiver, only to store new parameters.
 
     Attributes
     ----------
     worth
-        Smallest change of its beam for which it leaves, rad.
+        Smallest change of its beam that justifies leaving, rad.
     leave
         Function that brings it to standby.
     """
@@ -293,7 +293,7 @@ class CalibrationCycle:
     async def alone(
         self, target: Target, heliostat: str, shot: Shot, standing: Standing | None
     ) -> Shot:
-        """Return a shot as if no neighbour obstructed its mirror; see `Unhidden.shot`."""
+        """Return a shot corrected for obstruction by neighbours; see `Unhidden.shot`."""
         if self.unhidden is None:
             return shot
         return await self.unhidden.shot(target, heliostat, shot, standing)
@@ -319,7 +319,7 @@ class CalibrationCycle:
         confirming
             Confirms new parameters; None: a photograph of this heliostat alone.
         least
-            Number of sightings that the fit needs; None: as in the settings.
+            Minimum number of sightings for the fit; None: as in the settings.
         leaving
             Set if the heliostat tracks a receiver, which it leaves only if its parameters change. A
             change that a photograph must confirm is left to a visit to a target. None: the
@@ -431,7 +431,7 @@ class CalibrationCycle:
     async def _after_leaving(
         self, visit: Visit, fit: JudgedFit, new_sightings: Sightings, leaving: Leaving
     ) -> JudgedFit:
-        """Return a fit for whose parameters a heliostat left a receiver, or why it stayed."""
+        """Return the fit for which a heliostat has left a receiver, or why the heliostat stayed."""
         if not self._sure(fit, new_sightings):
             text = "a photograph on a target must confirm the new parameters; calibrate it there"
             return replace(fit, outcome=CalibrationOutcome.NOT_VERIFIED, problem=text)
@@ -470,7 +470,7 @@ class CalibrationCycle:
                 return fit, pushed
             await self._push(visit, present[0], "the new ones were not verified")
         except BaseException:
-            # The local controller gets the old parameters as soon as its state allows.
+            # The local controller receives the old parameters as soon as its state allows.
             plant.want(name, present[0])
             visit.taken_off()
             raise

@@ -1,9 +1,9 @@
 """The coded visit: several heliostats on one surface at once, identified by their movements.
 
-Over a series of photographs each beam moves according to its code (`imaging.coded`); a photograph
-is taken only when all have settled. Each proven beam is a sighting, which is processed like that of
-an ordinary visit, with one fit, the same safeguards, and verification. Beams that are not proven
-are named, and nothing is learnt from them.
+During a series of photographs, each beam moves according to its code (`imaging.coded`); a
+photograph is taken only when all beams have settled. Each identified beam is a sighting, which is
+processed like that of an ordinary visit, with one fit, the same safeguards, and verification. Beams
+that are not identified are reported, and nothing is learnt from them.
 
 A visit to a target is a *joint visit*, a visit of heliostats that track a receiver is a *receiver
 visit*. They differ in how beams arrive and leave, in their light, and in the use of new parameters.
@@ -72,12 +72,12 @@ class Light:
     empty
         The light without beams; None: the surface is never without beams.
     usual, steady
-        Mean brightness of photographs, and its largest relative change; None: it may be any.
+        Mean brightness of photographs, and its largest relative change; None: unlimited.
     other
-        Brightness of the last photograph if it was unusual.
+        Brightness of the last photograph if unusual.
     lasting
-        Whether the last two photographs agreed in another light that is not the dark of a cloud. In
-        that case beams have come or left, and this light is the usual one from then on.
+        Whether the last two photographs agreed at another brightness that is not due to a cloud. In
+        that case beams have arrived or left, and this brightness is the usual one from then on.
     """
 
     view: FaceView | None = None
@@ -88,7 +88,7 @@ class Light:
     lasting: bool = False
 
     async def shown(self, picture: Exposed) -> bool:
-        """Return whether a photograph is as bright as usual, and follow slow changes of the sun."""
+        """Return whether a photograph has the usual brightness, and update the latter slowly."""
         if self.usual is None:
             return True
         level = (await picture.light).brightness
@@ -107,7 +107,7 @@ class Light:
 
 @dataclass
 class _Taken:
-    """The photographs of a visit, and when the heliostats stood still for each.
+    """The photographs of a visit, and when the heliostats were at rest for each.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class _Taken:
         Photographs of the present cycle, each with its number; they are evaluated while the beams
         move on.
     still
-        From when to when all stood at the aims of a photograph, and its number.
+        Start and end of the time at which all were at the aims of a photograph, and its number.
     count, first
         Total number of photographs; and the number with which the present cycle began.
     standing
@@ -178,7 +178,7 @@ class CodedCycle(ABC):
         Name of a visit, for display.
     comes
         Whether heliostats come to the surface, and return to their aims at the end; otherwise they
-        track it, and their beams move a little.
+        track it, and their beams move slightly.
     settings
         Settings of the plant file.
     """
@@ -224,7 +224,7 @@ class CodedCycle(ABC):
         light: Light,
         tell: Tell,
     ) -> dict[str, CycleResult]:
-        """Learn from proven beams; return the results by heliostat."""
+        """Learn from identified beams; return the results by heliostat."""
 
     # -- a visit ---------------------------------------------------------------------------
 
@@ -285,11 +285,11 @@ class CodedCycle(ABC):
     async def photographed(
         self, visit: CodedVisit, layout: Layout, light: Light, tell: Tell
     ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
-        """Bring beams to their places, photograph them, remove them, and tell them apart.
+        """Bring beams to their places, photograph them, remove them, and identify them.
 
         Returns
         -------
-            The sighting of each proven beam, and the results of the others, by heliostat.
+            The sighting of each identified beam, and the results of the others, by heliostat.
         """
         with _Taken.of(layout) as taken:
             async with self._stay(visit, layout, light, tell) as move:
@@ -337,7 +337,8 @@ class CodedCycle(ABC):
             while plant.now() < begin + settle:
                 await visit.look()
             picture = await noting(visit.look, self._next(visit, light, taken))
-            # They stand still until each has reported its step counts, however fast the camera is.
+            # Heliostats stay at rest until each has reported its step counts, however fast the
+            # camera is.
             while plant.now() < begin + 0.5 * settle + _COUNTED:
                 await visit.look()
             stood = plant.now()
@@ -362,7 +363,7 @@ class CodedCycle(ABC):
             raise RefusedError(f"{self.kind} to {visit.target.name}: no heliostat is left; {why}")
 
     async def _next(self, visit: CodedVisit, light: Light, taken: _Taken) -> Exposed:
-        """Take a photograph; few await evaluation, so that an unusable one ends the visit soon."""
+        """Take a photograph; few await evaluation, so an unusable one ends the visit soon."""
         if len(taken.pictures) >= _UNREAD:
             await asyncio.shield(taken.pictures[-_UNREAD][1].light)
         return await self._exposed(visit.target, light)
@@ -370,7 +371,7 @@ class CodedCycle(ABC):
     async def _separated(
         self, visit: CodedVisit, layout: Layout, light: Light, taken: _Taken, tell: Tell
     ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
-        """Return the sightings of proven beams, and the results of the others."""
+        """Return the sightings of identified beams, and the results of the others."""
         chosen = [layout.names.index(name) for name in visit.names]
         pictures = await taken.read()
         moves = layout.moves[[number for number, _ in pictures]][:, chosen]
@@ -424,7 +425,7 @@ class CodedCycle(ABC):
         least: int | None = None,
         leaving: Leaving | None = None,
     ) -> CycleResult:
-        """Learn from a proven beam, see `CalibrationCycle.learn`; an error is also a result."""
+        """Learn from an identified beam, see `CalibrationCycle.learn`; an error is a result."""
         try:
             return await self.cycle.learn(
                 visit.visits[name], taken, confirming=confirming, least=least, leaving=leaving

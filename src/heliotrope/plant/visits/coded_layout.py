@@ -125,7 +125,7 @@ class SentBeam:
     variance
         Variance of its position along each axis, m².
     power
-        Power of its light, in suns m².
+        Power of its light, suns · m².
     step
         Size of the steps in which it follows its aim, m right and up, (2,); see `beam_steps`.
     """

@@ -26,16 +26,17 @@ from heliotrope.plant.visits.visit import BroughtHome, Order, Visit, carried_out
 #: Function that sends heliostats to points, by name, for a person with a token.
 Pointing = Callable[[Person, int, Mapping[str, FloatArray]], Ticket]
 
-#: Longest time for an order, and for the way to standby, s.
+#: Time limits for an order, and for the path to standby, s.
 _ORDER, _HOME = 60.0, 120.0
 #: A goal that has just moved with the sun leaves an axis at most this far from it, rad.
 _STEP = 1e-3
-#: When all but this fraction are at their aims, the others get as long again plus this time, s.
+#: When all but this fraction of heliostats are at their aims, the others are allowed as long again
+#: plus this time, s.
 _FEW, _LATE = 0.1, 10.0
 #: Interval between checks of the field, s.
 _LOOK = 0.25
-#: States in which a beam may be on the target, and states that other orders have led to, which a
-#: visit does not undo.
+#: States in which a beam may be on the target, and states caused by other orders, which a visit
+#: does not undo.
 _ON = (states.IDLE, *states.ON_AIM)
 _OFF = (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.APPROACHING)
 
@@ -135,7 +136,7 @@ class CodedVisit(BroughtHome):
         await self._pointed(self.plant.aim, points, limit)
 
     async def move(self, points: Mapping[str, FloatArray], limit: float) -> None:
-        """Move beams a little away from their aims; those that may not be moved drop out."""
+        """Move beams slightly off their aims; heliostats that may not be moved drop out."""
         await self._pointed(self.plant.commands.move, points, limit)
 
     async def _pointed(
@@ -162,7 +163,7 @@ class CodedVisit(BroughtHome):
     async def _arrived(self, limit: float) -> None:
         """Wait until all stay at their aims in two reports; those that do not arrive drop out.
 
-        Once most have arrived, the others get as long again plus some seconds.
+        Once most have arrived, the others are allowed the same time again plus some seconds.
         """
         begin = self.plant.now()
         until, seen = begin + limit, dict.fromkeys(self.visits, (begin, 0))
@@ -264,7 +265,7 @@ class Returned:
         }
 
     async def __aenter__(self) -> Self:
-        """Note their present aims."""
+        """Record their present aims."""
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:

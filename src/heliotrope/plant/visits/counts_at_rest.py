@@ -19,11 +19,10 @@ _LEAST_ROWS = 3
 
 @dataclass(frozen=True)
 class CountsHeard:
-    """Step counts that one heliostat reported while it stood still for photographs.
+    """Step counts that one heliostat reported while at rest for photographs.
 
-    The local controller reports counts while it stands still for a photograph. They differ from the
-    counts that the aim of the photograph requires by the lag of its tracking; the median of the
-    differences applies to all of them.
+    The counts reported at rest differ from the counts that the aim of the photograph requires by
+    the lag of the tracking. The median of these differences applies to all of them.
 
     Attributes
     ----------
@@ -67,7 +66,7 @@ class CountsHeard:
         base
             Its aim without movement, ENU, m, (3,).
         still
-            Periods in which it stood still at an aim, monotonic s, and that aim, (3,).
+            Periods in which it was at rest at an aim, monotonic s, and that aim, (3,).
         middle
             Time of the counts in question.
         """

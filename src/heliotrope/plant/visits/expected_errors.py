@@ -32,8 +32,8 @@ def expected_covariances(
 ) -> FloatArray:
     """Return the covariances of the errors of K beams at their present aims, rad², (K, 2, 2).
 
-    The axes are to the right of and above the aim, as seen from the mirror. NaN for a beam that
-    cannot reach its aim, and for a heliostat that was never calibrated and has no ``model``.
+    The axes point right and up at the aim, as seen from the mirror. NaN for a beam that cannot
+    reach its aim, and for a heliostat that was never calibrated and has no ``model``.
 
     Parameters
     ----------

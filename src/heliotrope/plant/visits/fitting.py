@@ -58,21 +58,21 @@ class JudgedFit:
     fitted
         Fit of batch shape (1,).
     nominal
-        The mechanism from which it starts, batch shape (1,).
+        The mechanism from which the fit starts, batch shape (1,).
     sightings
-        The sightings, photographs first, without the errors that flights share.
+        The sightings, photographs first; the estimated shared errors of the flights are removed.
     before, after
         Beam errors under the present and the fitted mechanism, weighted by the sightings, rad RMS.
         A fit that follows the drift need not explain the past; only the last day's photographs
         count.
     outcome, problem
-        Why the fit is rejected, empty if it is not.
+        Verdict on the fit, and the reason if it is rejected, empty if not.
     name
         Name of the heliostat.
     flown
         Store numbers of its flight records, which are the last of ``sightings``.
     revealed
-        What it reveals about the shared errors of the flights; None without flight records.
+        What the fit reveals about the shared errors of the flights; None without flight records.
     """
 
     model: str
@@ -102,7 +102,7 @@ class JudgedFit:
         provenance: Provenance = Provenance.CAMERA,
         campaign: str = "",
     ) -> HeliostatCalibration:
-        """Return the record of this fit, whose photographs the beliefs already hold; see there."""
+        """Return the record of this fit for `Beliefs`, which already hold its photographs."""
         known, last = beliefs.known(self.name), beliefs.record(self.name)
         photographs = np.zeros(0, np.int64) if known is None else known.identities
         return HeliostatCalibration.from_fit(
@@ -134,7 +134,7 @@ class Believed:
     hyper
         Hyperparameters of its group; None: not learnt yet.
     flights
-        Flights of a drone.
+        Drone flights.
     """
 
     name: str
@@ -156,9 +156,9 @@ def fit_heliostat(
     """Return the fit of one heliostat, by a model, to its photographs and its flight records.
 
     The fit follows photographs and flight records through the drift to the latest of them, and must
-    explain the last day's, because what the belief considers outliers may come from a mirror that
-    moved an hour ago. If constant parameters explain them better, these are proposed. Flight
-    records share errors with other heliostats, which the joint fit of constants takes into account.
+    explain those of the last day, because apparent outliers may come from a mirror that moved an
+    hour ago. If constant parameters explain them better, the constants are proposed. Flight records
+    share errors with other heliostats, which the joint fit of constants takes into account.
     """
     if believed.name in believed.flights:
         (constants,) = _fit_group(
@@ -223,7 +223,7 @@ def _room(believed: Believed, settings: CycleSettings, flown: Identities) -> flo
     else:
         hours = [process.group == "hours" for process in hyper.processes]
         motion = hyper.amplitude[np.array(hours, dtype=np.bool_)]
-    # A beam turns by twice as much as its normal.
+    # A beam rotates by twice the angle of the normal.
     return float(np.hypot(usual, 2.0 * np.linalg.norm(motion)))
 
 
@@ -232,9 +232,9 @@ def fit_flights(
 ) -> dict[str, JudgedFit]:
     """Return the joint fits of many heliostats that share the errors of flights, by name.
 
-    All are fitted with the model for few sightings; a visit chooses a model for each one. A
-    heliostat whose fit is wrong says nothing about the shared errors, so the others are fitted
-    again without it.
+    All are fitted with the model for few sightings; a calibration visit chooses a model for each
+    heliostat. A heliostat whose fit is wrong does not contribute to the shared errors, so the
+    others are fitted again without it.
     """
     fits_by_name: dict[str, JudgedFit] = {}
     groups: dict[int, list[str]] = {}
@@ -263,7 +263,7 @@ def follow_flights(
 ) -> dict[str, JudgedFit]:
     """Return the fits of `fit_flights` followed through the drift, by name.
 
-    Each replays all sightings of its heliostat.
+    Each fit replays all sightings of its heliostat.
     """
     followed = {}
     for name, joint in fits.items():
@@ -382,7 +382,7 @@ def _judge(
     ending = FitOutcome(int(fitted.outcome[0]))
     if ending is not FitOutcome.CONVERGED:
         return CalibrationOutcome.FIT_FAILED, ending.text
-    # The worm ratio is found by a search, which has tested its significance.
+    # The worm ratio is found by a search, which has already tested its significance.
     fits = np.array([not name.endswith("_worm_ratio") for name in fitted.names])
     far = fits * np.abs(fitted.values[0]) / fitted.prior[0]
     if far.max() > settings.most:
@@ -405,7 +405,7 @@ def _judge(
 
 
 def change_of(present: Mechanism, new: Mechanism, made: Sightings) -> float:
-    """Return the largest change of the beam by new parameters at the counts of sightings, rad."""
+    """Return the largest beam change by new parameters at the counts of sightings, rad."""
     normals = [m[made.heliostat].pose(made.counts).normal for m in (present, new)]
     return 2.0 * float(angle_between(*normals).max())
 
@@ -420,12 +420,12 @@ def surprise_of(record: HeliostatCalibration, nominal: Mechanism, made: Sighting
     nominal
         The mechanism of the design, batch shape (1,).
     made
-        New sightings, heliostat row 0.
+        New sightings, heliostat index 0.
 
     Returns
     -------
     float
-        The largest distance, in standard deviations of itself.
+        The largest distance, in its own standard deviations.
     """
     line = linearise(record.mechanism(nominal)[made.heliostat], made, record.names)
     spread = np.eye(2) + line.jacobian @ record.covariance_at(made.time) @ np.swapaxes(

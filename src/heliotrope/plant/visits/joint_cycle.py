@@ -2,9 +2,9 @@
 
 The empty target is photographed first. New parameters are learnt as after an ordinary visit.
 
-Heliostats that were never calibrated go together, each with its own code. Those that store their
-first parameters return together, and a second series of photographs must prove each beam at the
-position that its parameters predict, which is also their second sighting.
+Uncalibrated heliostats go together, each with its own code. Heliostats that have stored their first
+parameters return together, and a second series of photographs must find each beam at the position
+that its parameters predict, which is also the second sighting.
 """
 
 import asyncio
@@ -36,21 +36,22 @@ from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, light_on
 from heliotrope.plant.visits.visit import Visit
 
-#: Number of sightings that a first fit needs: all photographs of a visit agree, and others verify
-#: it.
+#: Number of sightings that a first fit needs, since all photographs of a visit agree, and others
+#: verify the fit.
 _FIRST = 1
 #: Verdicts on a new heliostat whose beam may be beside the target; light that does not move at its
 #: place may come from another heliostat.
 _NOT_FOUND = (Verdict.FAINT, Verdict.ELSEWHERE, Verdict.STUCK)
-#: Joint visits that did not prove a heliostat. If its beam may be beside the target, it comes again
-#: and aims at another place beside the target.
+#: Joint visits that did not identify a heliostat's beam. If the beam may be beside the target, the
+#: heliostat comes again and aims at another place beside the target.
 JOINT = RetryLaw(
     "joint visit",
     LOOKS,
     0.0,
     "it goes to a target alone, with a search for its beam",
 )
-#: Verdicts for which no heliostat is responsible; a verification that ends so is repeated once.
+#: Verdicts for which no heliostat is responsible; a verification with such a verdict is repeated
+#: once.
 _AGAIN = (Verdict.JOINED, Verdict.CLOUD)
 
 
@@ -69,8 +70,8 @@ class JointCycle(CodedCycle):
     settings
         See `JointSettings`.
     attempts
-        Number of joint visits that did not prove a heliostat; heliostats that exceed the limit go
-        alone.
+        Number of joint visits that did not identify a heliostat's beam; heliostats that exceed the
+        limit go alone.
     """
 
     kind, comes = "joint visit", True
@@ -94,7 +95,7 @@ class JointCycle(CodedCycle):
         return 0 < self.attempts.counts.get(heliostat, 0) < LOOKS
 
     def note(self, result: CycleResult) -> None:
-        """Note the result of a visit, joint or single: whether the heliostat may join again.
+        """Record from the result of a joint or single visit whether the heliostat may join again.
 
         If the beams of all new heliostats miss the target, the target is as dark as under a cloud.
         The search therefore continues at the next position, and a cloud does not end it.
@@ -191,7 +192,7 @@ class _Waiting:
     fitted, nominal
         The fit of batch shape (1,), and the mechanism from which it starts.
     problem
-        Future reason why the fit is not confirmed, None if it is.
+        Future with the reason why the fit is not confirmed, None if it is.
     """
 
     visit: Visit
@@ -225,7 +226,7 @@ class _Verification:
     visit, light
         The visit to the target, and the light there.
     heliostats
-        Names of all that may come.
+        Names of all heliostats that may come.
     tell
         Called with the name of each step.
 
@@ -261,7 +262,7 @@ class _Verification:
         return await problem
 
     def leave(self, heliostat: str) -> None:
-        """Note that a heliostat has come, or will not come any more."""
+        """Record that a heliostat has come, or will no longer come."""
         self._coming.discard(heliostat)
         if not self._coming:
             self._complete.set()
@@ -280,8 +281,8 @@ class _Verification:
         """Verify new parameters; the sightings of confirmed heliostats are stored in `seen`.
 
         Heliostats that would make the target too bright are photographed later. Heliostats hidden
-        by other light come once more, each with its own code. Each series of photographs decides
-        about its own heliostats, whatever the next one shows.
+        by other light come once more, each with its own code. Each series of photographs is
+        conclusive for its heliostats, whatever the next series shows.
         """
         waits, own = tuple(self._waiting), False
         while waits:

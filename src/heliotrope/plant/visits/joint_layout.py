@@ -7,8 +7,8 @@ The beam of a heliostat that was never calibrated misses by metres, so separate 
 guaranteed. Each such heliostat has its own code, and moves widely to the right and left, which
 needs half as many photographs as movements along both axes. Heliostats with a larger expected miss
 aim nearer to the middle; a heliostat whose beam was not found before aims beside the target, so
-that its beam comes onto the target. The target must not become too bright wherever the beams truly
-are, so the expected light plus twice its standard deviation counts.
+that its beam comes onto the target. The target must not become too bright, wherever the beams
+actually are, so the limit applies to the expected light plus twice its standard deviation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ _CODES = (3, 7, 15, 31, 63, 127)
 _UP = 1
 #: The same for a first visit.
 _FIRST_BORDER, _FIRST_PLACED = 1.5, 1.5
-#: Number of standard deviations by which the light may exceed its expected value.
+#: Number of standard deviations by which the light is assumed to exceed its expected value.
 _ABOVE = 2.0
 #: Number of points across the target at which its light is computed.
 _ACROSS = 15
@@ -126,7 +126,7 @@ def _darkened(
 def _unknown(
     plant: PlantController, name: str, error: float, settings: JointSettings
 ) -> str | None:
-    """Return the reason why a beam is not known well enough by its expected error, or None."""
+    """Return the reason why the expected error of a beam is too large, or None."""
     if plant.beliefs.record(name) is None:
         return "it has no calibration yet; it is calibrated alone first"
     if error > settings.known:
@@ -151,7 +151,7 @@ def errors_on(
     """
     aims = np.broadcast_to(target.center, (len(heliostats), 3))
     found = expected_errors(plant, heliostats, aims, model)
-    # The priors of a heliostat that was never calibrated include what is drawn anew at each visit.
+    # The priors of an uncalibrated heliostat include errors that differ from visit to visit.
     known = np.array([plant.beliefs.record(name) is not None for name in heliostats])
     found = np.hypot(found, known * np.sqrt(2.0) * settings.visit)
     return dict(zip(heliostats, found.tolist(), strict=True))
@@ -207,7 +207,7 @@ def bells(points: FloatArray, places: FloatArray, moments: FloatArray) -> FloatA
 def _shared(
     known: Mapping[str, SentBeam], places: FloatArray, along: int | None
 ) -> npt.NDArray[np.intp]:
-    """Return the code of each beam, (M,), with as few codes as keep beams of one code apart."""
+    """Return the code of each beam, (M,): the fewest codes that keep beams of one code apart."""
     spread = np.array([b.moments + b.variance * np.eye(2) for b in known.values()])
     for few in _CODES if len(known) else ():
         # A series of movements along one axis has twice as many codes.
@@ -258,7 +258,7 @@ def newcomers(
 
 
 def _first_places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:
-    """Return places, right of and above the centre, m, (M, 2); the best known go far out."""
+    """Return places, right of and above the centre, m, (M, 2); well-known beams go far out."""
     if not sent:
         return np.zeros((0, 2))
     half = np.abs(target.plane_coordinates(target.corners)).min(axis=0)
@@ -276,7 +276,7 @@ def _first_places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:
 
 
 def _brightest(target: Target, sent: Mapping[str, SentBeam], places: FloatArray) -> float:
-    """Return the most light that must be expected at a place of the target, in suns."""
+    """Return the highest light level to be expected anywhere on the target, in suns."""
     corners = target.plane_coordinates(target.corners)
     x, y = (np.linspace(low, high, _ACROSS) for low, high in zip(*_ends(corners), strict=True))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -21,22 +21,22 @@ from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.visits.photographs import Shot, TargetCamera
 from heliotrope.plant.workers import Worker
 
-#: An axis is turning if it is further than this from its goal, rad.
+#: An axis is moving if it is further than this from its goal, rad.
 _TURNS = 2e-3
-#: Step counts older than this leave the shift unknown, s.
+#: Age of step counts above which the shift is unknown, s.
 _OLD = 30.0
 
 
 @dataclass(frozen=True)
 class Standing:
-    """How the N heliostats of a field stood when a photograph was taken.
+    """The poses of the N heliostats of a field when a photograph was taken.
 
     Attributes
     ----------
     counts, goals
         Step counts as last known, and their goals, (N, 2).
     at
-        When the counts were true, monotonic s, (N,); minus infinity if they were never known.
+        When the counts were valid, monotonic s, (N,); minus infinity if they were never known.
     """
 
     counts: FloatArray
@@ -51,7 +51,7 @@ class Standing:
 
 
 class Unhidden:
-    """Centroids corrected as if no neighbour obstructed the light.
+    """Corrects centroids for obstruction by neighbours.
 
     Parameters
     ----------

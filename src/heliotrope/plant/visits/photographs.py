@@ -26,7 +26,8 @@ from heliotrope.plant.visits.visit import Visit
 CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))
 #: Number of spare photographs, because some may be cut off at the edge of the target.
 _SPARE = 2
-#: A light that was absent where it was expected must have followed the aim this often to be used.
+#: Light that was once absent where it was expected must have followed the aim this often to be
+#: used.
 _FOLLOWED = 2
 #: An aim this close to the previous one is not sent, m.
 _SAME = 0.05
@@ -148,7 +149,8 @@ class Centred:
 
         Returns
         -------
-            Distance by which it misses its aim, right and up, m, (2,), None if not found; and why.
+            Distance by which the beam misses its aim, right and up, m, (2,), None if not found; and
+            why.
         """
         target = visit.target
         light = await self._find(visit, np.asarray(target.center), tell)
@@ -281,7 +283,7 @@ async def photographed(camera: TargetCamera, visit: Visit) -> Shot:
     Raises
     ------
     RefusedError
-        If it left its aim in the meantime.
+        If the heliostat has left its aim in the meantime.
     """
     shot = await camera.photograph(visit.target, visit.heliostat)
     if visit.state != states.TRACKING:

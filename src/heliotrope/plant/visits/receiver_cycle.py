@@ -1,11 +1,11 @@
 """The receiver visit: heliostats that track a receiver are measured while they do.
 
 A few dozen heliostats that track the receiver move their beams by a milliradian, each by its own
-code, while all others keep tracking. A camera observes the receiver. The movements are orders of
-the plant like any other, each proven before it is sent; the plant moves the beams back to their
-aims whatever happens to the visit (`movements`). A heliostat leaves the receiver only for new
-parameters that justify it, a few heliostats at a time, and only if no photograph must confirm them.
-Changes that need confirmation, and heliostats with any fault, are left to a visit to a target.
+code, while all others keep tracking. A camera observes the receiver. The movements are ordinary
+orders of the plant, each checked before it is sent; the plant moves the beams back to their aims
+whatever happens to the visit (`movements`). A heliostat leaves the receiver only for new parameters
+that justify it, a few heliostats at a time, and only if no photograph must confirm them. Changes
+that need confirmation, and heliostats with any fault, are left to a visit to a target.
 """
 
 import asyncio
@@ -32,9 +32,9 @@ from heliotrope.plant.visits.receiver_layout import arranged_on
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, light_on
 from heliotrope.plant.visits.visit import Visit
 
-#: Longest time for a movement, and for the return to the aims, s.
+#: Time limits for a movement, and for the return to the aims, s.
 _ORDER, _BACK = 20.0, 60.0
-#: Number of photographs that show whether the sun is steady, and the interval between them, s.
+#: Number of photographs that show whether sunlight is steady, and the interval between them, s.
 _LOOKS, _BETWEEN = 3, 2.0
 #: Smallest fraction of the receiver that a photograph must show below full scale.
 _SEEN = 0.5
@@ -116,7 +116,7 @@ class ReceiverCycle(CodedCycle):
         light: Light,
         tell: Tell,
     ) -> dict[str, CycleResult]:
-        """Learn from each proven beam; a heliostat that leaves the receiver returns to its aim."""
+        """Learn from each identified beam; heliostats that leave the receiver return later."""
         del layout, light, tell
         plant = self._plant
         lit = plant.field.among((states.TRACKING,), plant.now())

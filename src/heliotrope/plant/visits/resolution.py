@@ -13,7 +13,7 @@ Rows = npt.NDArray[np.intp]
 
 #: Minimum size of a coded movement, in steps in which a beam follows its aim. Each end of a
 #: movement is off by at most half a step, so its size is off by a quarter. A beam whose movement
-#: differs by 0.3 from what its light indicates is taken for two beams (`imaging.coded`).
+#: differs by 0.3 from the movement of its light is taken for two beams (`imaging.coded`).
 LEAST_STEPS = 2.0
 #: Number of steps over which a beam's motion is a straight line.
 _STRAIGHT = 10.0
@@ -22,12 +22,12 @@ _STRAIGHT = 10.0
 def beam_slopes(
     plant: PlantController, row: int | Rows, target: Target, sun: FloatArray, counts: FloatArray
 ) -> FloatArray:
-    """Return the displacement of beams on a target by a drive step, ENU, m, (..., 2, 3).
+    """Return the displacement of beams on a target per drive step, ENU, m, (..., 2, 3).
 
     Parameters
     ----------
     plant, row
-        The plant, and rows of heliostats, (...).
+        The plant, and indices of heliostats, (...).
     target, sun
         The target, and the unit vector to the sun, (3,).
     counts
@@ -58,7 +58,7 @@ def beam_steps(
     plant, target, sun
         As in `beam_slopes`.
     rows, aims
-        Rows of the heliostats, (K,), and aims of their beams, ENU, m, (K, 3).
+        Indices of the heliostats, (K,), and aims of their beams, ENU, m, (K, 3).
     """
     counts = plant.beams.poses(rows, aims, sun).best_counts
     slopes = np.abs(beam_slopes(plant, rows, target, sun, counts) @ target.axes.T)

@@ -32,7 +32,7 @@ def swung(axis: AxisLimits, fall: float, span: float, heard: float = math.inf) -
     Parameters
     ----------
     axis
-        Axis of the machine.
+        Limits of the axis.
     fall
         Steps by which its goal dropped between two reports at its goals; 0 or less: it did not
         drop.

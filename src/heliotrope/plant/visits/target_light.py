@@ -19,8 +19,8 @@ from heliotrope.plant.visits.photographs import TargetCamera
 T = TypeVar("T")
 #: A pixel is left out if it is clipped to at least this degree in any photograph.
 _FULL = 0.01
-#: A beam is joined with other light if its power, relative to the size of its mirror, differs from
-#: that of the others by this fraction and by this many of their standard deviations.
+#: A beam counts as merged with other light if its power, relative to the size of its mirror,
+#: differs from that of the others by this fraction and by this many standard deviations.
 _OTHER, _SIGMAS = 0.4, 4.0
 
 
@@ -116,7 +116,7 @@ def separated(
 
 
 def judged(beams: Sequence[SeparatedBeam], powers: FloatArray) -> list[SeparatedBeam]:
-    """Return beams (M,), with those marked as joined whose power does not fit their mirror size.
+    """Return beams (M,), marking those as merged whose power does not match their mirror size.
 
     The apparent brightness of the mirrors is not known in advance, but it is the same for all.
 

@@ -1,4 +1,4 @@
-"""Verification of new parameters: one photograph of the beam where they send it.
+"""Verification of new parameters: one photograph of the beam at the position that they predict.
 
 A fit explains whatever the photographs show, stray light as well as the beam. The heliostat
 therefore returns to the target with its new parameters, to a position away from all earlier
@@ -78,7 +78,7 @@ class Prediction:
         fitted
             The fit, of batch shape (1,).
         made
-            One sighting that the fit did not use, heliostat row 0.
+            One sighting that the fit did not use, heliostat index 0.
         """
         line = linearise(mechanism, made, tuple(fitted.names))
         slope = line.jacobian[0]

@@ -32,8 +32,8 @@ Order = Callable[[tuple[str, ...]], Ticket]
 #: A heliostat has arrived when both axes are this close (rad) to their goals in two consecutive
 #: reports.
 ARRIVED = 3e-4
-#: Longest silence of a heliostat after a command is done, and longest time for which a reason that
-#: ends by itself may delay an order, s.
+#: Longest silence of a heliostat after a command is done, and longest time for which a temporary
+#: reason may delay an order, s.
 SILENT = 10.0
 #: Interval between checks of the field, s.
 _LOOK = 0.25
@@ -48,9 +48,8 @@ async def carried_out(
 ) -> dict[str, str]:
     """Issue an order to heliostats and wait until it is done; return those that fail, and why.
 
-    A reason that ends by itself within seconds does not end a visit: a heliostat that is refused
-    for such a reason (`refusals.SOON`) gets the order again, until nothing has changed for `SILENT`
-    s.
+    A reason that clears within seconds does not end a visit: the order is repeated to a heliostat
+    that was refused for such a reason (`refusals.SOON`), until nothing has changed for `SILENT` s.
 
     Parameters
     ----------
@@ -93,7 +92,7 @@ async def carried_out(
 
 
 class BroughtHome(ABC):
-    """A visit that takes fine steps in its ``async with``, and is brought home when that ends."""
+    """A visit that uses fine steps in its ``async with``, and then is brought home."""
 
     plant: PlantController
 
@@ -113,7 +112,7 @@ class BroughtHome(ABC):
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Bring them home. A cancelled visit ends as cancelled, even if coming home is refused."""
+        """Bring the heliostats home; a cancelled visit ends as cancelled even if refused."""
         try:
             await self.home()
         except RefusedError:
@@ -129,7 +128,7 @@ class Visit(BroughtHome):
     Parameters
     ----------
     plant, mandate
-        The plant, and the mandate under which commands are given.
+        The plant, and the mandate under which commands are issued.
     heliostat, target
         Name of the heliostat, and the target.
 
@@ -299,7 +298,7 @@ class Visit(BroughtHome):
         return float(np.abs((goal - here) * self._drives.radians_per_count(here)).max())
 
     async def look(self) -> None:
-        """Wait a little, and note the counts if they are new.
+        """Wait briefly, and record the counts if they are new.
 
         Raises
         ------
@@ -312,7 +311,7 @@ class Visit(BroughtHome):
         self.note()
 
     def note(self) -> None:
-        """Note the last reported step counts, if they are new."""
+        """Record the last reported step counts if they are new."""
         # Counts may be polled less often than the state; their own age gives their time of
         # validity.
         counted = float(self.plant.field.counted_at[self.row])
@@ -330,8 +329,8 @@ class Visit(BroughtHome):
         """Return the step counts at an instant, interpolated between adjacent reports, (2,).
 
         Only reports at the goals count. An axis that moves down with the sun swings below its goal
-        from time to time, so as to approach from below; a report from such a moment says nothing
-        about the next second.
+        from time to time, so as to approach from below; a report from such a moment is not valid
+        for the next second.
 
         Raises
         ------

@@ -196,7 +196,7 @@ class Field:
         return np.asarray(self.journals.drives(chosen).angles(np.asarray(counts, dtype=np.float64)))
 
     def _pose(self, rows: Rows, aims: FloatArray, ahead_ms: int) -> tuple[FloatArray, Bools]:
-        """Return joint angles (M, 2) at which beams reach aims (M, 3), and whether they do."""
+        """Return joint angles (M, 2) for aims (M, 3), and which of the aims can be reached."""
         sun = (self._sun[0] + self._sun[1] * (self._sun_ms + ahead_ms) // 1000) / UNIT
         counts = self.axes["count"][rows].astype(np.float64)
         return self.journals.pose(rows, sun / np.linalg.norm(sun), aims, counts)

@@ -383,7 +383,7 @@ class QuietObserver(Judge):
         return max(safe.get(mirror.account.address, never), safe.get(wire.BROADCAST, never))
 
     def _carried_out(self, mirror: _Mirror, now: float) -> None:
-        """Check that an order leads to its state in time, and that the plant is told."""
+        """Check that an order is carried out by its deadline and that the plant is notified."""
         order = mirror.order
         if order is None:
             return

@@ -25,41 +25,40 @@ from heliotrope.twin.world.work import Work
 
 #: What an operator does each second on duty, with the token of the command authority.
 Commanding = Callable[[Operations, Person, int], None]
-#: Time until the clusters have a new token, and in which a command is done that only changes a
-#: setting, s.
+#: Time until the clusters have a new token and a command that only changes a setting is done, s.
 _DONE = 4.0
-#: Time for which an operator waits until mirrors have gone to stow and take UNLOCK, s.
+#: Time for which an operator waits for heliostats to reach stow and accept UNLOCK, s.
 _UNLOCKED_WITHIN = 120.0
-#: Noise of a parameter that an operator has measured, rad; and of points that operators choose, m.
+#: Noise of a parameter measured by an operator, rad, and of points chosen by operators, m.
 _MEASURED, _BESIDE = 3e-4, 0.5
-#: Least time on duty, s.
+#: Minimum time on duty, s.
 _LEAST_DUTY = 2.0
 
 
 class Acts:
-    """Acts of operators; each raises `RefusedError` where the plant refuses it.
+    """Actions of operators; each raises `RefusedError` if the plant refuses it.
 
     Parameters
     ----------
     work
         Automatic control.
     operator
-        Its operators' means: clears what latches, raises emergencies.
+        Operator who clears latched alarms and raises emergencies.
     watch
-        Observers of automatic control, which hear of each act.
+        Observers of automatic control, which are informed of each action.
     truth
         True imperfections of each heliostat, rad, by name and parameter.
     clock
         True time.
     seed
-        Seed of their acts.
+        Seed of the actions.
 
     Attributes
     ----------
     names
         The heliostats.
     chance
-        Source of all that is drawn.
+        Source of random numbers.
     """
 
     def __init__(
@@ -77,9 +76,9 @@ class Acts:
         self.names, self._truth, self._clock = tuple(truth), truth, clock
         self.chance = random.Random(f"shift {seed}")
         self._others = random.Random(f"locks {seed}")
-        self._withheld: set[str] = set()  # what a person keeps from automatic control
+        self._withheld: set[str] = set()  # withheld from automatic control
         self._locked: dict[str, str] = {}  # who has locked each heliostat
-        #: UNLOCK under way: the plant's program, its ticket, and who had locked each heliostat.
+        #: UNLOCK in progress: the plant's program, its ticket, and who had locked each heliostat.
         self._unlocking: list[tuple[Operations, Ticket, dict[str, str]]] = []
         operator.commands = False
 
@@ -88,18 +87,18 @@ class Acts:
         return self._clock.monotonic()
 
     def present(self) -> Operations | None:
-        """Return the operations of the plant; None while it does not run, or nobody is there."""
+        """Return the operations of the plant; None while it does not run, or nobody is present."""
         away = self._operator.away or self._operator.waits
         return None if away else self._work.operations
 
     def acted(self, word: str, person: Person = ENGINEER) -> None:
-        """Report an act; its event has this word in it."""
+        """Report an action, whose event contains this word."""
         self._watch.acted(self._work.operations, person, word, self.now())
 
     # -- giving back -------------------------------------------------------------------------
 
     def tidies(self, operations: Operations) -> None:
-        """Clear what latches, let automatic control go on, and give it the field."""
+        """Clear latched alarms, resume automatic control, and give the field back to it."""
         taken = self._operator.clear(operations.plant)
         holds = operations.plant.sentinel.on
         if CALLED in taken or not holds:
@@ -121,7 +120,7 @@ class Acts:
         self._withheld.clear()
 
     def _returns(self, operations: Operations, name: str, owners: Sequence[str]) -> None:
-        """Return one of the locks on a heliostat: its owner does, or an engineer by name."""
+        """Remove one of the locks on a heliostat, as its owner or as an engineer."""
         owner = owners[0]
         who = ENGINEER
         if owner != ENGINEER.name and self._others.random() < 0.5:
@@ -146,7 +145,7 @@ class Acts:
         reason: str = "",
         leaves: bool = False,
     ) -> None:
-        """Take the command authority for a while, and command; automatic control gives way.
+        """Take the command authority for a while, and issue commands; automatic control yields.
 
         Parameters
         ----------
@@ -157,9 +156,9 @@ class Acts:
         commands
             Called each second with a chance of a fifth.
         reason
-            Why it is seized from its holder; "": it is taken.
+            Reason for seizing the authority from its holder; "": it is taken when free.
         leaves
-            Whether the person goes without giving it back, so that it runs out.
+            Whether the person leaves without releasing the authority, so that it expires.
         """
         token = self._takes(operations, person, reason)
         until = self.now() + self.chance.uniform(_LEAST_DUTY, most)
@@ -190,7 +189,7 @@ class Acts:
     async def once(
         self, operations: Operations, person: Person, what: str, values: Sequence[float]
     ) -> None:
-        """Take the command authority for one command to all, and give it back when it is done."""
+        """Take the command authority for one field-wide command, and release it afterwards."""
         token = self._takes(operations, person, "")
         await asyncio.sleep(_DONE)  # until the clusters have the new token
         self.command(operations, person, token, what, (), values)
@@ -231,7 +230,7 @@ class Acts:
         names: Sequence[str],
         values: Sequence[float] = (),
     ) -> None:
-        """Give a command to some heliostats, () for all."""
+        """Issue a command to some heliostats, () for all."""
         if what not in ("ROUGH", "LOCK_AIM"):
             self._watch.taken(names or self.names)
         ticket = operations.command(person, token, what, names, values)
@@ -245,7 +244,7 @@ class Acts:
                 self._unlocking.append((operations, ticket, mine))
 
     def _hear(self) -> None:
-        """Learn what became of UNLOCK: one on its way to stow refuses it, and stays locked."""
+        """Handle the result of UNLOCK, which a heliostat on its way to stow refuses."""
         pending = self._unlocking
         self._unlocking = []
         for program, ticket, mine in pending:
@@ -259,7 +258,7 @@ class Acts:
     def aims(
         self, operations: Operations, person: Person, token: int, names: Sequence[str]
     ) -> None:
-        """Aim some heliostats at the receiver anew, or at a target."""
+        """Aim some heliostats at the receiver again, or at a target."""
         where = self.chance.choice(("receiver", *operations.targets))
         self._watch.taken(names)
         ticket = operations.aim_at(person, token, names, where)
@@ -268,7 +267,7 @@ class Acts:
     def points(
         self, operations: Operations, person: Person, token: int, names: Sequence[str]
     ) -> None:
-        """Set other standby points of some heliostats, or other aims on the receiver."""
+        """Set new standby points of some heliostats, or new aims on the receiver."""
         what = self.chance.choice(("STANDBY", "AIM"))
         gives, about = {
             "STANDBY": (operations.standby, STANDBY),
@@ -281,9 +280,9 @@ class Acts:
         self.accepted(person, token, gives(person, token, chosen), what)
 
     def parameters(self, operations: Operations, person: Person, token: int) -> None:
-        """Set a parameter of one heliostat to what was measured at the mirror.
+        """Set a parameter of one heliostat to the value measured at its mirror.
 
-        The reason that is given with it confirms a large change, as the plant demands.
+        The reason passed with it confirms a large change, as the plant requires.
         """
         name = self.chance.choice(self.names)
         causes = self._truth[name]
@@ -293,7 +292,7 @@ class Acts:
         try:
             ticket = typed(person, token, name, values, "measured with an inclinometer")
         except InputError:
-            return  # beyond what an installation may be, or what it has already
+            return  # implausible for an installation, or already in use
         self._watch.typed((name,))
         self.accepted(person, token, ticket, "PARAMETERS")
 
@@ -305,7 +304,7 @@ class Acts:
     # -- what anybody may do -----------------------------------------------------------------
 
     async def takes_off(self, operations: Operations) -> None:
-        """Take a mirror off, in a visit or not."""
+        """Order a heliostat off, whether in a visit or not."""
         name = self.chance.choice(self.names)
         self._watch.taken((name,))
         what = self.chance.choice(["DEFOCUS", "STOW"])
@@ -315,7 +314,7 @@ class Acts:
         self._withheld.add(name)
 
     async def holds(self, operations: Operations, person: Person = ENGINEER) -> None:
-        """Take a mirror out of service, perhaps one that others have locked: it goes to stow."""
+        """Take a heliostat, even one locked by others, out of service; it goes to stow."""
         name = self.chance.choice(self.names)
         if self._persons.locks and self._others.random() < 0.5:
             name = self._others.choice(sorted(self._persons.locks))
@@ -334,7 +333,7 @@ class Acts:
         stand = {call.who: Act[call.act] for call in operations.plant.sentinel.calls}
         operations.emergency(person, act.name, "somebody is in the field")
         if act <= stand.get(person.name, Act.ALARM):
-            return  # it merges with the person's own order, which says as much
+            return  # it merges with the person's own order, which is at least as strong
         self.acted(f"EMERGENCY {act.name}", person)
         self._operator.raised(person, act)
         self._watch.emergency(on=True)
@@ -342,7 +341,7 @@ class Acts:
     def calibrate(
         self, operations: Operations, person: Person, *, together: bool, receiver: bool
     ) -> None:
-        """Ask for a calibration now: of one heliostat or of several."""
+        """Request the calibration of one or several heliostats now."""
         count = self.chance.randint(2, 3) if together or receiver else 1
         first, *others = self.chance.sample(self.names, count)
         operations.calibrate(person, first, together=others, receiver=receiver)

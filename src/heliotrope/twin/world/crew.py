@@ -1,8 +1,8 @@
 """The people of a working day: two operators, a script, and a field attendant.
 
-They do what people do, at critical moments: when a visit is on its way, between its photographs,
-while a heliostat is locked for its parameters, while the beams are being separated. Two of them may
-act at once. Some time later the attendant withdraws emergencies, presses Resume, and gives the
+They act at critical moments: when heliostats travel to a visit, between its photographs, while a
+heliostat is locked to write its parameters, or while beams are being separated. Two of them may act
+at the same time. Some time later the attendant withdraws emergencies, presses Resume, and gives the
 field back to automatic control. On every other day, on average, everyone leaves at lunchtime, and
 automatic control has the rest of the day. A run may plan their actions instead (`CrewAct`).
 """
@@ -23,25 +23,25 @@ from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER
 
 #: The script, which has an operator's token.
 SCRIPT = Person("script", Role.OPERATOR)
-#: All operators of a crew whose acts are reported.
+#: All operators of a crew whose actions are reported.
 CREW = (OPERATOR, ENGINEER, VIEWER, SCRIPT)
-#: Mean time between two acts of one operator, and longest wait for a moment, s.
+#: Mean time between two actions of one operator, and longest wait for a moment, s.
 _PAUSE, _PATIENCE = 110.0, 60.0
 #: Longest time from a moment until an operator acts, s.
 _AFTER = 3.0
-#: Pause between two looks at the plant, s.
+#: Interval between checks of the plant, s.
 _LOOK = 0.5
-#: Longest time on duty, of an emergency, until somebody looks after the field, and of lunch, s.
+#: Maximum durations on duty, of an emergency, until someone attends to the field, and of lunch, s.
 _DUTY, _EMERGENCY, _CARE, _LUNCH = 40.0, 40.0, 40.0, 60.0
-#: Share of the days on which all leave at this share of the day.
+#: Fraction of days on which all leave, and fraction of the day at which they do.
 _LEAVE, _LEFT = 0.5, 0.45
-#: Words in the stages of visits for which operators wait; a mirror is locked; and any instant.
+#: Words in the stages of visits for which operators wait; locking of a heliostat; and any time.
 LOCKED, ANY_TIME = "locked", "any time"
 MOMENTS = (
     "on the way", "empty target", "photograph", "on the way back", "taking the beams apart",
     "learning", "verification", LOCKED, ANY_TIME,
 )  # fmt: skip
-#: Acts with their weights; see `Crew.acts`.
+#: Actions with their weights; see `Crew.acts`.
 WEIGHTS = {
     "duty": 5, "rough": 1, "seizes": 1, "leaves": 1, "off": 3, "hold": 2, "emergency": 2,
     "calibrate": 3, "together": 1, "receiver": 1, "switch": 1, "parameters": 2, "points": 2,
@@ -51,16 +51,16 @@ WEIGHTS = {
 
 @dataclass(frozen=True)
 class CrewAct:
-    """An act of a person that a run plans.
+    """A planned action of one person.
 
     Attributes
     ----------
     what
         A key of `WEIGHTS`.
     moment
-        One of `MOMENTS`, for which the person waits.
+        The moment for which the person waits, one of `MOMENTS`.
     after
-        Time from the moment to the act, s.
+        Time from the moment to the action, s.
     person
         Who acts.
     """
@@ -77,15 +77,16 @@ class Crew:
     Parameters
     ----------
     acts
-        What they do.
+        The actions available to the operators.
     boards
-        All heliostats, which operators see.
+        All heliostats, which the operators see.
     seconds
         Length of the day, s.
     rough
-        Whether the engineer lets all heliostats step roughly in the morning.
+        Whether the engineer sets all heliostats to coarse steps in the morning.
     planned
-        Their acts, one after another; None: all is drawn. The field has its attendant in any case.
+        Planned actions, one after another; None: drawn at random. The attendant is there in any
+        case.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class Crew:
         self._begin = acts.now()
         share = _LEFT if self._chance.random() < _LEAVE else 1.0
         self._until = self._begin + share * seconds
-        self._ends_at = 0.0  # until then an emergency is wanted
+        self._ends_at = 0.0  # the emergency is kept until then
         self._care_at: float | None = None
 
     async def work(self) -> None:
@@ -122,7 +123,7 @@ class Crew:
     # -- looking after the field ---------------------------------------------------------------
 
     async def _cares(self) -> None:
-        """Withdraw emergencies, press Resume, give the field back: soon, but not at once."""
+        """Withdraw emergencies, press Resume and give the field back, after a short delay."""
         while True:
             await asyncio.sleep(_LOOK)
             operations, now = self._acts.present(), self._acts.now()
@@ -139,7 +140,7 @@ class Crew:
     # -- acting --------------------------------------------------------------------------------
 
     async def _acts_as(self, person: Person) -> None:
-        """Act now and then, at a moment that matters."""
+        """Act occasionally, at a critical moment."""
         while True:
             await asyncio.sleep(self._chance.expovariate(1.0 / _PAUSE))
             await self._moment(self._chance.choice(MOMENTS))
@@ -162,7 +163,7 @@ class Crew:
                 await self._does(act.what, operations, act.person)
 
     async def _moment(self, moment: str, patience: float = _PATIENCE) -> None:
-        """Wait until a visit is at a stage, for a time at most, s."""
+        """Wait until a visit is at a stage, for at most ``patience`` s."""
         until = self._acts.now() + patience
         while self._acts.now() < until and moment not in self._moments():
             await asyncio.sleep(_LOOK)
@@ -202,7 +203,7 @@ class Crew:
             await self._duty(what, operations, person)
 
     async def _duty(self, what: str, operations: Operations, person: Person) -> None:
-        """Take the command authority, and command some or all."""
+        """Take the command authority, and command some or all heliostats."""
         everybody = what == "rough" and person is ENGINEER
         commands = self._roughens if everybody else self._some
         if what == "points":
@@ -221,7 +222,7 @@ class Crew:
         )
 
     def _roughens(self, operations: Operations, person: Person, token: int) -> None:
-        """Switch all to rough or fine steps."""
+        """Switch all heliostats to coarse or fine steps."""
         rough = float(self._chance.random() < 0.7)
         self._acts.command(operations, person, token, "ROUGH", (), (rough,))
 
@@ -234,7 +235,7 @@ class Crew:
         self._acts.points(operations, person, token, names)
 
     def _some(self, operations: Operations, person: Person, token: int) -> None:
-        """Command one heliostat, a few, or none: most look only."""
+        """Command one heliostat, a few, or most often none."""
         chance, acts = self._chance, self._acts
         names = chance.sample(acts.names, chance.randint(1, 3))
         does: list[Callable[[], None]] = [

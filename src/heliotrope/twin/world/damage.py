@@ -22,22 +22,22 @@ from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import Pod
 
-#: Faults of one heliostat, and of one cluster; every other one concerns them all. A cluster belongs
-#: to another run of a plant some time after it has begun, s.
+#: Faults of one heliostat, and of one cluster; all other faults concern the whole field. Also the
+#: time within which clusters join a new run of the plant, s.
 _OF_BOARD = ("power_cut", "brown_out", "flash_cut", "tick_jump", "board_exchanged", "stall")
-#: After these nothing tells where the mirror stands.
+#: Faults after which the pose of the mirror is unknown.
 _MISLEAD = ("board_exchanged", "stall")
 _DOWN = ("plant_crash", "plant_file", "plant_restored")
 _NEW_RUN, _RUN_WITHIN = (*_DOWN, "plant_twice"), 15.0
 _OF_CLUSTER = ("line", "bus", "cluster", "time", "replay", "forgery", "stranger_safe", "noise")
-#: Time for which a mirror has no supply while its board is exchanged, s.
+#: Time for which a heliostat has no supply while its board is exchanged, s.
 _EXCHANGE = 5.0
-#: An order need not be carried out while a fault of these kinds lasts.
+#: Kinds of faults during which an order need not be carried out.
 _HINDERS = ("line", "bus", "plant", "cluster_frozen")
 
 
 class SimulatedPlant(Protocol):
-    """The simulated plant that faults happen to; see `Simulation` for its attributes."""
+    """The simulated plant that faults affect; see `Simulation` for its attributes."""
 
     begin: float
     boards: list[Board]
@@ -50,7 +50,7 @@ class SimulatedPlant(Protocol):
     faults: Counter[str]
 
     def pod_of(self, fault: Fault) -> Pod:
-        """Return the cluster that a fault happens to."""
+        """Return the cluster that a fault affects."""
         ...
 
     def start_plant(self, group: asyncio.TaskGroup) -> None:
@@ -62,11 +62,11 @@ class SimulatedPlant(Protocol):
         ...
 
     def edit_plant_file(self, fault: Fault) -> None:
-        """Write another stow position of a heliostat into the plant file."""
+        """Write a different stow position of a heliostat into the plant file."""
         ...
 
     def restore_store(self) -> None:
-        """Put a backup in the place of the plant's store."""
+        """Replace the plant's store with a backup."""
         ...
 
     def run_twice(self, group: asyncio.TaskGroup, *, on: bool) -> None:
@@ -74,7 +74,7 @@ class SimulatedPlant(Protocol):
         ...
 
     def hang_plant(self, now: float, *, silent: bool, frozen: bool) -> None:
-        """Silence the plant's program, or freeze it, or let it go on."""
+        """Silence the plant's program, freeze it, or let it continue."""
         ...
 
 
@@ -101,13 +101,13 @@ class Damage:
         self._active: list[tuple[float, Fault]] = []
         self._off: dict[int, float] = {}  # boards without power, and when it returns
         self._own: dict[int, NorFlash] = {}  # flash of the boards that were exchanged
-        #: When the last fault of a heliostat, of a cluster, or of all ended, s.
+        #: When the last fault of a heliostat, of a cluster, or of the whole field ended, s.
         self._rest: dict[str, float] = {}
-        self._pause = 1.0  # until a board that died during a write restarts
+        self._pause = 1.0  # until a board that lost power during a write restarts
         self.next = -math.inf
 
     def hinders(self, pod: Pod) -> bool:
-        """Whether a fault stands between the plant's orders and the heliostats of a cluster."""
+        """Whether a fault may keep the plant's orders from the heliostats of a cluster."""
         return not pod.runs or any(
             fault.kind.startswith("plant")
             or (fault.kind.startswith(_HINDERS) and self._of.pod_of(fault) is pod)
@@ -126,7 +126,7 @@ class Damage:
         }
 
     def _concerns(self, fault: Fault, now: float) -> None:
-        """Note whom a fault concerns, and until when: a wrong time until the end of the run."""
+        """Record what a fault affects, and until when; a wrong time lasts to the end of the run."""
         key = ""
         if fault.kind in _OF_BOARD:
             key = self._of.boards[fault.target].outfit.name
@@ -140,7 +140,7 @@ class Damage:
         self._rest[key] = max(self._rest.get(key, -math.inf), until)
 
     def look(self, now: float, group: asyncio.TaskGroup) -> None:
-        """Begin and end the faults that are due."""
+        """Start and end the faults that are due."""
         changed = False
         while self._pending and self._begin + self._pending[0].at <= now:
             fault = self._pending.popleft()
@@ -204,13 +204,13 @@ class Damage:
             _strangers(pod, pod.boards.index(board), fault)
 
     def _exchanges(self, fault: Fault, now: float) -> None:
-        """Put a spare board in, which was another mirror's and was at stow there."""
+        """Fit a spare board that was last used at stow on another heliostat."""
         of, target = self._of, fault.target
         board, pod = of.boards[target], of.pod_of(fault)
         if target in self._own:
             return
         others = [candidate.outfit for candidate in of.boards if candidate is not board]
-        if fault.size < 0.5 or not others:  # of another field, which this plant does not know
+        if fault.size < 0.5 or not others:  # from another field, which this plant does not know
             others = outfits(1, seed=int(1e6 * fault.size))
         other = others[int(1e3 * fault.size) % len(others)]
         board.power_off(now)
@@ -251,7 +251,7 @@ class Damage:
                 pod.start(group)
             pod.freeze(on="cluster_frozen" in active and pod.runs)
             _apply_to(pod, active)
-        # The plant does not start without room for its records.
+        # The plant does not start without disk space for its records.
         if everywhere.isdisjoint(_DOWN) and not of.disk.full and of.plant is None:
             of.start_plant(group)
         of.run_twice(group, on="plant_twice" in everywhere)
@@ -267,7 +267,7 @@ class Damage:
         return {name: "" if missing else f"{name}x"}
 
     def _supply(self, now: float) -> None:
-        """Restore power to boards, including those that died during a flash write."""
+        """Restore power to boards, including those that lost it during a flash write."""
         for place, board in enumerate(self._of.boards):
             if board.node is not None:
                 continue

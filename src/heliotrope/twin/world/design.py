@@ -15,9 +15,9 @@ from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.twin.boards.outfit import RECEIVER, Outfit, mechanisms
 from heliotrope.twin.world.scene import Scene
 
-#: Width and height of every mirror, m.
+#: Width and height of all mirrors, m.
 MIRROR = 2.0
-#: Joint visits and receiver visits of a small field, in a run of some minutes.
+#: Settings of joint visits and receiver visits for a small field and a run of some minutes.
 JOINT = JointSettings(least=3, first=8)
 _EYE = "below"
 RECEIVER_VISITS = ReceiverSettings(_EYE, "receiver", least=2, known=0.01, power=0.01, every=60.0)
@@ -30,7 +30,7 @@ def design_of(
     *,
     together: bool = False,
 ) -> Plant:
-    """Return a plant with some heliostats, calibrated to the truth.
+    """Return a plant whose heliostats are calibrated to their true parameters.
 
     Parameters
     ----------

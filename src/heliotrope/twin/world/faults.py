@@ -12,7 +12,7 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import ticks
 from heliotrope.twin.world.worlds import OWN_FAULTS, pause_of, weights_of
 
-#: Everything that can go wrong: kind, weight in the random draw, meaning.
+#: Everything that can go wrong: kind, weight in the random draw, and meaning.
 KINDS = {
     "line_cut": (3, "plant and cluster do not hear each other"),
     "line_one_way": (1, "one of them does not hear the other"),
@@ -37,7 +37,7 @@ KINDS = {
     "stranger_safe": (3, "a stranger sends DEFOCUS or STOW"),
     "noise": (4, "a stranger sends noise"),
 }
-#: What can go wrong in some worlds only, by name of the world.
+#: Faults that occur only in some worlds, by name of the world.
 KINDS_OF_WORLDS = {
     "frozen": {
         "cluster_frozen": (8, "the program of the cluster stands still, and goes on"),
@@ -86,7 +86,7 @@ _LONGEST = {
     "board_exchanged": 120.0, "cluster_file": 90.0, "plant_file": 20.0, "plant_restored": 20.0,
     "stall": 60.0,
 }  # fmt: skip
-#: A heliostat that is cut off for this long must be at stow, s.
+#: Time after which a heliostat that is cut off must be at stow, s.
 _LONG = 330.0
 
 
@@ -147,7 +147,7 @@ def drawn(
     Raises
     ------
     InputError
-        An unknown kind, or a pause that is not above 0.
+        If a kind is unknown, or the pause is not above 0.
     """
     others = {k: v for kinds in KINDS_OF_WORLDS.values() for k, v in kinds.items()}
     known = KINDS | {k: v for k, v in others.items() if k not in KINDS}

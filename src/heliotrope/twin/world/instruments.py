@@ -9,9 +9,9 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.safety import FLUX_READING
 from heliotrope.twin.invariants.sensors import SensorObserver
 
-#: Readings that the sensors of the world "sensors" give.
+#: Readings that the sensors of the world "sensors" supply.
 READINGS = ("wind_gust", "wind_mean", "receiver_flux", FLUX_READING)
-#: Pause between two readings, s.
+#: Interval between readings, s.
 _EVERY = 1.0
 
 
@@ -23,18 +23,18 @@ class Instruments:
     clock
         True time.
     seed
-        Seed of the weather and of the lies.
+        Seed of the weather and of the false readings.
     flux
-        Returns the true share of the beams on the receiver.
+        Returns the true fraction of beams on the receiver.
     observer
-        Told of each reading that the plant is given.
+        Informed of each reading that the plant receives.
 
     Attributes
     ----------
     plant
-        The plant that they feed; None while it does not run.
+        The plant that receives the readings; None while it does not run.
     lies
-        Present lie of each reading: a kind of fault, "" for none.
+        Present falsification of each reading: a kind of fault, "" for none.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Instruments:
         self._gust: tuple[float, float] = (-math.inf, 0.0)
 
     def gust(self, size: float) -> None:
-        """Blow a gust of 10 to 25 m/s, for ``size`` of 0 to 1."""
+        """Start a gust of 10 to 25 m/s, for a ``size`` of 0 to 1."""
         self._gust = self._clock.monotonic(), 10.0 + 15.0 * size
 
     def _true(self, name: str) -> float:
@@ -61,7 +61,7 @@ class Instruments:
             return 0.8 * self._flux()
         mean = self._mean + 0.5 * math.sin((now - self._begin) / 97.0)
         at, peak = self._gust
-        # The shape (1 - cos)/2 over 10.5 s, as of `twin.wind`.
+        # The shape is (1 - cos)/2 over 10.5 s, as in `twin.wind`.
         passed = (now - at) / 10.5
         gust = 0.5 * peak * (1.0 - math.cos(2.0 * math.pi * passed)) if 0.0 <= passed < 1.0 else 0.0
         return mean if name == "wind_mean" else max(1.2 * mean, gust)
@@ -80,7 +80,7 @@ class Instruments:
         return true
 
     async def run(self) -> None:
-        """Feed the plant each second, without end."""
+        """Send readings to the plant every second, until cancelled."""
         while True:
             due = self._clock.monotonic() + _EVERY
             for name in READINGS if self.plant is not None else ():

@@ -53,7 +53,7 @@ class Intruder:
     def recorded(self, size: float) -> bytes:
         """Return an earlier frame chosen by ``size`` (0 to 1), or b"".
 
-        Every second choice is one of the last commands, which may not have expired yet.
+        Half of the frames chosen are recent commands, which may not have expired yet.
         """
         commands, part = self._frames.commands[-_LATELY:], 2.0 * size % 1.0
         if size >= 0.5 and commands:

@@ -24,23 +24,23 @@ from heliotrope.twin.boards.outfit import MACHINE
 from heliotrope.twin.invariants.plant_observer import MOMENT
 from heliotrope.twin.world.operator import ENGINEER, OPERATOR, VIEWER, Operator
 
-#: Share of the locks that are put on a mirror which somebody has locked already.
+#: Fraction of the locks that are applied to a heliostat that is already locked.
 _AGAIN = 0.6
-#: Chance that persons wait once more before they confirm what a restored store has.
+#: Probability that the staff wait once more before confirming a restored store.
 _LATER = 0.5
-#: Share of these writes that are stow positions; a board at stow refuses other counts itself.
+#: Fraction of the writes that set stow positions; a board at stow refuses other counts by itself.
 _STOWS = 0.8
-#: A stow position, or counts, that persons write to a locked mirror differ by this, steps.
+#: Change of the stow position or counts written to a locked heliostat, steps.
 _OTHER = 2500
 
 
 class Maintenance:
-    """The persons at the mirrors.
+    """The maintenance staff in the field.
 
     Parameters
     ----------
     operator
-        The persons who command; one of them writes and declares counts.
+        The operators; one of them writes parameters and declares counts.
     boards
         All heliostats.
     clock
@@ -70,7 +70,7 @@ class Maintenance:
         self._put_at, self._written = -math.inf, ""
 
     def acts(self, plant: PlantController) -> None:
-        """Do one thing."""
+        """Perform one action."""
         if self.service is None:
             return
         if self._written:
@@ -92,7 +92,7 @@ class Maintenance:
             self._mends(plant)
 
     def _locks(self, service: Service) -> None:
-        """Take a mirror out of service, mostly one that another person has locked."""
+        """Take a heliostat out of service, mostly one that another person has locked."""
         locked = sorted(self._persons.locks)
         again = locked and self._chance.random() < _AGAIN
         name = self._chance.choice(locked if again else self._names)
@@ -100,7 +100,7 @@ class Maintenance:
 
     def _puts(self, service: Service, person: Person, name: str) -> None:
         if self._clock.monotonic() - self._put_at < MOMENT:
-            return  # the plant takes the same order of a moment for one
+            return  # the plant merges identical orders given at the same moment
         self._put_at = self._clock.monotonic()
         concerned = service.take(person, [(Kind.HELIOSTAT, name)], "washing", math.nan)
         now = self._clock.monotonic()
@@ -110,7 +110,7 @@ class Maintenance:
         self._operator.counts["locks"] += 1
 
     def _returns(self, service: Service) -> None:
-        """Return a lock: its owner does."""
+        """Remove a lock, as its owner."""
         locks = self._persons.locks
         if locks and self._persons.sure:
             name = self._chance.choice(sorted(locks))
@@ -123,9 +123,9 @@ class Maintenance:
         self._operator.counts["locks returned"] += 1
 
     def confirms(self, plant: PlantController) -> None:
-        """Confirm a restored store: put the present locks, and return the old ones.
+        """Confirm a restored store: apply the present locks, and remove the old ones.
 
-        The last one is that on the tower; then the standby points are given again.
+        The tower's lock is removed last; then the standby points are sent again.
         """
         service = self.service
         asks = service is not None and any(lock.who == OWNER for lock in service.out)
@@ -144,9 +144,9 @@ class Maintenance:
         self._operator.give(plant, "STANDBY")
 
     def _writes(self, plant: PlantController, name: str) -> None:
-        """Write another stow position, or other counts, to a locked mirror; later it goes to stow.
+        """Write a different stow position or counts to a locked heliostat, which later is stowed.
 
-        The plant must refuse both: the mirror would turn under the hands of whoever is at it.
+        The plant must refuse both, because the mirror could move while someone works on it.
         """
         steps = [self._chance.choice([-_OTHER, _OTHER]) for _ in range(2)]
         if self._chance.random() < _STOWS:
@@ -158,13 +158,13 @@ class Maintenance:
         self._written = name
 
     def _takes_off(self, plant: PlantController) -> None:
-        """Take two mirrors off by one order, of which a cluster may know one only."""
+        """Order two heliostats off by one command, only one of which a cluster may know."""
         names = self._chance.sample(self._names, min(2, len(self._names)))
         ticket = plant.defocus(VIEWER.name, names)
         self._observer.obeyed(VIEWER.name, "DEFOCUS", self._clock.monotonic(), ticket.identity)
 
     def _mends(self, plant: PlantController) -> None:
-        """Declare the true step counts of a mirror that does not know them."""
+        """Declare the true step counts of a heliostat that has lost them."""
         board = self._chance.choice(self._boards)
         rests = all(axis.idle for axis in board.axes)
         if board.node is not None and not board.node.controller.motion.known and rests:

@@ -36,14 +36,14 @@ from heliotrope.twin.world.worlds import Habits, narrow_limits
 OPERATOR = Person("operator", Role.OPERATOR)
 ENGINEER = Person("engineer", Role.ENGINEER)
 VIEWER = Person("viewer", Role.VIEWER)
-#: Command that leads on from each state.
+#: Command that advances a heliostat from each state.
 ONWARDS = {
     "": ("APPROACH",), "STOWED": ("APPROACH",),
     "IDLE": ("TRACK", "TRACK", "TRACK", "SEARCH", "JOG"),
     "TRACKING": ("AIM", "AIM", "IDLE", "ROUGH"), "DEFOCUSED": ("REFOCUS", "IDLE"),
     "SEARCHING": ("TRACK", "IDLE"), "LOCKED": ("UNLOCK",), "FAULT": ("CLEAR_FAULT",),
 }  # fmt: skip
-#: Rows of the safety table that latch; the others release by themselves.
+#: Rows of the safety table that latch; all others release by themselves.
 LATCHING = frozenset(
     {"operator_emergency", "nodes_unacknowledged", "flux_after_emergency", "clock_jump"}
 )
@@ -51,7 +51,7 @@ Point = tuple[float, ...]
 
 
 class Maintenance(Protocol):
-    """The persons who work at the mirrors; see `world.maintenance`."""
+    """The maintenance staff in the field; see `world.maintenance`."""
 
     def acts(self, plant: PlantController) -> None:
         """Do one thing."""
@@ -62,14 +62,14 @@ class Maintenance(Protocol):
         ...
 
 
-#: Share of the emergencies that a second operator orders too.
+#: Fraction of the emergencies that a second operator orders too.
 _SECOND = 0.3
-#: Somebody who looks at a mirror sees from this many steps on that it stands wrong.
+#: Error from which an operator who looks at a heliostat notices its wrong pose, steps.
 _SEEN_WRONG = 300
 
 
 class Operator:
-    """The persons at the plant.
+    """The operators of the plant.
 
     Parameters
     ----------
@@ -78,15 +78,15 @@ class Operator:
     seed, habits
         Seed of their actions, and how often they take each.
     panel
-        Observers of the plant, which hear of each accepted command and of what persons order.
+        Observers of the plant, which are informed of each accepted command and operator order.
     fits
         The heliostats.
     pods
         Clusters whose lines the rogue uses.
     keep_out
-        Middle of a keep-out volume, at which they aim now and then.
+        Centre of a keep-out volume, at which the operators occasionally aim.
     flux
-        Returns the share of the beams on the receiver; None: sensors feed it.
+        Returns the fraction of beams on the receiver; None: sensors supply it.
 
     Attributes
     ----------
@@ -95,15 +95,15 @@ class Operator:
     away
         Whether nobody is on duty.
     waits
-        Whether the plant's program is frozen, so that it answers no command.
+        Whether the plant's program is frozen, so that it replies to no command.
     commands
-        Whether they hold the authority; else it is left to automatic control.
+        Whether the operators hold the authority; otherwise it is left to automatic control.
     counts
         Number of actions of each kind.
     refusal
-        Why the plant refused last.
+        Reason for the plant's last refusal.
     maintenance
-        The persons who work at the mirrors; None: there are none. Set by the owner.
+        The maintenance staff; None: there is none. Set by the owner.
     points
         Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
     panel
@@ -140,7 +140,7 @@ class Operator:
         self._number = 0
 
     def begins(self, plant: PlantController | None) -> None:
-        """Note that the plant has started or (None) ended."""
+        """Record that the plant has started or (None) ended."""
         self.plant = plant
 
     # -- authority -------------------------------------------------------------------------
@@ -178,7 +178,7 @@ class Operator:
         return None
 
     def seize(self, plant: PlantController, person: Person) -> None:
-        """Put an operator on duty, who breaks the present authority."""
+        """Put an operator on duty, who seizes the present authority."""
         try:
             token = plant.seize_authority(person, "on duty now").token
         except RefusedError:
@@ -194,7 +194,7 @@ class Operator:
         self._observer.granted(person, token, self._clock.monotonic(), seized=seized)
 
     def _change(self, plant: PlantController) -> None:
-        """Put another operator on duty, who breaks the authority or takes it after its release."""
+        """Put another operator on duty, who seizes the authority or takes it once released."""
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
         if self._chance.random() < 0.5:
             with contextlib.suppress(RefusedError):
@@ -205,7 +205,7 @@ class Operator:
     # -- actions ---------------------------------------------------------------------------
 
     async def work(self) -> None:
-        """Command without end."""
+        """Issue commands until cancelled."""
         while True:
             await asyncio.sleep(self._chance.expovariate(1 / self._habits.pause))
             plant = self.plant
@@ -245,7 +245,7 @@ class Operator:
         token: int | None = None,
         values: tuple[float, ...] | None = None,
     ) -> Ticket | None:
-        """Give a command, and report it to the observer if it is accepted; else return None."""
+        """Issue a command, and report it to the observer if accepted; otherwise return None."""
         who = person or self._duty
         mine = self._tokens.get(who.name, 0) if token is None else token
         names = heliostats or self._names
@@ -284,7 +284,7 @@ class Operator:
             each.on_accepted(who, token, ticket, what, self._clock.monotonic())
 
     def _into_keep_out(self, plant: PlantController) -> None:
-        """Ask for a motion that leads a beam through the keep-out volume; it must be refused."""
+        """Request a motion that moves a beam through the keep-out volume, which must be refused."""
         name, mine = self._chance.choice(self._names), self._tokens.get(self._duty.name, 0)
         point = self._points((name,), self._keep_out, 0.5)
         what = self._chance.choice(["AIM", "STANDBY", "SEARCH"])
@@ -318,7 +318,7 @@ class Operator:
         return ()
 
     def onward(self, plant: PlantController) -> None:
-        """Lead one heliostat on, by its state."""
+        """Advance one heliostat according to its state."""
         name = self._chance.choice(self._names)
         state = plant.field.of(name, plant.now()).state
         what = self._chance.choice(ONWARDS.get(state, ("APPROACH",)))
@@ -347,7 +347,7 @@ class Operator:
         self.give(plant, "LOCK", (self._chance.choice(self._names),))
 
     def _unauthorised(self, plant: PlantController) -> None:
-        """Command without authority: with an old token, with another operator's, or as a viewer."""
+        """Command without authority: with an old or a foreign token, or as a viewer."""
         what = self._chance.choice(["TRACK", "APPROACH", "AIM", "REFOCUS", "STANDBY"])
         name = self._chance.choice(self._names)
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
@@ -396,7 +396,7 @@ class Operator:
         return self._accepted(who, token, ticket, "ZERO")
 
     def _calibrate(self, plant: PlantController) -> None:
-        """Change parameters of one heliostat: rightly, slightly wrongly, or much, unconfirmed."""
+        """Change parameters of one heliostat: correctly, slightly wrongly, or grossly."""
         chance, name = self._chance, self._safe(plant)
         fit = self._fits[name]
         slight = {k: v + chance.gauss(0.0, 3e-4) for k, v in fit.causes.items()}
@@ -430,19 +430,19 @@ class Operator:
         who = self._chance.choice([VIEWER, self._duty])
         if not plant.sentinel.pause(who.name):
             self.raises(plant, who, act)
-        if self._others.random() < _SECOND:  # another person has a reason of their own
+        if self._others.random() < _SECOND:  # another operator has a separate reason
             others = [person for person in (OPERATOR, ENGINEER, VIEWER) if person is not who]
             act = self._others.choice([Act.DEFOCUS, Act.STOW])
             if not plant.sentinel.pause((other := self._others.choice(others)).name):
                 self.raises(plant, other, act)
 
     def raises(self, plant: PlantController, who: Person, act: Act) -> EmergencyOrder:
-        """Raise an emergency, which anybody may do."""
-        self.raised(who, act)  # the plant raises its alarm before it answers
+        """Raise an emergency, which anyone may do."""
+        self.raised(who, act)  # the plant raises its alarm before it replies
         return plant.raise_emergency(who.name, act)
 
     def raised(self, who: Person, act: Act) -> None:
-        """Note an emergency that an operator has raised."""
+        """Record an emergency that an operator has raised."""
         self.counts["emergencies"] += 1
         for each in self.panel.each:
             each.on_call(who.name, act, self._clock.monotonic())
@@ -452,7 +452,7 @@ class Operator:
         self.safe(plant, what, self._chance.choice(self._names))
 
     def safe(self, plant: PlantController, what: str, name: str) -> Ticket:
-        """Defocus or stow one heliostat, which anybody may do."""
+        """Defocus or stow one heliostat, which anyone may do."""
         ticket = (plant.defocus if what == "DEFOCUS" else plant.stow)(VIEWER.name, (name,))
         self.took_off(ticket, what)
         return ticket
@@ -463,9 +463,9 @@ class Operator:
             each.on_safe(VIEWER, ticket, what, self._clock.monotonic())
 
     def clear(self, plant: PlantController) -> set[str]:
-        """Withdraw one emergency order, acknowledge all that waits for it; return what was taken.
+        """Withdraw an emergency order, acknowledge what awaits it; return what was accepted.
 
-        Another operator's order stands on until the next time.
+        The order of another operator remains until the next call.
         """
         if self.maintenance is not None:
             self.maintenance.confirms(plant)
@@ -474,7 +474,7 @@ class Operator:
         return self._acknowledge(plant)
 
     def withdraws(self, plant: PlantController, owner: str) -> None:
-        """Withdraw an operator's order: that operator does, or an engineer by name for a viewer."""
+        """Withdraw an operator's order, as that operator, or as an engineer for a viewer."""
         who = OPERATOR if owner == OPERATOR.name else ENGINEER
         now = self._clock.monotonic()
         try:
@@ -485,7 +485,7 @@ class Operator:
         self._persons.withdrew(owner)
 
     def _acknowledge(self, plant: PlantController) -> set[str]:
-        """Acknowledge every latched condition; return those for which the plant takes it.
+        """Acknowledge every latched condition; return those that the plant accepts.
 
         The engineer acts for the supervisor.
         """
@@ -506,10 +506,10 @@ class Operator:
         return taken
 
     def _stands_right(self, name: str) -> bool:
-        """Look at a mirror whose step counts are in doubt.
+        """Inspect a heliostat whose step counts are in doubt.
 
-        Whoever confirms one without looking makes its beam miss, and no software can know that: it
-        would be the operator's fault that breaks invariant 12. So these operators do look.
+        If an operator confirmed it without looking, its beam could miss, which no software can
+        detect. Invariant 12 would then be violated by the operator, so these operators do look.
         """
         boards = (board for pod in self._pods for board in pod.boards)
         board = next(board for board in boards if board.outfit.name == name)
@@ -518,7 +518,7 @@ class Operator:
     # -- the rogue -------------------------------------------------------------------------
 
     async def _rogue(self) -> None:
-        """Command past the plant, with a void or guessed token."""
+        """Send commands that bypass the plant, with an invalid or guessed token."""
         now = self._clock.monotonic()
         void = [token for token, at in self._observer.old.items() if now - at > VOID_WITHIN]
         token = self._chance.choice([0, self._chance.getrandbits(32), *void[-2:], *void[-2:]])

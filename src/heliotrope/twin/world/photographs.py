@@ -24,20 +24,21 @@ from heliotrope.twin.cameras import ExactCamera, FieldSnapshot
 T = TypeVar("T")
 #: What a photograph may show instead of the heliostat's beam.
 LIES = ("still", "passing", "before")
-#: What may spoil the photographs of a stack, at this share of the rate of lies, and the size of a
-#: lamp, m; photographs of a stack follow each other within this time, s.
+#: What may spoil the photographs of a stack, the rate of this relative to that of lies, the size of
+#: a lamp, m, and the longest time between photographs of a stack, s.
 SPOILS, _STACKS_SPOILT, _LAMP, _GAP = ("lamp", "cloud"), 0.1, 0.3, 20.0
 #: Variance of a centroid in the plane of the target, m².
 _CENTROID = 1e-4
-#: Photographs in turn that show the same lie; the same where lights stand for minutes.
+#: Numbers of consecutive photographs that show the same lie; the same for lights that last for
+#: minutes.
 _RUNS, _LONG_RUNS = (1, 3, 4, 6, 12), (12, 24, 48)
-#: Greatest speed of another mirror's spot that crosses a target, m/s.
+#: Maximum speed of another heliostat's spot across a target, m/s.
 _SPEED = 0.3
 
 
 @dataclass(frozen=True)
 class _Lie:
-    """A light on a target: its place in the target's plane, m, (2,), its speed, m/s, since when."""
+    """A light on a target: position in its plane, m, (2,), velocity, m/s, and start time."""
 
     kind: str
     place: FloatArray
@@ -48,7 +49,7 @@ class _Lie:
 
 @dataclass(frozen=True)
 class _Spoilt:
-    """What spoils photographs of a stack: a lamp, m in the target's plane (2,), or less sun."""
+    """What spoils photographs of a stack: a lamp at a point of the target, m, (2,), or less sun."""
 
     kind: str
     place: FloatArray
@@ -58,7 +59,7 @@ class _Spoilt:
 
 
 class LyingCamera:
-    """A camera of targets whose photographs lie now and then.
+    """A target camera whose photographs are occasionally false.
 
     Parameters
     ----------
@@ -67,21 +68,22 @@ class LyingCamera:
     seed
         Seed of noise and lies.
     share
-        Share of the photographs with which lies begin.
+        Fraction of the photographs with which lies begin.
     waver
-        Standard deviation of a beam in each direction, beside that of its centroid, rad.
+        Standard deviation of a beam in each direction, in addition to that of its centroid, rad.
     standing
-        Whether every lie is a light that stands still for minutes, as a lamp does, or the beam of a
-        mirror that was left there.
+        Whether every lie is a light that stays for minutes, such as a lamp or the beam of a
+        heliostat left there.
 
     Attributes
     ----------
     lies
-        Number of photographs of each kind that lied.
+        Number of false photographs of each kind.
     taken
         Times of all photographs of single beams, s of the monotonic clock.
     told
-        Called with each of these: heliostat, target, point as it is read, ENU, m, (3,), and time.
+        Called with each of these photographs: heliostat, target, measured point, ENU, m, (3,), and
+        time.
     """
 
     def __init__(
@@ -103,7 +105,8 @@ class LyingCamera:
     def away(self, at: float) -> float:
         """Return the time to the nearest photograph, s; times are monotonic.
 
-        A sighting of a stack has the time of its middle, which may be between two photographs.
+        A sighting from a stack has the mid-time of the stack, which may lie between two
+        photographs.
         """
         near = min((abs(at - taken) for taken in self.taken), default=math.inf)
         between = any(
@@ -116,7 +119,7 @@ class LyingCamera:
         return Exposed.read(await self.light(target, view))
 
     async def light(self, target: Target, view: FaceView | None = None) -> TargetLight:
-        """Return the light on a target, now and then beside a lamp or under a cloud."""
+        """Return the light on a target, occasionally next to a lamp or under a cloud."""
         true = await self._true.light(target, view)
         self._stacked.append(true.at)
         spoilt = self._spoilt.get(target.name)
@@ -148,7 +151,7 @@ class LyingCamera:
         return work()
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return the light on a photograph: the heliostat's beam, or another one."""
+        """Return the light in a photograph: the heliostat's beam, or another light."""
         shot = await self._photographed(target, heliostat)
         if self.on_photograph is not None:
             self.on_photograph(heliostat, target.name, shot.point, shot.at)
@@ -173,7 +176,7 @@ class LyingCamera:
         return shown
 
     def _wavered(self, target: Target, shot: Shot, heliostat: str) -> Shot:
-        """Return a photograph of the beam turned by the wind."""
+        """Return a photograph of the beam as deflected by the wind."""
         mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
         if (mirror := mirrors.get(heliostat)) is None:  # it is covered
             return shot

@@ -42,7 +42,7 @@ from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.world.intruder import Intruder
 from heliotrope.twin.world.worlds import PodErrors
 
-#: A cluster counts a command's lifetime from its arrival, so the command may be this much older, s.
+#: Extra age allowed for a command, because a cluster counts its lifetime from arrival, s.
 UNDER_WAY = 0.8
 #: Line, bus and cluster count as healthy after this long without a fault, s.
 SETTLED = 4.0
@@ -64,26 +64,26 @@ class Pod:
     site
         Site of the plant.
     chance
-        Draws clocks and seeds.
+        Source of random clocks and seeds.
     errors
-        What is wrong with the cluster from the start.
+        Errors of the cluster from the start.
 
     Attributes
     ----------
     bus, line
-        Those in use now.
+        The bus and line in use now.
     clock, time
-        The cluster's own; ``time`` is None where it uses its system clock.
+        The cluster's own clock and time; ``time`` is None if it uses its system clock.
     addresses
-        Address of each heliostat for the cluster: exchanged, if errors say so.
+        Address of each heliostat as known to the cluster; swapped if ``errors`` say so.
     tap, ear
         The plant's end of the line and its listener; None while no plant runs.
     plant
         Observer of the plant; set by the owner.
     answers
-        Observer of what boards and cluster say of themselves.
+        Observer of what boards and cluster report about themselves.
     lines
-        Observer of the line; None: a second plant takes it now and then.
+        Observer of the line; None: a second plant occasionally takes it.
     counts
         Messages to the plant, by kind.
     freezes
@@ -161,7 +161,7 @@ class Pod:
         ]
 
     def crash(self) -> None:
-        """Kill the program wherever it is; the network tells the plant."""
+        """Kill the program at whatever point it is; the network notifies the plant."""
         for task in self._running:
             task.cancel()
         self._running = []
@@ -173,7 +173,7 @@ class Pod:
             loop.kill(self.name)
 
     def edit(self, file: Mapping[str, str], group: asyncio.TaskGroup) -> None:
-        """Restart the program with another file, if it is another one; see ``file``."""
+        """Restart the program with a file, if the file is a different one; see ``file``."""
         if file == self.file:
             return
         self.file = dict(file)
@@ -185,7 +185,7 @@ class Pod:
             self.start(group)
 
     def freeze(self, *, on: bool) -> None:
-        """Freeze the program, or let it go on."""
+        """Freeze the program, or let it continue."""
         loop = asyncio.get_running_loop()
         if self.freezes and isinstance(loop, VirtualLoop):
             (loop.freeze if on else loop.thaw)(self.name)
@@ -193,7 +193,7 @@ class Pod:
     # -- health ----------------------------------------------------------------------------
 
     def look(self, now: float, *, hindered: bool) -> None:
-        """Note whether an order given now would surely be carried out."""
+        """Record whether an order issued now would certainly be carried out."""
         tap, link = self.tap, self.link
         whole = tap is not None and link is not None and tap.connected and link.connected
         if hindered or not whole:
@@ -210,7 +210,7 @@ class Pod:
         return both if self.lines is None else (*both, self.lines)
 
     def carried(self, now: float) -> bool:
-        """Whether an order given now must be carried out."""
+        """Whether an order issued now must be carried out."""
         return now - self._whole_since > SETTLED
 
     # -- the bus (Tap) ---------------------------------------------------------------------
@@ -225,7 +225,7 @@ class Pod:
         self.answers.heard(how, now)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Pass on an answer to the cluster; keep its states, and the true step counts with it."""
+        """Pass on a reply to the cluster; store its states together with the true step counts."""
         self.observer.answered(data, how, now)
         self.answers.answered(data, how, now)
         if self.plant is None:
@@ -244,7 +244,7 @@ class Pod:
 
 
 class _ClusterEar:
-    """Listens at a cluster's end of its line, for the leases that really reach it."""
+    """Listens at a cluster's end of its line for the leases that actually arrive."""
 
     def __init__(self, observer: Observer) -> None:
         self._observer = observer
@@ -259,7 +259,7 @@ class _ClusterEar:
         """Allow the cluster to receive."""
 
     def received(self, data: bytes, now: float) -> None:
-        """Note a lease."""
+        """Record a lease."""
         message = decode(data)
         if isinstance(message, Lease):
             self._observer.runs.leased(message.run, message.lifetime, now)
@@ -286,11 +286,11 @@ class PlantEar:
         self._ended = False
 
     def end(self) -> None:
-        """Stop judging: a killed program's last acts leave no line."""
+        """Stop judging, because the last messages of a killed program never leave it."""
         self._ended = True
 
     def hang(self, *, on: bool) -> None:
-        """Freeze the plant's program, or let it go on, while the connection stays up."""
+        """Freeze the plant's program, or let it continue, while the connection stays up."""
         if on:
             self._goes.clear()
         else:
@@ -343,7 +343,7 @@ class PlantEar:
         return "PARAMETERS", (message.heliostat,)
 
     def order(self, message: Command | Parameters, now: float, *, known: bool) -> PlantCommand:
-        """Return an order for the ledger; ``known``: its token was once issued."""
+        """Return an order for the ledger; ``known``: its token has been issued before."""
         name, whom = self._asked(message)
         until = self._plant.until(message.token, now + message.lifetime + UNDER_WAY)
         addresses = frozenset(self._addresses[heliostat] for heliostat in whom)

@@ -22,22 +22,23 @@ from heliotrope.twin.boards.outfit import (
 from heliotrope.twin.invariants.invariants import OFF
 from heliotrope.twin.world.worlds import DAYS, drawn, works
 
-#: The sun is at least this high at the beginning and at the end of a drawn scene, rad.
+#: Minimum elevation of the sun at the start and end of a drawn scene, rad.
 _LOWEST = math.radians(8.0)
-#: Elevations of the sun below which automatic control stows the field, and above which it raises it
-#: again, rad; and lowest sun of a run that meets one of them: beams need a sun above the ground.
+#: Elevations of the sun below which automatic control stows the field and above which it raises the
+#: field again; and lowest elevation in a run that crosses one of them, since beams need a sun above
+#: the horizon, rad.
 _STOWS, _RAISES, _UP = math.radians(8.0), math.radians(9.0), math.radians(1.0)
-#: Share of a run before the evening's limit, at least and at most; for the first, and before the
-#: morning's limit, no longer than this, s.
+#: Smallest and largest fraction of a run before the evening limit is crossed; and longest time for
+#: the former and before the morning limit, s.
 _BEFORE, _SOON = (0.55, 0.75), 300.0
-#: Nearest two heliostats, and nearest that a beam at rest passes the receiver, m.
+#: Minimum distance between heliostats, and of a beam at standby from the receiver, m.
 _APART, _BESIDE = 6.0, 8.0
-#: A beam at stow passes receiver and volumes by this much more than their radius, m: nothing can
-#: take it elsewhere, and operators change the stow position a little.
+#: Clearance of a beam at stow from the receiver and volumes, beyond their radius, because the beam
+#: cannot be moved and operators change the stow position slightly, m.
 _ROOM = 10.0
-#: The sun is looked at this often, s.
+#: Interval at which the sun position is checked, s.
 _OFTEN = 60.0
-#: Time after the evening's limit of a short day in which the field goes to stow, s.
+#: Time after the evening limit of a short day in which the field goes to stow, s.
 _EVENING = 130.0
 
 
@@ -52,7 +53,7 @@ class Scene:
     places
         East and north of each heliostat, m; (): `outfits` draws them.
     keep_outs
-        Balls that no beam may enter; the first is the one that operators aim at.
+        Spheres that no beam may enter; the first is the one at which operators aim.
     targets
         Calibration targets.
     lowest
@@ -74,18 +75,18 @@ def _square(name: str, middle: tuple[float, float, float], side: float) -> Targe
     return Target(name, np.array(corners), np.array(middle))
 
 
-#: Corners of a square as seen from its front: left and right are those of a reader in the north.
+#: Corners of a square as seen from its front, that is, by a viewer in the north.
 _CORNERS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 #: Targets for visits, below the receiver and away from the usual keep-out volume.
 TARGETS = (_square("left", (2.0, 0.0, 33.0), 7.0), _square("right", (14.0, 0.0, 27.0), 7.0))
-#: The usual scene; its volume lies away from all natural ways.
+#: The usual scene; its volume lies away from all ordinary beam paths.
 USUAL = Scene(Site(37.4, -6.0, 100.0, name="simulation"), datetime(2026, 6, 21, 9, tzinfo=UTC))
 
 
 def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) -> Scene:
-    """Return the scene of a run: drawn in the worlds "place" and "day", else the usual one.
+    """Return the scene of a run: drawn in the worlds "place" and "day", otherwise the usual one.
 
-    That of "days" has the usual places, and a sun that crosses the zenith.
+    The scene of "days" has the usual places, and a sun that crosses the zenith.
     """
     targets = TARGETS if works(worlds) else ()
     chance = random.Random(f"place {seed}")
@@ -110,7 +111,7 @@ def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) 
 
 
 def _clear_at_stow(places: Sequence[tuple[float, float]], suns: FloatArray, ball: Ball) -> bool:
-    """Whether no beam at stow comes near a ball; ``suns`` are (S, 3)."""
+    """Return whether all beams at stow are clear of a ball, for sun vectors (S, 3)."""
     (middle, radius), (vertex, direction) = ball, stow_beams(places, suns)
     along = ((np.array(middle) - vertex) * direction).sum(axis=-1, keepdims=True)
     miss = np.linalg.norm(np.array(middle) - vertex - np.maximum(along, 0.0) * direction, axis=-1)
@@ -137,11 +138,11 @@ def _when(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
 
 
 def _limit(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
-    """Return a site and a time from which the sun meets a limit of elevation, and stays up.
+    """Return a site and a time after which the sun crosses an elevation limit, and stays up.
 
-    In the evening it falls below the limit late enough that the field is up before. In the morning
-    it is below the limit first, and rises above the upper one before the run is nearly over; a
-    short run has evenings only.
+    In the evening the sun falls below the limit late enough for the field to be up before. In the
+    morning it starts below the limit, and rises above the upper limit well before the end of the
+    run; short runs have evenings only.
     """
     while True:
         site, midnight = _when(chance, 0.0)
@@ -166,9 +167,9 @@ def _limit(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
 def _short_day(chance: random.Random, seconds: float) -> tuple[Site, datetime, float]:
     """Return a site, a time and the elevation, rad, above which the sun then stays for a short day.
 
-    Where the sun crosses the zenith its elevation rises and falls by a degree in four minutes, so
-    that a whole day of the field passes in less time than an hour has. One day in five begins below
-    the limit, and the field waits in stow until the sun is high enough.
+    If the sun crosses the zenith, its elevation changes by one degree in four minutes, so that a
+    whole day of the field passes in less than an hour. One day in five begins below the limit, and
+    the field waits in stow until the sun is high enough.
     """
     noon = datetime(2026, 1, 1, 12, tzinfo=UTC) + timedelta(days=chance.randrange(365))
     declination = math.degrees(math.asin(float(vector(noon.timestamp(), Site(90.0, 0.0, 0.0))[2])))
@@ -188,12 +189,12 @@ def _short_day(chance: random.Random, seconds: float) -> tuple[Site, datetime, f
 
 
 def _ball(chance: random.Random, places: Sequence[tuple[float, float]], suns: FloatArray) -> Ball:
-    """Return a ball across a natural way of beams, clear of mirrors, receiver and beams at stow."""
+    """Return a ball across an ordinary beam path, clear of mirrors, receiver and beams at stow."""
     while True:
         radius = chance.uniform(1.0, 5.0)
         east, north = chance.choice(list(places))
         goal = chance.choice([STANDBY, STANDBY, RECEIVER])
-        # On a beam at rest or at the aim; below one, on the way up; or anywhere about the tower.
+        # On a beam at standby or at its aim, below one on its path up, or anywhere about the tower.
         share, low = chance.uniform(0.3, 0.95), chance.choice([1.0, 1.0, chance.random()])
         middle = (
             east + share * (goal[0] - east),

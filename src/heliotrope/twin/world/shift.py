@@ -20,17 +20,17 @@ from heliotrope.twin.world.crew import Crew
 from heliotrope.twin.world.operator import ENGINEER, VIEWER
 from heliotrope.twin.world.work import Work
 
-#: Pause between two looks of an operator, s.
+#: Interval between checks by an operator, s.
 LOOK = 2.0
 #: Longest time on duty, s.
 _DUTY = 15.0
-#: Longest emergency, s: until it is over, nothing goes on.
+#: Longest emergency, during which no other work continues, s.
 _EMERGENCY = 12.0
 
 
 @dataclass(frozen=True)
 class Working:
-    """Automatic control of a run, the operators beside it, and the observers of its work."""
+    """Automatic control of a run, its operators, and the observers of its work."""
 
     control: Work
     shift: "Shift | Crew"
@@ -48,8 +48,8 @@ class Working:
     ) -> None:
         """Judge the work; see the observers.
 
-        ``quiet`` is None where a cluster is wrong from the start: its mirrors may do nothing, and
-        what is reported is true of others. ``waits``: the plant's program is frozen.
+        ``quiet`` is None if a cluster is wrong from the start, because its heliostats may then do
+        nothing, and its reports concern other heliostats. ``waits``: the plant's program is frozen.
         """
         watch, operations = self.watch, None if waits else self.control.operations
         watch.visits.look(plant, sun, now)
@@ -67,7 +67,7 @@ class Shift:
     Parameters
     ----------
     acts
-        What they do.
+        The actions available to the operators.
     pause
         Mean time between two interruptions, s.
     """
@@ -77,7 +77,7 @@ class Shift:
         self._chance = acts.chance
 
     async def work(self) -> None:
-        """Look after the field without end."""
+        """Look after the field until cancelled."""
         acts = self._acts
         await asyncio.sleep(4.0)
         due = acts.now() + self._chance.expovariate(1.0 / self._pause)

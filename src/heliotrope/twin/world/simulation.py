@@ -1,7 +1,7 @@
 """Deterministic simulation: a real plant, clusters and nodes in virtual time, with faults.
 
 A seed and a length define a run. The seed determines the heliostats and clusters, the actions of
-people, the list of faults, the drift of the clocks, and the order in which the event loop runs
+operators, the list of faults, the drift of the clocks, and the order in which the event loop runs
 ready callbacks. The same seed yields the same run, so one command replays a violated invariant
 (`RunResult.command`). The observers (`twin.invariants`) check every step.
 """
@@ -99,26 +99,27 @@ from heliotrope.twin.world.worlds import (
     works,
 )
 
-#: Longest interval between two looks at the boards, and between two judgements of everything, s: a
-#: board whose motion an order has begun meanwhile has handed steps for 0.1 s to its timer.
+#: Longest interval between checks of the boards, and between checks of everything, s. A board that
+#: an order has set in motion in the meantime has passed steps for 0.1 s to its timer.
 LOOK, JUDGE = 0.09, 0.5
 #: The true sun is computed this often (s) and interpolated linearly, to within 1e-6 rad.
 _SUN_EVERY = 30.0
 #: The plant's program, for freezing it.
 _PLANT = "plant"
-#: Worlds in which a cluster is wrong from the start, so that its mirrors may do nothing.
+#: Worlds in which a cluster is wrong from the start, so that its heliostats may do nothing.
 _WRONG = ("addresses", "clock", "site", COMMON)
 #: The witness in the world "common".
 WITNESSES = frozenset({"sun sensor"})
 #: Plant files are edited so that stow is on the receiver beyond this size of the fault.
 _ON_RECEIVER = 0.7
-#: Longest run: the sun must stay up.
+#: Longest run, since the sun must stay up, h.
 MOST_HOURS = 8.0
-#: Mean time between two interruptions by operators, s: a joint visit takes two minutes.
+#: Mean time between interruptions by operators, alone and with joint visits, which take two
+#: minutes, s.
 SHIFT_PAUSE, PARTY_PAUSE = 90.0, 300.0
-#: The same as `NEAR` for motors that step coarsely, and may stay two full steps behind, rad.
+#: The same as `NEAR` for motors in coarse steps, which may lag by two full steps, rad.
 NEAR_COARSE = 4e-3
-#: With this few mirrors they join one at a time.
+#: With so few heliostats, they join one at a time.
 SETTINGS = PlantSettings(
     join_rate=0.5,
     join_burst=1,
@@ -128,7 +129,7 @@ SETTINGS = PlantSettings(
 )
 #: The same plant in the world "sensors".
 MEASURED = replace(SETTINGS, sensors=frozenset(READINGS))
-#: Without the rows on the share of failed nodes, which one of three or four already exceeds.
+#: The table without the rows on the fraction of failed nodes, which one of three or four exceeds.
 TABLE = tuple(row for row in conditions() if row.reading != "node_fault_share")
 
 
@@ -153,7 +154,7 @@ class RunPlan:
     worlds
         Names of `WORLDS` that this run adds to the usual environment.
     acts
-        Actions of the people in a day ("days"); None: drawn from the seed.
+        Actions of the crew in a day ("days"); None: drawn from the seed.
 
     Raises
     ------
@@ -228,7 +229,7 @@ class RunResult:
     faults
         Number of faults of each kind.
     counts
-        Number of actions by people, and of messages to the plant.
+        Number of actions by operators, and of messages to the plant.
     states
         Number of times each state was entered.
     seconds
@@ -289,7 +290,7 @@ class Simulation:
     disk
         Store of the plant's records.
     operator
-        The people at the plant.
+        The operators of the plant.
     faults
         Number of faults of each kind so far.
     """
@@ -318,7 +319,7 @@ class Simulation:
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         together = joint_visits(plan.worlds)
         self._design, self._homes = design_of(known, homes, scene, together=together), homes
-        # The boards' wanted items and assigned points survive the plant's program.
+        # The boards' desired items and assigned points survive the plant's program.
         self._fits = known
         self._wanted = wanted_of(known) if knows_boards(plan.worlds) else Wanted()
         self._exits = contextlib.ExitStack()
@@ -391,7 +392,7 @@ class Simulation:
             pod.plant = self.observer
 
     def _quiet_observer(self) -> QuietObserver | None:
-        """Return the observer of work; None: what is wrong from the start hinders it."""
+        """Return the observer of work; None if initial errors hinder the work."""
         if not set(_WRONG).isdisjoint(self.plan.worlds):
             return None
         observers = {pod.name: pod.observer for pod in self.pods}
@@ -408,7 +409,7 @@ class Simulation:
         self._covered = covered_by(tuple(boards), plan.worlds, plan.seed)
 
         def mirrors() -> Sequence[TrueMirror]:
-            """Return the mirrors that throw light."""
+            """Return the mirrors that reflect light."""
             return [mirror for mirror in all_mirrors() if mirror.heliostat not in self._covered]
 
         sight = FieldSnapshot(clock, mirrors, lambda: self.sun(clock.monotonic()))
@@ -490,7 +491,7 @@ class Simulation:
         return sun
 
     def _flux(self) -> float:
-        """Return the share of the beams on the receiver."""
+        """Return the fraction of beams on the receiver."""
         sun = self.sun(self._clock.monotonic())
         return float(np.mean([board.miss(sun, RECEIVER) <= OFF for board in self.boards]))
 
@@ -508,7 +509,7 @@ class Simulation:
     # -- the plant -------------------------------------------------------------------------
 
     def start_plant(self, group: asyncio.TaskGroup) -> None:
-        """Start the plant program; only the disk and the wanted parameters are carried over."""
+        """Start the plant program; only the disk and the desired parameters are carried over."""
         links = {}
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
@@ -518,7 +519,7 @@ class Simulation:
             links[pod.name] = pod.tap
         audit = self._audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
         if self._work is not None:
-            self._wanted = wanted_of(self._fits)  # the store knows better; see `Work.begins`
+            self._wanted = wanted_of(self._fits)  # superseded by the store; see `Work.begins`
             noted = self.alarms.on_alarm
             self._work.control.opens(lambda alarm: noted(alarm, self._clock.monotonic()))
         if self._store is not None:
@@ -608,7 +609,7 @@ class Simulation:
         self._stows = {fit.name: packed("stow", (int(stow[0]), int(stow[1])))}
 
     def _read_plant_file(self) -> None:
-        """Want the stow positions of the plant file; the next program finds it corrected."""
+        """Require the stow positions of the plant file, which the next program finds corrected."""
         for fit in self._fits:
             self._wanted.set(fit.name, {"stow": self._stows.get(fit.name, fit.items["stow"])})
         self._stows = {}
@@ -675,8 +676,8 @@ class Simulation:
     def hang_plant(self, now: float, *, silent: bool, frozen: bool) -> None:
         """Silence the plant program, freeze it, or let it continue.
 
-        A silenced program continues without its lines; in a frozen one nothing runs, and people
-        wait.
+        A silenced program continues without its lines; in a frozen program nothing runs, and the
+        operators wait.
         """
         runs = self.plant is not None
         self.observer.hangs(now, on=(silent or frozen) and runs, stands=frozen and runs)
@@ -737,7 +738,7 @@ class Simulation:
         """Advance boards, faults and observers to the end."""
         end, judged = self.begin + self.plan.seconds, self.begin
         while (now := self._clock.monotonic()) < end:
-            # A fault that ends now has been in the way until now.
+            # A fault that ends now has had an effect until now.
             hindered = [damage.hinders(pod) for pod in self.pods]
             damage.look(now, group)
             for board in self.boards:
@@ -808,7 +809,7 @@ def run(plan: RunPlan) -> RunResult:
         outcome.seconds = loop.time() - begin
     try:
         runner.close()
-    except RuntimeError as error:  # a task does not end, such as one of a program that is frozen
+    except RuntimeError as error:  # a task does not end, for example in a frozen program
         outcome.problem = outcome.problem or f"the run does not end: {error}"
     outcome.checks = simulation.checks
     outcome.faults = simulation.faults
@@ -826,7 +827,7 @@ def _lost(about: dict[str, Any], outcome: RunResult) -> None:
 
 
 def _blame(error: BaseException, outcome: RunResult) -> None:
-    """Find what broke first among all that a task group raises."""
+    """Return the first failure among all exceptions of a task group."""
     errors = list(_leaves(error))
     for leaf in errors:
         if isinstance(leaf, InvariantError):

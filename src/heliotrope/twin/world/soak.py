@@ -84,7 +84,7 @@ def run_many(
     processes
         Number of processes.
     budget
-        Wall time after which no further run is started, s.
+        Wall-clock time after which no further run is started, s.
     progress
         File with one line per run; runs already in the file are skipped.
     tell
@@ -97,7 +97,7 @@ def run_many(
     InputError
         If there is less than one process.
     FormatError
-        If a progress file has other contents.
+        If the progress file is not one of such runs.
     """
     if processes < 1:
         raise InputError(f"soak with {processes} processes; give 1 or more")

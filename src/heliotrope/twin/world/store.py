@@ -27,7 +27,7 @@ class PlantStore:
     clock
         Of the plant.
     persons
-        Observer that knows what persons had ordered and locked at the time of each backup.
+        Observer that knows what operators had ordered and locked at the time of each backup.
     exits
         Removes it at the end of the run.
 
@@ -65,7 +65,7 @@ class PlantStore:
         self._backups = [*self._backups, (folder, self._persons.words())][-2:]
 
     def restore(self) -> None:
-        """Put the older of the last two backups in the place of the store, if there is one."""
+        """Replace the store with the older of the last two backups, if there is one."""
         if not self._backups:
             return
         folder, words = self._backups[0]

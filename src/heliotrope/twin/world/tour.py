@@ -1,10 +1,10 @@
 """The environment "tour": nothing fails, and an engineer takes each heliostat through all commands.
 
-An observer of faults finds nothing in a field that does nothing. Here each command must be carried
-out: it is accepted and done in time, the board is in the requested state, the plant shows it, and
-no alarm is raised. A state is only a name, so the true heliostat is checked too: its beam is on the
-specified point (12), and its motors have moved as commanded. At the end a field-wide emergency
-defocuses the field, is confirmed, and the field comes back.
+Observers of faults cannot find errors in a field that does nothing. Here each command must be
+carried out: it is accepted and done in time, the board is in the requested state, the plant shows
+it, and no alarm is raised. A state is only a name, so the true heliostat is checked too: its beam
+is on the specified point (12), and its motors have moved as commanded. At the end a field-wide
+emergency defocuses the field, is confirmed, and the field comes back.
 """
 
 import asyncio
@@ -34,29 +34,29 @@ STEPS = (
     ("SEARCH", "IDLE"), ("JOG", "IDLE"), ("IDLE", "IDLE"), ("STANDBY", "IDLE"), ("LOCK", "LOCKED"),
     ("UNLOCK", "IDLE"), ("IDLE", "IDLE"), ("DIAGNOSE", "IDLE"), ("TRACK", "TRACKING"),
 )  # fmt: skip
-#: Alarms of every run: its safety table lacks the rows on the share of failed nodes.
+#: Alarms of every run, because its safety table lacks the rows on the fraction of failed nodes.
 EXPECTED = ("unknown_reading",)
-#: A command is done in this time; those that go far, or rest on each point, in the other, s.
+#: Time limits for a command, and for commands that move far or stop at each point, s.
 SOON, LATER = 20.0, 120.0
 FAR = ("APPROACH", "STOW")
 #: Pitch and radius of a search, rad, and the time that it takes, s.
 SPIRAL, SPIRAL_TAKES = (4e-3, 8e-3), 30.0
-#: Rest after a command, for the plant to be told, s; after LOCK, in which the sun moves by more
-#: steps than rough stepping waits for.
+#: Pauses after a command, so that the plant is informed, and after LOCK, in which the sun moves by
+#: more steps than the dead band of coarse stepping, s.
 REST, LOCKED_FOR = 2.5, 10.0
-#: Pause between two looks at a mirror that moves, s.
+#: Interval between checks of a moving heliostat, s.
 LOOK = 0.2
-#: Steps of a JOG, and what the sun adds to them until it is carried out; least motion of each axis
-#: in a diagnosis, steps: it turns them by 0.02 rad.
+#: Steps of a JOG, steps that the sun adds until the JOG is carried out, and least motion of each
+#: axis in a diagnosis, which rotates the axes by 0.02 rad, steps.
 JOGGED, DRIFT, NUDGED = 200, 60, 1000
-#: The true beam is this near its point: share of its length, rad, and m. Backlash is 0.5 mrad of
-#: the mirror, rough stepping 0.25 mrad; beams turn by twice as much.
+#: Largest distance of the true beam from its point: as an angle, rad, plus a length, m. Backlash is
+#: 0.5 mrad of the mirror, coarse stepping 0.25 mrad; beams rotate by twice these angles.
 NEAR, NEAR_M = 4e-3, 0.1
-#: A search comes to the last turn of its spiral: at least this share of its radius.
+#: A search must reach the last turn of its spiral: at least this fraction of its radius.
 OUTWARD = 0.7
 #: Commands that end with the beam at standby.
 TO_STANDBY = ("APPROACH", "IDLE", "STANDBY", "SEARCH")
-#: An emergency takes every beam off the receiver within this, s.
+#: Time within which an emergency must move every beam off the receiver, s.
 OFF_WITHIN = 30.0
 
 
@@ -66,7 +66,7 @@ class Tour:
     Parameters
     ----------
     operator
-        Gives the commands.
+        Issues the commands.
     boards
         The heliostats.
     clock
@@ -79,7 +79,7 @@ class Tour:
     Attributes
     ----------
     over
-        Whether it has been led to its end.
+        Whether the tour is complete.
     """
 
     def __init__(
@@ -97,14 +97,14 @@ class Tour:
         self.over = False
 
     async def work(self) -> None:
-        """Lead all through the tour, then raise an emergency; return at the end of it.
+        """Take all heliostats through the tour, then raise an emergency; return when it is over.
 
         Raises
         ------
         InvariantError
             If a command is refused or not done.
         """
-        await asyncio.sleep(5.0)  # until all have been heard
+        await asyncio.sleep(5.0)  # until all have reported
         self._operator.seize(self._plant, ENGINEER)
         await asyncio.sleep(REST)  # until the clusters have the new token
         async with asyncio.TaskGroup() as group:
@@ -136,7 +136,7 @@ class Tour:
         await self._done("TRACK", name, "TRACKING")
 
     async def _done(self, what: str, name: str, state: str) -> None:
-        """Give a command, and check that it is carried out and shown."""
+        """Issue a command, and check that it is carried out and shown."""
         board, jog = self._boards[name], [0, 0]
         jog[self._chance.randrange(2)] = self._chance.choice([-JOGGED, JOGGED])
         before = _turned(board)
@@ -166,7 +166,7 @@ class Tour:
             await self._stands(name)
 
     def _ordered(self, what: str, name: str, jog: Sequence[int]) -> Ticket | None:
-        """Give a command; None if it is refused."""
+        """Issue a command; return None if it is refused."""
         if what in ("DEFOCUS", "STOW"):
             return self._operator.safe(self._plant, what, name)
         if what == "PARAMETERS":
@@ -177,7 +177,7 @@ class Tour:
         return self._operator.give(self._plant, what, (name,), values=values)
 
     async def _searched(self, name: str) -> None:
-        """Check that the beam goes along the spiral, to its last turn and no further."""
+        """Check that the beam follows the spiral, to its last turn and no further."""
         board, point = self._boards[name], self._operator.points["AIM", name]
         far, most = _far(board, point), 0.0
         until = self._clock.monotonic() + SPIRAL_TAKES
@@ -190,7 +190,7 @@ class Tour:
         self._check(low <= most <= high, saw, 12)
 
     async def _stands(self, name: str) -> None:
-        """Check that a locked mirror stands still."""
+        """Check that a locked heliostat stays at rest."""
         before = _turned(self._boards[name])
         await asyncio.sleep(LOCKED_FOR)
         moved = _turned(self._boards[name]) - before
@@ -204,7 +204,7 @@ class Tour:
         self._check(row.state == state, f"{what} {name}: {state}, and the plant shows {row.state}")
 
     def _beam(self, what: str, name: str) -> None:
-        """Check where the true beam is, or that the true mirror is at stow."""
+        """Check where the true beam is, or that the true heliostat is at stow."""
         board, points = self._boards[name], self._operator.points
         if board.state == states.STOWED:
             off = int(np.abs(_turned(board) - board.outfit.stow).max())
@@ -224,7 +224,7 @@ class Tour:
         return board.miss(self._sun(self._clock.monotonic()), (point[0], point[1], point[2]))
 
     async def _emergency(self) -> None:
-        """Take the whole field off, and bring it back."""
+        """Defocus the whole field, and bring it back."""
         order = self._operator.raises(self._plant, VIEWER, Act.DEFOCUS)
         good = await order.ticket.end(OFF_WITHIN)
         self._check(good, f"an emergency is not carried out: {order.ticket.text}")

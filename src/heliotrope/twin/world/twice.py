@@ -20,43 +20,43 @@ from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
 from heliotrope.twin.world.worlds import Habits
 
-#: Mean time between two commands of its people, s.
+#: Mean time between two commands of its operators, s.
 _PAUSE = 1.5
 
 
-#: Makes a program of a plant from its links, its stores, and a source of random bytes.
+#: Creates a plant program from its links, its stores, and a source of random bytes.
 Begins = Callable[[Mapping[str, Link], Stores, Callable[[int], bytes]], PlantController]
-#: Makes the people of a plant from a seed, their habits, its observers, and whether they give the
-#: plant the flux on the receiver.
+#: Creates the operators of a plant from a seed, their habits, its observers, and whether they enter
+#: the flux on the receiver.
 People = Callable[[int, Habits, Panel, bool], Operator]
 
 
 class SecondPlant:
-    """The second plant, which runs now and then.
+    """The second plant, which runs occasionally.
 
     Parameters
     ----------
     clock, seed
-        True time; seed of everything that it draws.
+        True time; seed of all random choices.
     wanted, assigned
         Parameters and points of the first plant, copied at each start.
     pods
         The clusters, whose lines it takes.
     observers
-        Makes the observers of a plant with records on a disk.
+        Creates the observers of a plant with records on a disk.
     people
-        Makes the people of a plant.
+        Creates the operators of a plant.
     begins
-        Makes a program of the plant from its links, its stores, and a source of random bytes.
+        Creates the plant program from its links, its stores, and a source of random bytes.
 
     Attributes
     ----------
     observer
         Observer of this plant's authority, records and messages.
     operator
-        Its people.
+        Its operators.
     plant
-        None while it does not run.
+        The plant; None while it does not run.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class SecondPlant:
         self._program: list[asyncio.Task[None]] = []
 
     async def work(self) -> None:
-        """Have its people raise mirrors, one at a time."""
+        """Let its operators raise heliostats, one at a time."""
         while True:
             await asyncio.sleep(self._chance.expovariate(1.0 / _PAUSE))
             if self.plant is not None:

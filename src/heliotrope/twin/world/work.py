@@ -35,13 +35,14 @@ from heliotrope.store.records import PlannedVisit
 from heliotrope.twin.cameras import FieldSnapshot
 from heliotrope.twin.world.photographs import LyingCamera
 
-#: Mirrors that may be lost together without an operator: of so few, two may be all.
+#: Number of heliostats that may be lost together without an operator; a small field may have only
+#: two.
 LOSSES = 1
-#: Orders are given again soon.
+#: Settings with short pauses before orders are repeated.
 SETTINGS = AutomaticSettings(rate=1.0, losses=LOSSES, patience=20.0)
-#: A visit that fits into a run of some minutes.
+#: Settings of a visit that fits into a run of some minutes.
 VISIT = CycleSettings(shots=3, interval=2.0, arrival=60.0, least=3, model=CYCLE.model)
-#: A search that stays near its target.
+#: Settings of a search that stays near its target.
 SEARCH = Centring(most=8)
 
 
@@ -52,12 +53,12 @@ class WorkKind:
     Attributes
     ----------
     lies
-        Share of the photographs with which lies begin.
+        Fraction of the photographs with which lies begin.
     searches
-        Share of the runs whose visits search for the beam and follow it: what is searched for is
-        never a light that stands.
+        Fraction of the runs whose visits search for the beam and follow it, so that a stationary
+        light is never taken for the beam.
     lights
-        Whether lights stand on the targets for minutes.
+        Whether lights stay on the targets for minutes.
     together
         Whether the plant chooses by its own schedule, and measures several heliostats at once.
     lowest
@@ -103,18 +104,18 @@ class _Rounds:
         return ()
 
     def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> None:
-        """Return nothing: it predicts nothing."""
+        """Return nothing, because this schedule predicts nothing."""
         del able, targets
 
     def done(self, entry: CalibrationEntry) -> None:
-        """Nothing to do: the next is next."""
+        """Do nothing, because results do not affect the order."""
 
     def shone(self, mirrors: int, lit: int, seconds: float) -> None:
-        """Nothing to do: it predicts nothing."""
+        """Do nothing, because this schedule predicts nothing."""
 
 
 class Work:
-    """Automatic control of a run, made anew whenever the plant's program starts.
+    """Automatic control of a run, created again whenever the plant's program starts.
 
     Parameters
     ----------
@@ -130,13 +131,14 @@ class Work:
     Attributes
     ----------
     centred
-        Whether visits search for the beam and follow it; else they photograph what is there.
+        Whether visits search for the beam and follow it; otherwise they photograph whatever is
+        there.
     camera
         Camera of the targets.
     records
         The store.
     operations, logbook
-        Of the plant's program; None while it does not run.
+        Those of the plant's program; None while it does not run.
     """
 
     def __init__(
@@ -146,7 +148,7 @@ class Work:
         exits: contextlib.ExitStack,
         kind: WorkKind,
     ) -> None:
-        # A stack of photographs tells beams apart, as a search does.
+        # A stack of photographs distinguishes beams, as a search does.
         searches = random.Random(f"visits {seed}").random() < kind.searches
         self.centred = kind.together or searches
         self._together, self._kind = kind.together, kind
@@ -161,7 +163,7 @@ class Work:
         self.logbook: Logbook | None = None
 
     def away(self, at: float) -> float:
-        """Return the span from a POSIX time, s, to the nearest photograph, s."""
+        """Return the time from a POSIX time, s, to the nearest photograph, s."""
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
         return self.camera.away(at - zero)
 
@@ -172,7 +174,7 @@ class Work:
         return self.logbook
 
     def begins(self, plant: PlantController) -> Operations:
-        """Return the operations of a new program; local controllers should store what it knows."""
+        """Return the operations of a new program; local controllers should store its parameters."""
         assert self.logbook is not None
         centring = SEARCH if self.centred else None
         cycle = CalibrationCycle(plant, self.camera, VISIT, centring)
@@ -206,12 +208,12 @@ class Work:
         return None if settings is None else ReceiverCycle(plant, self.camera, cycle, settings)
 
     def take_alarm(self, alarm: Alarm) -> None:
-        """Take an alarm of the plant."""
+        """Accept an alarm of the plant."""
         if self.logbook is not None:
             self.logbook.take_alarm(alarm)
 
     def ends(self) -> None:
-        """Note that the program ends, wherever it is."""
+        """Record that the program ends, at whatever point it is."""
         if self.operations is not None:
             self.operations.automatic.stop()
         self.operations = self.logbook = None

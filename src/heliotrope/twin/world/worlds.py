@@ -11,7 +11,7 @@ from heliotrope.mechanism.machine import Stepping
 from heliotrope.sun import Site
 from heliotrope.twin.boards.outfit import MACHINE, Outfit
 
-#: Everything that a run may add, and its meaning.
+#: Everything that a run may add, with its meaning.
 WORLDS = {
     "calm": "persons seldom take mirrors off the receiver",
     "swarm": "each run draws its own weights of faults and of what persons do",
@@ -38,38 +38,39 @@ WORLDS = {
 DAYS, DAY = "days", 840.0
 #: Boards, files and stores are exchanged; plant and clusters share a wrong time.
 REPAIRS, COMMON = "repairs", "common"
-#: Worlds in which nothing fails but their own faults.
+#: Worlds in which only their own faults occur.
 OWN_FAULTS = frozenset({DAYS, REPAIRS})
 #: Worlds with automatic control.
 WORKING = ("visits", "day", "lights", "parties", DAYS)
-#: Worlds with joint visits and receiver visits, and the least number of their heliostats.
+#: Worlds with joint visits and receiver visits, and their minimum number of heliostats.
 PARTIES, PARTY = ("parties", DAYS), 6
 #: Worlds in which site, date, hour, and places are drawn.
 DRAWN = ("place", "day")
-#: Faults in a run with automatic control come this many times more seldom: a visit takes a minute,
-#: and an operator's act is most of what happens on a day.
+#: Factor on the time between faults in runs with automatic control, because a visit takes a minute,
+#: and most events of a day are actions of operators.
 _SELDOM, _SELDOM_BY_DAY = 4.0, 50.0
-#: Repairs take their time: faults come this many times more seldom than usual ones.
+#: Factor on the time between faults in runs with repairs, which take longer.
 _REPAIRED = 2.0
-#: Name that lets each run draw its worlds: see `mixed`.
+#: Name by which each run draws its worlds; see `mixed`.
 ANY = "any"
-#: Worlds that hold, of which `mixed` chooses.
+#: Worlds from which `mixed` chooses.
 MIX = (
     "calm", "swarm", "frozen", "disk", "place", "sensors", "parameters", "calibrations",
     "twice",
     "visits", "day",
 )  # fmt: skip
-#: Worlds that `mixed` adds to this share of runs each, beside those that it draws. A cluster that
-#: is wrong from the start is found within seconds, and then keeps its mirrors from all else.
+#: Worlds that `mixed` adds, each to this fraction of runs, in addition to those that it draws. A
+#: cluster that is wrong from the start is detected within seconds, and its heliostats then do
+#: nothing.
 RARE, RARE_SHARE = ("lights", "clock", "site", "addresses", COMMON), 0.04
-#: Motors whose full step is 0.5 mrad of the joint: rough stepping goes by full steps.
+#: Motors with a full step of 0.5 mrad at the joint; coarse stepping uses full steps.
 COARSE = Stepping((32, 32))
-#: Shares of days with motors that step coarsely, and with heliostats of which the plant file is
-#: wrong; by how much, rad of the mirror.
+#: Fractions of days with motors that step coarsely, and with heliostats that are wrong in the plant
+#: file; range of that error, rad of the mirror.
 _COARSE_DAYS, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.018, 0.022)
-#: Share of the days on which a mirror is covered: it throws no light.
+#: Fraction of the days on which a mirror is covered, so that it reflects no light.
 _COVERED = 0.25
-#: Share of the runs of `mixed` that are a working day, or repairs, and nothing else.
+#: Fraction of the runs of `mixed` that are only a working day; the same for repairs.
 ALONE_SHARE = 0.1
 
 
@@ -79,7 +80,7 @@ def checked(worlds: Sequence[str]) -> None:
     Raises
     ------
     InputError
-        An unknown one.
+        If a name is unknown.
     """
     for name in worlds:
         if name not in WORLDS:
@@ -87,7 +88,7 @@ def checked(worlds: Sequence[str]) -> None:
 
 
 def mixed(seed: int) -> tuple[str, ...]:
-    """Return worlds drawn from a seed: some of `MIX`, and seldom one of `RARE`; or one alone."""
+    """Return worlds drawn from a seed: some of `MIX`, and rarely one of `RARE`; or only one."""
     for alone in (DAYS, REPAIRS):
         if random.Random(f"{alone} {seed}").random() < ALONE_SHARE:
             return (alone,)
@@ -99,31 +100,31 @@ def mixed(seed: int) -> tuple[str, ...]:
     return tuple(name for name in worlds if name != "twice" or not works(worlds))
 
 
-#: Weights of the actions of operators while much is repaired: emergencies are frequent; and of
-#: those who leave mirrors up for a while.
+#: Weights of the operators' actions during repairs: with frequent emergencies, and for operators
+#: who leave heliostats up for a while.
 _REPAIRING = (60, 14, 2, 6, 2, 2, 2, 3, 1)
 _REPAIRING_CALMLY = (60, 10, 1, 1.5, 0.3, 0.3, 2, 2, 1)
 
 
 @dataclass(frozen=True)
 class Habits:
-    """The acts of simulated operators, and their rates.
+    """The actions of simulated operators, and their rates.
 
     Attributes
     ----------
     pause
         Mean time between two actions, s.
     weights
-        Of their actions: lead a mirror on, command all, push parameters, raise an emergency, take
-        one mirror off, lock one, command without authority, change the authority, aim at a
-        keep-out volume.
+        Weights of their actions: advance a heliostat, command all, push parameters, raise an
+        emergency, order one heliostat off, lock one, command without authority, change the
+        authority, aim at a keep-out volume.
     idle
-        Whether they command IDLE to all: heliostats at stow are stuck in it.
+        Whether they order IDLE for all heliostats; those at stow then stay in IDLE.
     calibrates
-        Share of their actions that change parameters beyond those of every run.
+        Fraction of the actions that change parameters, in addition to those of every run.
     locks
-        Share of their actions that lock a mirror, return a lock, write to what is locked, or mend
-        a board.
+        Fraction of their actions that lock a heliostat, remove a lock, write to a locked heliostat,
+        or repair a board.
     """
 
     pause: float = 2.0
@@ -152,7 +153,7 @@ class Habits:
 
 
 def weights_of(worlds: Sequence[str], seed: int, weights: Mapping[str, float]) -> dict[str, float]:
-    """Return the weights of the kinds of faults of a run, not all of them 0."""
+    """Return the weights of the kinds of faults of a run, which are not all 0."""
     if "swarm" not in worlds:
         return dict(weights)
     chance = random.Random(f"weights {seed}")
@@ -187,7 +188,7 @@ def measured(worlds: Sequence[str]) -> bool:
 
 
 def length_of(worlds: Sequence[str], hours: float | None) -> float:
-    """Return the length of a run, s: a day for "days", else 0.1 h, where no ``hours`` are given."""
+    """Return the length of a run, s: ``hours`` if given, else a day for "days", else 0.1 h."""
     if hours is not None:
         return 3600.0 * hours
     return DAY if DAYS in worlds else 360.0
@@ -206,10 +207,10 @@ def knows_boards(worlds: Sequence[str]) -> bool:
 def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
     """Return heliostats with the items that their boards store at the start.
 
-    In the world "parameters" half of them store wrong ones: another mirror's, or their own with an
-    error from a scratch to a blunder, or limits that are too narrow. Where addresses are exchanged,
-    none stores another mirror's: a board with the address and the armature of another mirror is
-    that mirror's by all that it reports, and only a photograph would tell.
+    In the world "parameters" half of them store wrong items: those of another heliostat, or their
+    own with a small to gross error, or limits that are too narrow. If addresses are swapped, none
+    stores those of another heliostat, because a board with the address and the armature of another
+    heliostat is indistinguishable from that heliostat's board, except by a photograph.
     """
     if "parameters" not in worlds:
         return list(fits)
@@ -224,7 +225,7 @@ def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
 
 
 def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
-    """Return heliostats with their motors: on one day in three these step coarsely."""
+    """Return heliostats with their motors, which step coarsely on one day in three."""
     coarse = DAYS in worlds and random.Random(f"motors {seed}").random() < _COARSE_DAYS
     if not coarse:
         return list(fits)
@@ -240,9 +241,9 @@ def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
 
 
 def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
-    """Return heliostats as the plant file has them: on one day in three it is wrong about three.
+    """Return heliostats as in the plant file; on one day in three it is wrong about three.
 
-    From 80 m on, their beams then go beside the targets, where no photograph shows them.
+    From 80 m, their beams then miss the targets, so that no photograph shows them.
     """
     chance = random.Random(f"survey {seed}")
     if DAYS not in worlds or chance.random() >= _UNSURVEYED:
@@ -258,7 +259,7 @@ def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[O
 
 
 def covered_by(names: Sequence[str], worlds: Sequence[str], seed: int) -> frozenset[str]:
-    """Return the heliostats of which the mirror is covered: one on one day in four."""
+    """Return the heliostats whose mirrors are covered: one, on one day in four."""
     chance = random.Random(f"covers {seed}")
     if DAYS not in worlds or chance.random() >= _COVERED:
         return frozenset()
@@ -266,7 +267,7 @@ def covered_by(names: Sequence[str], worlds: Sequence[str], seed: int) -> frozen
 
 
 def wrong_items(fit: Outfit, others: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:
-    """Return some wrong items of a heliostat, or another one's location and armature."""
+    """Return some wrong items of a heliostat, or another heliostat's location and armature."""
     what = chance.choice([*(["another"] if others else []), "armature", "biases", "machine"])
     if what == "another":
         other = items_of(chance.choice(list(others)).mechanism)
@@ -296,7 +297,7 @@ def narrow_limits() -> dict[str, bytes]:
 
 
 def common_error(worlds: Sequence[str], seed: int) -> timedelta:
-    """Return by how much the time of plant and clusters alike is ahead of the true one."""
+    """Return how far the common time of plant and clusters is ahead of the true time."""
     if COMMON not in worlds:
         return timedelta()
     chance = random.Random(f"{COMMON} {seed}")
@@ -320,7 +321,7 @@ class PodErrors:
     freezes
         Whether its program may be frozen.
     shared
-        Whether a second plant takes its line now and then.
+        Whether a second plant occasionally takes its line.
     """
 
     def __init__(self, worlds: Sequence[str], seed: int, index: int) -> None:
@@ -332,7 +333,7 @@ class PodErrors:
         return random.Random(f"{world} {self._name}") if world in self._worlds else None
 
     def start(self, start: datetime) -> datetime:
-        """Return the time that the cluster's clock begins with."""
+        """Return the time at which the cluster's clock starts."""
         chance = self._chance("clock")
         if chance is None:
             return start
