@@ -345,7 +345,7 @@ def test_refusals(possible: CandidateSightings, year: FloatArray) -> None:
     with pytest.raises(UnknownNameError, match="tilt_up"):
         precision(FIELD, ("tilt_up",))
     made = camera_target([30], [[0.0, 0.0]], [0.0, 0.0, 1.0], [0.0, 0.0, 13.0])
-    with pytest.raises(InputError, match="row 30; there are 18"):
+    with pytest.raises(InputError, match="heliostat index 30, but there are 18"):
         precision(FIELD, NAMES, made)
     with pytest.raises(InputError, match="end must be after"):
         time_grid(START, START, 60.0)

@@ -466,7 +466,7 @@ def test_cameras_that_cannot_see_the_target() -> None:
     with pytest.raises(InputError, match="its position is unknown"):
         render(scene(camera=lost), 0)
     behind = replace(CAMERA, position=CAMERA.position * [1.0, -1.0, 1.0])
-    with pytest.raises(InputError, match="does not see the front of target target"):
+    with pytest.raises(InputError, match="cannot see the front of target target"):
         render(scene(camera=behind), 0)
     near = example_camera(TARGET, 9.0, side=1.3, size=(640, 480))
     wide = replace(ALONE, wall=(0.0, 60.0, 0.0, 0.0))

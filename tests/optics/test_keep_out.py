@@ -508,7 +508,7 @@ def test_what_cannot_be_is_refused() -> None:
     many = kinds.azimuth_elevation(np.zeros((2, 3))).armature
     with pytest.raises(InputError, match="3 paths for 2 heliostats"):
         optics.sweep(many, np.zeros((3, 2, 2)), SUN, mirror, ZOO)
-    with pytest.raises(InputError, match="give one heliostat"):
+    with pytest.raises(InputError, match="pass one heliostat"):
         optics.safe_way(many, (0, 1), SUN, FOOT, STANDBY, mirror, ZOO)
     with pytest.raises(InputError, match="pass the 2 joint angles"):
         optics.safe_way(arm, (0, 1, 2), SUN, FOOT, STANDBY, mirror, ZOO)

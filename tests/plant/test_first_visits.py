@@ -308,7 +308,7 @@ def test_automatic_control_begins_with_them() -> None:
     ("wrong", "said"),
     [
         ({"first": 3}, "3 heliostats without a calibration; must be 0, or 4 to 127"),
-        ({"first": 128}, "first 128 .heliostats without a calibration.*; must be 0 to 127$"),
+        ({"first": 128}, "first 128 .heliostats without a calibration.*; give 0 to 127$"),
         ({"first_movement": 6e-3}, "first_movement_mrad 6 .*; give above 0 to 5$"),
     ],
 )

@@ -271,9 +271,7 @@ def read_photos(
         except InputError as error:
             problems.append(str(error))
     missing = sorted(set(rows) - {f.name for f in files})
-    problems += [
-        f"{place / name}: {table.name} lists it, but there is no such file" for name in missing
-    ]
+    problems += [f"{place / name}: {table.name} lists it, but no such file" for name in missing]
     if not photos:
         raise InputError(
             f"{place}: none of the {len(problems)} photographs can be used: {problems[0]}"
@@ -385,7 +383,7 @@ def _of_row(
         except ValueError:
             raise FormatError(table, f"time {text!r} is not ISO 8601", row["name"]) from None
         if time.tzinfo is None:
-            raise FormatError(table, f"time {text} has no zone; append Z", row["name"])
+            raise FormatError(table, f"time {text} has no time zone; append Z", row["name"])
         time = time.astimezone(UTC)
     turned = rotation_of_gimbal(yaw, pitch, roll)
     return Photo(file.name, time, position, turned, np.full(3, number("sigma_m")), file)

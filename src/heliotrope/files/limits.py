@@ -88,7 +88,7 @@ def check_file(
                 raise FormatError(file, f"this is a device or a pipe; give a file: {what}")
             start = stream.read(4096)
     except FileNotFoundError:
-        raise FormatError(file, f"there is no such file; give the path of {what}") from None
+        raise FormatError(file, f"no such file; give the path of {what}") from None
     except IsADirectoryError:
         raise FormatError(file, f"this is a folder; give the path of {what}") from None
     except OSError as error:

@@ -66,7 +66,7 @@ class Frame:
                 f"{self.name or 'frame'}: pixels of {self.pixels.dtype}; use uint8 or uint16"
             )
         if self.time is not None and self.time.tzinfo is None:
-            raise InputError(f"{self.name or 'frame'}: time {self.time} has no zone; add one")
+            raise InputError(f"{self.name or 'frame'}: time {self.time} has no time zone; add one")
 
     @property
     def size(self) -> tuple[int, int]:

@@ -145,7 +145,7 @@ def _sun(azimuth_deg: float, elevation_deg: float) -> FloatArray | None:
 
 
 def beside(path: Path, heliostat: str = "") -> Entry | None:
-    """Return the entry in PAINT's file beside a photograph; None if there is no such file.
+    """Return the entry in PAINT's file beside a photograph; None if no such file.
 
     Parameters
     ----------

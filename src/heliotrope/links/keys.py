@@ -331,11 +331,11 @@ def carried_files(folder: Path, clusters: Sequence[str]) -> list[Path]:
     Raises
     ------
     InputError
-        If there is no such folder, a cluster is named twice, its name cannot be a file name, or a
+        If no such folder, a cluster is named twice, its name cannot be a file name, or a
         file exists, because keys are never overwritten.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder")
+        raise InputError(f"{folder}: no such folder")
     if len(set(clusters)) < len(clusters):
         raise InputError("keys: a cluster is named twice; name each once")
     files = []

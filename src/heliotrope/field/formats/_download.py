@@ -261,7 +261,7 @@ def _check_status(response: "httpx.Response", url: str, *also: HTTPStatus) -> No
         return
     answer = f"the server replied {status} {response.reason_phrase}".rstrip()
     if status in {HTTPStatus.NOT_FOUND, HTTPStatus.GONE}:
-        raise NotFoundError(f"{url}: there is no such file ({answer})")
+        raise NotFoundError(f"{url}: no such file ({answer})")
     if status >= HTTPStatus.INTERNAL_SERVER_ERROR or status in _LATER:
         after = response.headers.get("retry-after", "")
         raise _LaterError(answer, float(after) if after.isdigit() else 0.0)

@@ -212,7 +212,7 @@ def _maps(
     folder = reader.path.parent / reader.group.mirror.slope_maps
     if not folder.is_dir():
         raise reader.fail(
-            f"{folder}: there is no such folder; give one with NAME.npz, NAME.csv or NAME.h5 of "
+            f"{folder}: no such folder; give one with NAME.npz, NAME.csv or NAME.h5 of "
             "the heliostats",
             "mirror.slope_maps",
         )

@@ -51,7 +51,7 @@ class VideoSource(Source):
     def __post_init__(self) -> None:
         self.name = self.name or str(self.path)
         if self.start is not None and self.start.tzinfo is None:
-            raise TimeError(f"source {self.name}: its start {self.start} has no zone; add one")
+            raise TimeError(f"source {self.name}: its start {self.start} has no time zone; add one")
 
     def _begin(self) -> None:
         self._open().release()

@@ -207,7 +207,7 @@ class EmptyTarget:
         Raises
         ------
         InputError
-            If there is no such file.
+            If no such file.
         FormatError
             If the file is not such a model.
         """
