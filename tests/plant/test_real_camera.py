@@ -250,7 +250,7 @@ def test_snapshots_over_http(camera_server: str, tmp_path: Path) -> None:
 
 def test_a_snapshot_that_none_is(camera_server: str) -> None:
     source = SnapshotSource(f"{camera_server}/other.png")
-    with pytest.raises(FetchError, match="answer 404 of 2 bytes") as refused:
+    with pytest.raises(FetchError, match="replied 404 with 2 bytes") as refused:
         next(iter(source))
     assert "secret" not in str(refused.value)
     source = SnapshotSource("http://user:secret@127.0.0.1:1/now.jpg", timeout=2.0)

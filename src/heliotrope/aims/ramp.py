@@ -37,10 +37,10 @@ def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
     count = len(aims.aims)
     images = aims.engine.images(aims.aims[:, None, :], np.zeros(count, dtype=np.int64))
     joins = np.full(count, np.nan)
-    here = ~aims.defocused & (aims.engine.leaving > 0.0)
+    joining = ~aims.defocused & (aims.engine.leaving > 0.0)
     turn = (np.arange(count) * 0.6180339887498949) % 1.0
     # Neighbours one after the other would fill the same cells first.
-    waiting = [int(row) for row in np.argsort(turn, kind="stable") if here[row]]
+    waiting = [int(row) for row in np.argsort(turn, kind="stable") if joining[row]]
     flux, peak = np.zeros(images.shape[::-1]), float(aims.engine.maps[0].max())
     if peak > MOST * rate * step:
         raise InputError(
@@ -49,13 +49,13 @@ def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
         )
     k = 0
     while waiting:
-        allowed, left = (k + 1) * rate * step, []
+        allowed, later = (k + 1) * rate * step, []
         for row in waiting:
             image = images.of(row)
             if (flux + image > allowed)[image > 0.0].any():
-                left.append(row)
+                later.append(row)
                 continue
             flux += image
             joins[row] = k * step
-        waiting, k = left, k + 1
+        waiting, k = later, k + 1
     return as_float(joins)

@@ -350,24 +350,24 @@ class _Walk:
 
     def relieved(self, rows: Rows) -> list[Move]:
         """Rest mirrors while cells are above the limit, the most effective first, all at once."""
-        gone: list[int] = []
-        left = [int(row) for row in rows]
-        while left:
+        resting: list[int] = []
+        lighting = [int(row) for row in rows]
+        while lighting:
             over = np.maximum(self._flux - (1.0 + HOLDS) * self._cap, 0.0)
             if not over.any():
                 break
-            share = {row: float((self._path.images.of(row) * over).sum()) for row in left}
-            left.sort(key=share.__getitem__)
-            for _ in range(1 + int(SHED * len(left))):
-                if not left or share[left[-1]] <= 0.0:
+            share = {row: float((self._path.images.of(row) * over).sum()) for row in lighting}
+            lighting.sort(key=share.__getitem__)
+            for _ in range(1 + int(SHED * len(lighting))):
+                if not lighting or share[lighting[-1]] <= 0.0:
                     break
-                self._flux = self._flux - self._path.images.of(left[-1])
-                gone.append(left.pop())
+                self._flux = self._flux - self._path.images.of(lighting[-1])
+                resting.append(lighting.pop())
             else:
                 continue
             break
-        self.done = np.union1d(self.done, gone).astype(np.intp)
-        return [_rest(np.array(gone, dtype=np.intp))] if gone else []
+        self.done = np.union1d(self.done, resting).astype(np.intp)
+        return [_rest(np.array(resting, dtype=np.intp))] if resting else []
 
 
 def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:

@@ -199,22 +199,22 @@ def _shaped(scene: Scene, best: SceneAims, demand: Demand, light: dict[str, Any]
     power = (1.0 - demand.give) * best.engine.powers[0]
     low = power / float(wanted.sum() * best.field.images.area)
     high = float((best.quantile / wanted).max())
-    found = best
+    held = best
     while high > CLOSE * low:
         level = float(np.sqrt(low * high))
         cap = as_float(np.minimum(best.limit, level * wanted))
         try:
-            trial = _held(scene, best.field, demand, cap, found, None, light)
+            trial = _held(scene, best.field, demand, cap, held, None, light)
         except InputError:
             low = level
             continue
         if trial.engine.powers[0] >= power:
-            found, high = trial, level
+            held, high = trial, level
         else:
             low = level
     # The bound on the power is that of the limit.
-    choice = replace(found.choice, bound=best.choice.bound)
-    return replace(found, choice=choice, limit=best.limit)
+    choice = replace(held.choice, bound=best.choice.bound)
+    return replace(held, choice=choice, limit=best.limit)
 
 
 def deviation(flux: FloatArray, wanted: FloatArray) -> float:

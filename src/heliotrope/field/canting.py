@@ -51,8 +51,8 @@ def off_axis(
     aim
         ENU m, (N, 3).
     """
-    left, up = np.moveaxis(tangent_axes(normal), 1, 0)
-    axes = np.stack([-left, up, normal], axis=1)
+    side, up = np.moveaxis(tangent_axes(normal), 1, 0)
+    axes = np.stack([-side, up, normal], axis=1)
     place = vertex[:, None] + np.einsum("hfk,hki->hfi", center, axes[:, :2])
     light = np.broadcast_to(sun, place.shape)
     lean = bisector(light, normalize(aim[:, None] - place, "aim − facet"))

@@ -5,6 +5,7 @@ fluid in a tube, the less flux its wall endures. The panels of the receiver, in 
 flow, say how hot and how fast the fluid is at each position.
 """
 
+import operator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,10 +66,10 @@ class FluxTable:
             (self.temperature, temperature, "temperature", "°C"),
             (self.velocity, velocity, "velocity", "m/s"),
         ):
-            wrong = ~((value >= axis[0]) & (value <= axis[-1]))
-            if wrong.any():
+            outside = ~((value >= axis[0]) & (value <= axis[-1]))
+            if outside.any():
                 raise InputError(
-                    f"flux table: a {name} of {np.asarray(value)[wrong].flat[0]:g} {unit} is "
+                    f"flux table: a {name} of {np.asarray(value)[outside].flat[0]:g} {unit} is "
                     f"outside its {axis[0]:g} to {axis[-1]:g} {unit}; extend the table"
                 )
             places.append(np.interp(value, axis, np.arange(len(axis))))
@@ -145,21 +146,21 @@ def limit_of(table: FluxTable, panels: tuple[Panel, ...], margin: float = 0.0) -
         edges = table.at(as_float(temperature), np.full(_ROWS + 1, panel.velocity))
         least = np.minimum(edges[:-1], edges[1:])[:, None]
         first = int(np.floor(panel.begin * _COLUMNS + 1e-6))
-        here = slice(first, int(np.ceil(panel.end * _COLUMNS - 1e-6)))
-        flux[:, here] = np.minimum(flux[:, here], least)
+        columns = slice(first, int(np.ceil(panel.end * _COLUMNS - 1e-6)))
+        flux[:, columns] = np.minimum(flux[:, columns], least)
     return FluxLimit(flux, margin)
 
 
 def _check(panels: tuple[Panel, ...]) -> None:
     """Refuse panels that do not cover the width once, or paths with a step in temperature."""
     at = 0.0
-    for panel in sorted(panels, key=lambda each: each.begin):
+    for panel in sorted(panels, key=operator.attrgetter("begin")):
         if abs(panel.begin - at) > 1e-6:
-            wrong = "without a limit" if panel.begin > at else "on two panels"
+            problem = "without a limit" if panel.begin > at else "on two panels"
             low, high = sorted((at, panel.begin))
             raise InputError(
-                f"panels: the receiver's width from {low:g} to {high:g} is {wrong}; let each panel "
-                "begin where another ends"
+                f"panels: the receiver's width from {low:g} to {high:g} is {problem}; let each "
+                "panel begin where another ends"
             )
         at = panel.end
     if abs(at - 1.0) > 1e-6:
@@ -227,16 +228,16 @@ def read_panels(path: str | Path) -> tuple[Panel, ...]:
     units = {"begin": "a share of the width", "end": "a share of the width", "inlet_c": "°C",
              "outlet_c": "°C", "velocity_m_s": "m/s"}  # fmt: skip
     values = [rows.numbers(name, what) for name, what in units.items()]
-    ways = rows.texts("flow")
-    for i, way in enumerate(ways):
-        if way not in ("up", "down"):
-            rows.refuse(i, "flow", f"{way!r} is neither up nor down; give one")
+    flows = rows.texts("flow")
+    for i, flow in enumerate(flows):
+        if flow not in ("up", "down"):
+            rows.refuse(i, "flow", f"{flow!r} is neither up nor down; give one")
     rows.refuse_bad()
     panels = []
-    for i, (name, way) in enumerate(zip(rows.texts("path"), ways, strict=True)):
+    for i, (name, flow) in enumerate(zip(rows.texts("path"), flows, strict=True)):
         begin, end, *state = (float(value[i]) for value in values)
         try:
-            panels.append(Panel(name, begin, end, way == "up", *state))
+            panels.append(Panel(name, begin, end, flow == "up", *state))
         except InputError as error:
             raise FormatError(rows.path, str(error), rows.places[i]) from None
     return tuple(panels)

@@ -175,8 +175,8 @@ class Heliostats(Value, Framed):
         if self.facets is not None and len(self.facets.center) != count:
             raise InputError(f"heliostats: {len(self.facets.center)} rows of facets for {count}")
         if self.surface is not None:
-            each = 1 if self.facets is None else self.facets.center.shape[1]
-            self.surface.check(self.names, each)
+            facets = 1 if self.facets is None else self.facets.center.shape[1]
+            self.surface.check(self.names, facets)
 
     def check_facets(self) -> None:
         """Check that every facet lies on its mirror.

@@ -150,9 +150,9 @@ class MirrorSurface(Value):
                 raise InputError(
                     f"mirrors: {what} of shape {value.shape} for {count} mirrors of {facets} facets"
                 )
-            wrong = ~((value > low) & (value <= high))
-            if wrong.any():
-                place = tuple(np.argwhere(wrong)[0])
+            outside = ~((value > low) & (value <= high))
+            if outside.any():
+                place = tuple(np.argwhere(outside)[0])
                 facet = f", facet {place[1]}" if len(place) > 1 else ""
                 raise InputError(
                     f"heliostat {names[place[0]]}{facet}: {what} {value[place]:g} {unit} must be "
@@ -160,10 +160,10 @@ class MirrorSurface(Value):
                 )
         if self.maps and len(self.maps) != count:
             raise InputError(f"mirrors: {len(self.maps)} slope maps for {count} mirrors")
-        for name, each in zip(names, self.maps, strict=bool(self.maps)):
-            if each is not None and (each.ndim != 4 or each.shape[::3] != (facets, 2)):
+        for name, slopes in zip(names, self.maps, strict=bool(self.maps)):
+            if slopes is not None and (slopes.ndim != 4 or slopes.shape[::3] != (facets, 2)):
                 raise InputError(
-                    f"heliostat {name}: a slope map of shape {each.shape}, but the mirror has "
+                    f"heliostat {name}: a slope map of shape {slopes.shape}, but the mirror has "
                     f"{facets} facets; give ({facets}, rows, columns, 2)"
                 )
 

@@ -175,7 +175,7 @@ def shaped(
 def _mapped(group: Heliostats) -> npt.NDArray[np.bool_]:
     """Return which mirrors of a group have a slope map, (N,)."""
     maps = () if group.surface is None else group.surface.maps
-    return np.array([each is not None for each in maps] or [False] * len(group), dtype=np.bool_)
+    return np.array([slopes is not None for slopes in maps] or [False] * len(group), dtype=np.bool_)
 
 
 def _numbers(group: Heliostats) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -222,8 +222,8 @@ def _table(
             continue
         assert group.surface is not None
         for i, slopes in enumerate(group.surface.maps):
-            one = _Parts(*(value[i : i + 1] for value in vars(whole).values()))
-            parts.append(one if slopes is None else _divided(one, slopes))
+            part = _Parts(*(value[i : i + 1] for value in vars(whole).values()))
+            parts.append(part if slopes is None else _divided(part, slopes))
     most = max(part.center.shape[1] for part in parts)
     rows = zip(*(vars(part.padded(most)).values() for part in parts), strict=True)
     center, tilt, half, curve, variance = (np.concatenate(column) for column in rows)

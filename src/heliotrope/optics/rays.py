@@ -201,16 +201,18 @@ class _Tracer:
         return normalize(ray + error[:, :1] * right + error[:, 1:] * np.cross(right, ray))
 
     def _stopped(self, start: FloatArray, ray: FloatArray, length: FloatArray) -> np.ndarray:
-        origin, way = _single(start - self.origin), _single(ray)
-        hit = self.solids.run(origin, way, dists=_single(length - 2.0 * self.off), query="OCCLUDED")
+        origin, along = _single(start - self.origin), _single(ray)
+        hit = self.solids.run(
+            origin, along, dists=_single(length - 2.0 * self.off), query="OCCLUDED"
+        )
         return np.asarray(hit >= 0)
 
     def _met(self, point: FloatArray, ray: FloatArray) -> tuple[Any, Any, FloatArray]:
         """Return the first surface of each ray, its cell there, and the distance."""
         surface = np.full(len(point), -1)
         cell, nearest = np.full(len(point), -1), np.full(len(point), np.inf)
-        for j, each in enumerate(self.scene.surfaces):
-            where, distance, hit = self._cell(each, point, ray)
+        for j, receiver in enumerate(self.scene.surfaces):
+            where, distance, hit = self._cell(receiver, point, ray)
             first = hit & (distance < nearest)
             surface[first], cell[first], nearest[first] = j, where[first], distance[first]
         return surface, cell, nearest
@@ -224,13 +226,15 @@ class _Tracer:
             cell, distance = on(surface, point, ray)  # type: ignore[arg-type]
             return cell, distance, cell >= 0
         inner = surface if isinstance(surface, Mesh) else surface.inner
-        found = self.meshes[id(inner)].run(_single(point - self.origin), _single(ray), output=True)
-        cell, distance = found["primID"], as_float(found["tfar"])
+        crossed = self.meshes[id(inner)].run(
+            _single(point - self.origin), _single(ray), output=True
+        )
+        cell, distance = crossed["primID"], as_float(crossed["tfar"])
         front = (cell >= 0) & (_dot(inner.cells.normal[cell], ray) < 0.0)
         if isinstance(surface, Mesh):
             return np.where(front, cell, -1), distance, front
-        seen, before = _on_plate(surface.aperture, point, ray)
-        return np.where(front & (seen >= 0), cell, -1), before, seen >= 0
+        reached, before = _on_plate(surface.aperture, point, ray)
+        return np.where(front & (reached >= 0), cell, -1), before, reached >= 0
 
 
 def _on_plate(plate: Plate, point: FloatArray, ray: FloatArray) -> tuple[Any, FloatArray]:
@@ -283,10 +287,10 @@ class _Tally:
         for row, share in enumerate(shares):
             self.sums[row] += np.bincount(mirror, share, minlength=self.sums.shape[1])
         for j, sums in enumerate(self.cells):
-            here = lit & (surface == j)
-            on = here & (cell >= 0)
+            arrived = lit & (surface == j)
+            on = arrived & (cell >= 0)
             for row in (0, 1):
-                self.caught[j, row] += float((weight[here] ** (row + 1)).sum())
+                self.caught[j, row] += float((weight[arrived] ** (row + 1)).sum())
                 got = weight[on] ** (row + 1)
                 sums[row] += np.bincount(cell[on], got, minlength=sums.shape[1])
 
@@ -338,8 +342,8 @@ def _sides(tower: Tower) -> FloatArray:
     edge = tower.radius * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
     edge = edge + [tower.east, tower.north]
     low, high = (np.insert(edge, 2, z, axis=1) for z in (tower.bottom, tower.top))
-    one = np.stack([low[:-1], low[1:], high[1:]], axis=1)
-    return np.concatenate([one, np.stack([low[:-1], high[1:], high[:-1]], axis=1)])
+    lower = np.stack([low[:-1], low[1:], high[1:]], axis=1)
+    return np.concatenate([lower, np.stack([low[:-1], high[1:], high[:-1]], axis=1)])
 
 
 def _meshes(surfaces: tuple[Surface, ...]) -> list[Mesh]:

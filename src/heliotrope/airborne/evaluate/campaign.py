@@ -119,7 +119,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
 
 
 def _cause(lines: Sequence[str]) -> str:
-    """Return why a flight failed: the most frequent reason among its messages, with an example."""
+    """Return the most frequent reason for which a flight failed, with an example."""
     reasons = [line for line in lines if line.strip(" :")]
     if not reasons:
         return "its photographs show no reflection of the lamp"

@@ -272,7 +272,7 @@ def _median_errors(mechanism: Mechanism, sightings: Sightings, fitted: FieldFit)
 def _hopeless(
     mechanism: Mechanism, mine: Sightings, outcome: FitOutcome, strain: float, error: float
 ) -> str | None:
-    """Return why a fit cannot be valid even if no sighting is wrong; None if it can."""
+    """Return the reason why a fit cannot be valid even if no sighting is wrong; None if it can."""
     still = [
         mechanism.joints[joint]
         for d, joint in enumerate(mechanism.driven)

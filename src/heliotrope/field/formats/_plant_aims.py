@@ -33,13 +33,13 @@ def build_aims(table: AimsTable | None, folder: Path) -> AimSettings:
     """
     if table is None:
         return AimSettings()
-    given = {
+    limits = {
         "limit_kw_m2": table.limit_kw_m2 is not None,
         "limit_map": bool(table.limit_map),
         "limit_table": bool(table.limit_table),
     }
-    if sum(given.values()) > 1:
-        both = " and ".join(key for key, there in given.items() if there)
+    if sum(limits.values()) > 1:
+        both = " and ".join(key for key, present in limits.items() if present)
         raise InputError(f"aims: {both}; give one of them")
     if bool(table.limit_table) != bool(table.limit_panels):
         raise InputError("aims: limit_table and limit_panels belong together; give both or none")

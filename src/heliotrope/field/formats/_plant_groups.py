@@ -75,8 +75,8 @@ def build_group(
     names = tuple(table.name[i] for i in rows)
     size = (np.broadcast_to(width, rows.shape), np.broadcast_to(height, rows.shape))
     facets = read_facets(reader, size, site)
-    one = FacetGrid(1, 1, 0.0, Canting("none"))
-    center, half = one.places(*size)
+    grid = FacetGrid(1, 1, 0.0, Canting("none"))
+    center, half = grid.places(*size)
     parts = Facets.of(center, half, np.zeros_like(center)) if facets is None else facets
     heliostats = Heliostats(
         names=names,

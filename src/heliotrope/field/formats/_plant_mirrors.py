@@ -79,14 +79,14 @@ def read_facets(reader: _Numbers, size: tuple[FloatArray, FloatArray], site: Sit
 
 def _check_keys(reader: _Numbers, table: MirrorTable) -> None:
     """Refuse keys that exclude each other, and columns of the table that are not valid keys."""
-    ways = {
+    kinds = {
         "mirror.facets": table.facets,
         "mirror.facet": table.facet,
         "facets": reader.group.facets,
     }
-    given = [name for name, value in ways.items() if value]
-    if len(given) > 1:
-        raise reader.fail(f"facets are given as {' and '.join(given)}; keep one", "mirror")
+    specified = [name for name, value in kinds.items() if value]
+    if len(specified) > 1:
+        raise reader.fail(f"facets are given as {' and '.join(specified)}; keep one", "mirror")
     used = (table.canting, table.canting_focal_m, table.canting_time, table.canting_sun)
     canting = any(value is not None for value in used) or table.gap_m
     if not table.facets and (canting or reader.columns("mirror.canting_focal_m")):
@@ -180,11 +180,11 @@ def _full(reader: _Numbers, value: FloatArray | None) -> FloatArray | None:
 
 
 def _of_facets(
-    reader: _Numbers, table: MirrorTable, key: str, each: list[float] | None, *, whole: bool
+    reader: _Numbers, table: MirrorTable, key: str, values: list[float] | None, *, whole: bool
 ) -> FloatArray | None:
     """Return a value per mirror, (N,), or per facet if facets differ, (N, F)."""
-    if each is not None:
-        return reader.array(f"mirror.facet_{key}", each)
+    if values is not None:
+        return reader.array(f"mirror.facet_{key}", values)
     mirror = _full(reader, reader.number(f"mirror.{key}", getattr(table, key)))
     own = [
         reader.number(f"mirror.facet.{k}.{key}", getattr(facet, key))
@@ -221,7 +221,7 @@ def _maps(
         # Deflectometry measures the total slope, from which the known curvature is subtracted.
         curve = np.inf if focal is None else focal[i]
         maps.append(measured_slopes(folder, name, facets.take(np.array([i])), curve))
-    if all(each is None for each in maps):
+    if all(slopes is None for slopes in maps):
         raise reader.fail(
             f"{folder}: it has no slope map of any heliostat of the group; name the files after "
             f"heliostats, {names[0]}.npz",
@@ -266,10 +266,10 @@ def mirror_document(
                 mirror[full] = first(f"mirror.{full}", value)
         if surface.reflectivity is not None:
             mirror["reflectivity"] = first("mirror.reflectivity", surface.reflectivity)
-        if any(each is not None for each in surface.maps):
+        if any(slopes is not None for slopes in surface.maps):
             mirror["slope_maps"] = folder = f"{place.stem}.{name}.slopes"
             (place.parent / folder).mkdir(exist_ok=True)
-            for heliostat, each in zip(heliostats.names, surface.maps, strict=True):
-                if each is not None:
-                    write_slopes(place.parent / folder / f"{heliostat}.npz", each)
+            for heliostat, slopes in zip(heliostats.names, surface.maps, strict=True):
+                if slopes is not None:
+                    write_slopes(place.parent / folder / f"{heliostat}.npz", slopes)
     return {**document, **({"mirror": mirror} if mirror else {})}

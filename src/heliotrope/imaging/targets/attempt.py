@@ -452,7 +452,7 @@ class Search:
         return ""
 
     def _dark(self, view: FaceView, used: list[int], observed: _Observed) -> str:
-        """Return why the area between marks does not look like bright paint; empty if it does."""
+        """Return why the area between marks is too dark to be paint; empty if it is not."""
         flat = ("corner", "tee", "square", "disc")
         shown = [k for k in used if k in observed.looks and self.marks[k].kind in flat]
         if not shown:
@@ -536,7 +536,7 @@ class Search:
 
 
 def _problem(refined: Refined | None, mark: Mark, read: bool) -> str:
-    """Return why a match is not the mark; empty if it is the mark.
+    """Return the reason why a match is not the mark; empty if it is the mark.
 
     A tag whose code was ``read`` may fit less well, because its cells may be small.
     """

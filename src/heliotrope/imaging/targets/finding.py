@@ -271,7 +271,7 @@ class _Face:
         return replace(settled, view=None, text=text) if text else settled
 
     def _elsewhere(self, attempt: Attempt, view: FaceView) -> str:
-        """Return why the view may show a different target; empty if it cannot."""
+        """Return the reason why the view may show a different target; empty if it cannot."""
         search = self.search
         marks, plane, targets = search.marks, search.plane, search.face.targets
         near = 0.05 * search.extent

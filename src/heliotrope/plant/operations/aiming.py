@@ -275,36 +275,36 @@ class Aiming:
             else:
                 await self._go(answer.moves)
 
-    def _measure(self, answer: Answer, given: Round) -> bool:
+    def _measure(self, answer: Answer, present: Round) -> bool:
         """Record the flux on the receiver, and how far the measured flux is above the limit.
 
         Return whether the flux has only now been measured above the limit, so that the moves of
         this round no longer suffice.
         """
         assert self._settings.limit is not None
-        self._beyond = [(at, found) for at, found in self._beyond if given.at - at <= WARY]
-        dni = self._measured_dni(given.at)
+        self._beyond = [(at, beyond) for at, beyond in self._beyond if present.at - at <= WARY]
+        dni = self._measured_dni(present.at)
         if not math.isfinite(dni):
             return False
-        flux = as_float(answer.flux * (max(dni, 0.0) / given.scene.dni))
-        self._had = [(at, had) for at, had in self._had if given.at - at <= WARM]
-        self._had.append((given.at, flux))
-        found = self._check.beyond(self._settings.limit, flux)
-        if found is None:
+        flux = as_float(answer.flux * (max(dni, 0.0) / present.scene.dni))
+        self._had = [(at, had) for at, had in self._had if present.at - at <= WARM]
+        self._had.append((present.at, flux))
+        beyond = self._check.beyond(self._settings.limit, flux)
+        if beyond is None:
             return False
-        self._beyond.append((given.at, found))
+        self._beyond.append((present.at, beyond))
         return len(self._beyond) == 1
 
-    def _take(self, answer: Answer, given: Round) -> None:
+    def _take(self, answer: Answer, present: Round) -> None:
         """Accept a result, and raise or clear the alarms about the limit and late aims."""
         self._answer, self._source = answer, "optimiser"
         if self._problem:
             self._problem = ""
             self._log.take_alarm(alarms.AIMS.ended())
         name, kind = self._plant.design.receivers[0].name, alarms.FLUX_ABOVE_LIMIT
-        seen = [found for at, found in self._beyond if at >= given.at]
-        excess, source = (seen[0].excess, "measured") if seen else (answer.excess, "predicted")
-        above = bool(seen) or excess > 0.01
+        fresh = [beyond for at, beyond in self._beyond if at >= present.at]
+        excess, source = (fresh[0].excess, "measured") if fresh else (answer.excess, "predicted")
+        above = bool(fresh) or excess > 0.01
         if above:
             self._log.take_alarm(kind.raised(name, source=source, excess=100.0 * excess))
         elif self._above:
@@ -412,7 +412,7 @@ class Aiming:
         """Return the limit, lowered where a measured flux was above it."""
         if not self._beyond:
             return limit
-        factor = np.max([found.factor for _, found in self._beyond], axis=0)
+        factor = np.max([beyond.factor for _, beyond in self._beyond], axis=0)
         return FluxLimit(limit.on(*surface_in(scene).shape) / factor)
 
     def _scene(self, now: float) -> Scene:

@@ -171,24 +171,24 @@ class FluxCheck:
             return None
         surface = surface_of(receiver)
         if measured.ndim:
-            seen = np.empty(predicted.shape)
+            mapped = np.empty(predicted.shape)
             order = np.arange(predicted.shape[1])
             if isinstance(surface, Cylinder):
                 middles = 0.5 * (surface.edges[1:] + surface.edges[:-1])
                 order = columns_from_outside(receiver, as_float(middles * surface.radius))[1]
-            seen[:, order] = measured
+            mapped[:, order] = measured
         else:
-            seen = measured / max(float(predicted.mean()), 1e-9) * predicted
+            mapped = measured / max(float(predicted.mean()), 1e-9) * predicted
         allowed = limit.on(*predicted.shape) / (1.0 - limit.margin)
-        ratio = seen / np.maximum(predicted, 1e-9)
-        hot = (seen > allowed) & (ratio > 1.0) & (ratio <= TRUST)
+        ratio = mapped / np.maximum(predicted, 1e-9)
+        hot = (mapped > allowed) & (ratio > 1.0) & (ratio <= TRUST)
         if not hot.any():
             return None
         # A mean does not say which cells are too hot.
         factor = (
             np.where(hot, ratio, 1.0) if measured.ndim else np.full(hot.shape, ratio[hot].max())
         )
-        return Beyond(as_float(factor), float((seen / allowed)[hot].max()) - 1.0)
+        return Beyond(as_float(factor), float((mapped / allowed)[hot].max()) - 1.0)
 
     async def look(self) -> None:
         """Compare, and raise or end the alarm.

@@ -142,10 +142,10 @@ class Raising:
 
     def given_up(self) -> Mask:
         """Return a mask of the heliostats not raised for now, after too many failures, (N,)."""
-        found = np.zeros(len(self._plant.field), dtype=np.bool_)
+        resting = np.zeros(len(self._plant.field), dtype=np.bool_)
         waiting = self.attempts.waiting(self._plant.now())
-        found[[self._plant.field.place(name) for name in waiting]] = True
-        return found
+        resting[[self._plant.field.place(name) for name in waiting]] = True
+        return resting
 
     def why_not(self, heliostat: str) -> str | None:
         """Return the reason why a heliostat is not raised, None if it is or waits for its turn."""
@@ -233,10 +233,10 @@ class Raising:
 
     def _on_targets(self, points: FloatArray) -> Mask:
         """Return a mask of the points (N, 3) on a target, where an operator has ended the visit."""
-        found = np.zeros(len(points), dtype=np.bool_)
+        on_target = np.zeros(len(points), dtype=np.bool_)
         for middle, reach in self._targets:
-            found |= np.linalg.norm(points - middle, axis=-1) <= reach
-        return found
+            on_target |= np.linalg.norm(points - middle, axis=-1) <= reach
+        return on_target
 
     def stuck(self, visiting: Collection[str], resting: Mask) -> Rows:
         """Return the rows of wanted heliostats that can proceed only by way of stow.
@@ -254,17 +254,17 @@ class Raising:
         halted &= ~self.able() | shut_in & field.among((states.DEFOCUSED,), now)
         halted[[field.place(name) for name in visiting]] = False
         self._halted_at = np.where(halted, np.minimum(self._halted_at, now), math.inf)
-        found = now - self._halted_at >= _HALTED
-        self._halted_at[found] = math.inf
-        self._failed(np.flatnonzero(found), "could not continue from its position")
-        return np.flatnonzero(found)
+        overdue = now - self._halted_at >= _HALTED
+        self._halted_at[overdue] = math.inf
+        self._failed(np.flatnonzero(overdue), "could not continue from its position")
+        return np.flatnonzero(overdue)
 
     def able(self) -> Mask:
         """Return a mask of the heliostats that report that they can track from standby, (N,)."""
         field = self._plant.field
-        found: Mask = field.rows["flags"] & meanings.READY != 0
-        found[[field.place(name) for name in self._plant.wanted.missing]] = False
-        return found
+        able: Mask = field.rows["flags"] & meanings.READY != 0
+        able[[field.place(name) for name in self._plant.wanted.missing]] = False
+        return able
 
     async def step(self, token: int, visiting: Callable[[], frozenset[str]], resting: Mask) -> None:
         """Issue the commands that may be issued now.
