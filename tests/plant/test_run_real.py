@@ -604,7 +604,7 @@ def test_what_cannot_be_run_is_one_line(
     assert text in err
     assert err.count("\n") == 1
     # What begins before the refusal says so: the plant, and the field that simulates it.
-    begun = r"([^\n]*: \d+ heliostats\n(the simulated field begins[^\n]*\n)?)?"
+    begun = r"([^\n]*: \d+ heliostats\n(starting the simulated field[^\n]*\n)?)?"
     assert re.fullmatch(begun, out), out
 
 
