@@ -223,7 +223,7 @@ SIGHTINGS = [
     Wrong(lambda: row(destination_covariance=np.eye(2)), "destination_covariance", "(2, 2)", "(3, 3)"),
     Wrong(lambda: row(source_at_infinity=[True, False]), "source_at_infinity", "(2,)", "(3,)"),
     Wrong(lambda: sun_sensor(0, np.zeros((1, 2)), UP, normal_sigma=0.25), "sigma", "0.5 rad", "0.2 rad"),
-    Wrong(lambda: join([]), "join", "the list is empty", "at least 1"),
+    Wrong(lambda: join([]), "join", "the list is empty", "at least one"),
     Wrong(lambda: join([seen(), 5]), "part 1", "int", "list of Sightings"),  # type: ignore[list-item]
     Wrong(lambda: join([seen(), row(counts=np.zeros((3, 1)))]), "join", "[1, 2] drives", "one kind"),
     Wrong(lambda: ht.split(seen(), "random", 1.5), "fraction", "1.5", "between 0 and 1"),
@@ -237,7 +237,7 @@ CALIBRATION = [
     Wrong(lambda: ht.fit(mechs(), seen(), 8), "model", "an int", "name of a model"),  # type: ignore[arg-type]
     Wrong(lambda: ht.fit("P6A", seen(), "guo6"), "mechanism", "a str", "plant[name]"),  # type: ignore[arg-type]
     Wrong(lambda: ht.fit(mechs(), np.zeros((3, 2)), "guo6"), "sightings", "numpy ndarray", "heliotrope.sightings"),  # type: ignore[arg-type]
-    Wrong(lambda: ht.fit(mechs()[:1], row(heliostat=4), "guo6"), "sightings", "row 4", "1 heliostats"),
+    Wrong(lambda: ht.fit(mechs()[:1], row(heliostat=4), "guo6"), "sightings", "index 4", "1 heliostats"),
     Wrong(lambda: ht.fit(mechs(), row(counts=np.zeros((3, 1))), "guo6"), "counts", "1 drives", "have 2"),
     Wrong(lambda: ht.fit(mechs(), seen(), "guo6", priors={"canting": 0.0}), "prior of canting", "0.0", "above 0"),
     Wrong(lambda: ht.fit(mechs(), seen(), "guo6", priors={"cant": 0.1}), "parameter", "'cant'", "canting", UnknownNameError),
@@ -248,8 +248,8 @@ CALIBRATION = [
     Wrong(lambda: ht.learn(mechs(), seen(), "guo6", used=np.ones(3, bool)), "used", "(3,)", "(12,)"),
     Wrong(lambda: learned().parameters_at([1], 0.0), "heliostat", "row 1", "0 to 0"),
     Wrong(lambda: learned().parameters_at([0], "noon"), "times", "'noon'", "ISO 8601", TimeError),
-    Wrong(lambda: predict(learned(), row(heliostat=7)), "heliostat", "row 7", "1 heliostats"),
-    Wrong(lambda: ht.beam_errors(mechs()[:2], row(heliostat=7)), "sightings", "row 7", "2 heliostats"),
+    Wrong(lambda: predict(learned(), row(heliostat=7)), "heliostat", "index 7", "1 heliostats"),
+    Wrong(lambda: ht.beam_errors(mechs()[:2], row(heliostat=7)), "sightings", "index 7", "2 heliostats"),
     Wrong(lambda: ht.evaluate(field().names, mechs(), seen(), "guo6", fraction=0.0), "fraction", "0.0", "between 0 and 1"),
 ]  # fmt: skip
 
@@ -273,7 +273,7 @@ FIELD = [
     Wrong(lambda: Sphere("tower", ORIGIN, 0.0), "radius", "0.0 m", "above 0"),
     Wrong(lambda: Box("hall", ORIGIN, (1.0, 1.0)), "size", "(2,)", "3 numbers"),
     Wrong(lambda: Cylinder("mast", ORIGIN, ORIGIN, 1.0), "mast", "coincide", "two different points"),
-    Wrong(lambda: flux(aim=[AIM, AIM]), "aim", "(2, 3)", "expected (3,) or"),
+    Wrong(lambda: flux(aim=[AIM, AIM]), "aim", "(2, 3)", "give (3,) or"),
     Wrong(lambda: flux(reflectivity=1.2), "reflectivity", "1.2", "from 0 to 1"),
     Wrong(lambda: flux(sun=(1.0, 0.0)), "sun", "(2,)", "3 numbers"),
     Wrong(lambda: flux(cells=(0, 24)), "cells", "0", "at least 1"),

@@ -44,7 +44,7 @@ def test_the_page_is_live_through_a_joint_visit_and_an_emergency(
     page = next(signing_in)("engineer")
     page.evaluate(WATCH)
     page.click(".hx-tabs >> text=Calibration")
-    page.wait_for_selector(".hx-calibration li:has-text('photograph')")
+    page.wait_for_selector(".hx-calibration li:has-text('photograph')", timeout=300_000)
     # The beams of one of the targets are taken apart.
     until(page, ENOUGH)
     page.click("#emergency")

@@ -17,7 +17,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: ht.open(5), "path is an int, 5; pass the path of a file or folder"),
+        (lambda: ht.open(5), "path is an int, 5; give the path of a file or folder"),
         (lambda: ht.open(None), "path is a NoneType, None"),
         (lambda: ht.open(""), "path is empty"),
         (lambda: ht.calibrate("base.csv"), "field is a str, 'base.csv'; give what read_field"),

@@ -179,7 +179,7 @@ def test_some_come_first_and_some_never_unless_a_person_asks() -> None:
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        ({"rule": "often"}, "rule 'often'; give first or never"),
+        ({"rule": "often"}, "rule 'often'; use first or never"),
         ({"rule": "never", "at": ("12:00Z",)}, "remove times and target"),
         ({"rule": "first", "target": "left"}, "remove times and target"),
     ],

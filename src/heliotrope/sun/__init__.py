@@ -12,7 +12,6 @@ from heliotrope.sun.broadcast import (
     fast_vector,
     vector_and_rate,
 )
-from heliotrope.sun.clear_sky import clear_sky
 from heliotrope.sun.ephemeris import (
     UPPER_LIMB,
     Site,
@@ -27,6 +26,7 @@ from heliotrope.sun.ephemeris import (
     unix_seconds,
     vector,
 )
+from heliotrope.sun.sky import clear_sky
 
 __all__ = [
     "LOWEST_BROADCAST",
