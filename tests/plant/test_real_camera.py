@@ -254,7 +254,7 @@ def test_a_snapshot_that_none_is(camera_server: str) -> None:
         next(iter(source))
     assert "secret" not in str(refused.value)
     source = SnapshotSource("http://user:secret@127.0.0.1:1/now.jpg", timeout=2.0)
-    with pytest.raises(FetchError, match=r"no answer \(ConnectError\)") as refused:
+    with pytest.raises(FetchError, match=r"no reply \(ConnectError\)") as refused:
         next(iter(source))
     assert "secret" not in str(refused.value)
     with pytest.raises(InputError, match="not the address of an image"):
