@@ -176,6 +176,35 @@ def test_a_frame_from_before_is_no_photograph(plant: Plant, frame: Frame) -> Non
         cameras.close()
 
 
+class OnRequest(Source):
+    """A camera that takes frames only on request, and whose clock is 0.2 s behind."""
+
+    frame: Frame
+
+    def _frames(self) -> Iterator[Frame]:
+        while not self.stop.is_set():
+            self.wanted.clear()
+            yield replace(self.frame, time=datetime.now(UTC) - timedelta(seconds=0.2))
+            self.wanted.wait(60.0)
+
+
+def test_a_camera_whose_clock_is_behind_is_asked_again(plant: Plant, frame: Frame) -> None:
+    """Its first frame seems to have been exposed before it was asked for."""
+
+    def source(camera: Any, folder: Path, stop: threading.Event) -> Source:
+        made = OnRequest(stop=stop)
+        made.frame = replace(frame, time_deviation=0.01)
+        return made
+
+    cameras = RealCameras(plant, Path(), SystemClock(), patience=20.0, sources=source)
+    cameras.start(unheard)
+    try:
+        for _ in range(2):
+            assert looked(cameras, plant.targets[0].name).reasons == ()
+    finally:
+        cameras.close()
+
+
 def test_a_time_that_is_too_unsure_is_a_reason(plant: Plant, frame: Frame) -> None:
     script = Scripted(frame, late=-3.0)
     script.deviation = 2.0

@@ -339,6 +339,7 @@ class RealCameras:
     async def _frame(self, eye: _Eye, target: str) -> Frame:
         """Wait for a frame exposed from now on."""
         asked, until = self._clock.utc(), self._clock.monotonic() + self._patience
+        last = eye.feed.newest
         eye.feed.ask()
         while self._clock.monotonic() < until:
             frame = eye.feed.newest
@@ -346,6 +347,10 @@ class RealCameras:
                 if target in self.silent:
                     self._tell(target)
                 return frame
+            if frame is not last:
+                # It was on its way already, or the camera's clock is a little behind.
+                last = frame
+                eye.feed.ask()
             await asyncio.sleep(_LOOK)
         why = eye.feed.problem or "check the camera, its network and its clock"
         text = f"camera {eye.camera.name}: no frame for {self._patience:g} s; {why}"
