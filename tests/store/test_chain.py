@@ -100,7 +100,7 @@ def test_a_chain_that_was_made_anew_has_another_head(tmp_path: Path) -> None:
     for name in ("event", "event_link"):
         keeper.do(lambda c, name=name: c.execute(text(f"DELETE FROM {name} WHERE number = 5")))
     verified(keeper)
-    with pytest.raises(StoreError, match="link 5 is not there; records were removed"):
+    with pytest.raises(StoreError, match="link 5 is not there; records have since been removed"):
         verified(keeper, *noted)
     keeper.close()
     again = Keeper(tmp_path, inline=True)
@@ -165,7 +165,7 @@ def test_a_head_of_the_last_event_that_left_is_held_against_the_anchor(
     if not noted:
         keeper.do(lambda c: c.execute(text("DELETE FROM about WHERE name = 'event_anchor_number'")))
     verified(keeper, head)
-    with pytest.raises(StoreError, match="link 3 has another digest; records were removed"):
+    with pytest.raises(StoreError, match="link 3 has another digest; records have since been removed"):
         verified(keeper, replace(head, digest="1" * 64))
 
 
