@@ -61,7 +61,8 @@ class FluxTable:
         InputError
             If a temperature or velocity is outside the table.
         """
-        places = []
+        from scipy.interpolate import RegularGridInterpolator  # slow to import
+
         for axis, value, name, unit in (
             (self.temperature, temperature, "temperature", "°C"),
             (self.velocity, velocity, "velocity", "m/s"),
@@ -72,16 +73,8 @@ class FluxTable:
                     f"flux table: a {name} of {np.asarray(value)[outside].flat[0]:g} {unit} is "
                     f"outside its {axis[0]:g} to {axis[-1]:g} {unit}; extend the table"
                 )
-            places.append(np.interp(value, axis, np.arange(len(axis))))
-        low = [
-            np.minimum(at.astype(np.int64), max(n - 2, 0))
-            for at, n in zip(places, self.flux.shape, strict=True)
-        ]
-        high = [np.minimum(k + 1, n - 1) for k, n in zip(low, self.flux.shape, strict=True)]
-        share = [at - k for at, k in zip(places, low, strict=True)]
-        near = (1 - share[1]) * self.flux[low[0], low[1]] + share[1] * self.flux[low[0], high[1]]
-        far = (1 - share[1]) * self.flux[high[0], low[1]] + share[1] * self.flux[high[0], high[1]]
-        return as_float((1 - share[0]) * near + share[0] * far)
+        between = RegularGridInterpolator((self.temperature, self.velocity), self.flux)
+        return as_float(between(np.stack([temperature, velocity], axis=-1)))
 
 
 @dataclass(frozen=True)
