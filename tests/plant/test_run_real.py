@@ -462,7 +462,7 @@ def test_each_cluster_gets_its_way(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "old", "new", "text"),
     [
-        ("links.toml", 'format = "heliotrope-links"', "", "format is None; a links file says"),
+        ("links.toml", 'format = "heliotrope-links"', "", "format is missing; a links file begins"),
         ("links.toml", 'K3 = "K3.toml"\n', "", "a cluster K3 of 2 heliostats, but no line"),
         ("links.toml", "[clusters]", '[clusters]\nK9 = "mqtt"', "the plant has no cluster K9"),
         (

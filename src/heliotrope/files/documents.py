@@ -59,8 +59,8 @@ def read_document(
     if raw.get("format") != f"heliotrope-{kind}":
         raise FormatError(
             path,
-            f"format is {raw.get('format')!r}; a {kind} file says "
-            f'format = "heliotrope-{kind}" and version = 1',
+            (f"format is {raw['format']!r}" if "format" in raw else "format is missing")
+            + f'; a {kind} file begins with format = "heliotrope-{kind}" and version = 1',
         )
     try:
         return model.model_validate(raw)

@@ -134,5 +134,5 @@ def _refuse_unused(place: Path, **arguments: object) -> None:
 
 def _needed(place: Path, site: Site | None) -> Site:
     if site is None:
-        raise FormatError(place, f"this format holds no place on Earth, {_GIVE}")
+        raise FormatError(place, f"a table of positions contains no site, {_GIVE}")
     return site
