@@ -95,4 +95,7 @@ def browser() -> Iterator[Any]:
 @pytest.fixture
 def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
     """Sign in to the plant of the module as somebody of a role."""
-    yield from entering(field.address, browser)
+    try:
+        yield from entering(field.address, browser)
+    finally:
+        field.release()

@@ -73,6 +73,14 @@ def test_versions_side_by_side_and_one_brought_back(
     page.click(".hx-tabs >> text=Heliostat")
     page.click("text=Versions…")
     page.wait_for_selector("dialog th:has-text('version 0')")
+    page.focus("dialog [name=tilt_east]")
+    page.evaluate(
+        "document.activeElement.dataset.old = 1;"
+        "document.querySelector('dialog select').dispatchEvent(new Event('change'))"
+    )
+    page.wait_for_selector("dialog [data-old]", state="detached")
+    page.keyboard.insert_text("2.5")  # the table was drawn anew under the typing hand
+    assert page.input_value("dialog [name=tilt_east]") == "2.5"
     for value in ("0.5", "1.5"):
         page.fill("dialog [name=tilt_east]", value)
         page.click("dialog >> text=Store new values")

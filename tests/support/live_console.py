@@ -231,6 +231,16 @@ class LiveConsole:
         """How many heliostats are in each state, as the plant knows them."""
         return self.call(lambda: dict(self.live.operations.summary().states))
 
+    def release(self) -> None:
+        """Release the command authority, whoever holds it: a failed test keeps nothing."""
+
+        def give_back() -> None:
+            plant = self.live.plant
+            if (grant := plant.authority.grant) is not None:
+                plant.release_authority(grant.holder, grant.token)
+
+        self.call(give_back)
+
     def calm(self) -> None:
         """Withdraw an emergency, and acknowledge what it left as soon as its causes have gone."""
         who = Person("engineer", Role.ENGINEER)

@@ -41,13 +41,14 @@ export async function compareVersions(name) {
     try {
       if (known.approval) waits.replaceChildren(...(await api("GET", "parameters/waiting")).filter((one) => one.heliostat === name).map((one) => waitingView(one, false)));
       const found = await api("GET", `${path}/versions?first=${first.value}&second=${second.value}`);
-      const same = (r) => Math.abs(r.second - r.first) < 1e-12;
+      const same = (r) => Math.abs(r.second - r.first) < 1e-12, typing = body.contains(document.activeElement) ? document.activeElement.name : "";
       body.replaceChildren(h("p", {}, found.beam_rms === null ? t("It does not track its aim today.") : t("The beam moves by {rms} mm RMS at its aim over today's suns, at most {most} mm.", { rms: number(1e3 * found.beam_rms, 1), most: number(1e3 * found.beam_most, 1) })),
         table([[t("Parameter"), (r) => r.name], [t("version {n}", { n: first.value }), (r) => shown(r.first, r.unit), "num"], ["σ", (r) => shown(r.first_sigma, r.unit), "num"],
           [t("version {n}", { n: second.value }), (r) => shown(r.second, r.unit), "num"], ["σ", (r) => shown(r.second_sigma, r.unit), "num"],
           [t("Change"), (r) => h("span", { className: same(r) ? "" : "warn" }, shown(r.second - r.first, r.unit)), "num"], ["", (r) => UNITS[r.unit][0]],
           ...(engineer ? [[t("New value"), (r) => h("input", { type: "number", step: "any", className: "hx-new", name: r.name, ariaLabel: t("New value of {name}", { name: r.name }), value: typed.get(r.name)?.text ?? "", oninput: ({ target }) => { if (target.value) typed.set(r.name, { text: target.value, value: Number(target.value) / UNITS[r.unit][1] }); else typed.delete(r.name); } })]] : [])], found.parameters));
       back.textContent = known.approval ? t("Ask for version {n}", { n: first.value }) : t("Bring back version {n}", { n: first.value }); back.disabled = Number(first.value) === known.version || first.value === "0";
+      if (typing) body.querySelector(`[name="${CSS.escape(typing)}"]`)?.focus(); // who types meanwhile types on
     } catch (error) { tell(error.message, true); }
   };
   // The order is followed here to its end; what was typed stays after a refusal.
