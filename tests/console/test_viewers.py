@@ -50,7 +50,7 @@ def test_viewers_leave_places_to_operators() -> None:
     with contextlib.ExitStack() as stack:
         assert taken(stack, stream, viewer) == round(100 * (1.0 - RESERVED))
         assert taken(stack, stream, lambda _: OLGA) == OWN
-        with pytest.raises(BusyError, match="100 streams are open"):
+        with pytest.raises(BusyError, match="100 streams are already open"):
             stack.enter_context(stream.place(Person("Otto", Role.OPERATOR)))
 
 
