@@ -271,7 +271,7 @@ def test_a_decimal_comma_between_commas_is_never_read(table: str, tmp_path: Path
     ("other", "says"),
     [
         ("Süd1", "Süd1 is already the name of line 2; each name must be unique"),
-        ("SÜD 1", "SÜD 1 is the name of line 2 too but for case or blanks (Süd1)"),
+        ("SÜD 1", "SÜD 1 is already the name of line 2 apart from case or blanks (Süd1)"),
         ("Su\u0308d1", "Süd1 is already the name of line 2; each name must be unique"),
     ],
 )

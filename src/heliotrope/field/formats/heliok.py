@@ -288,10 +288,8 @@ def _surface(values: Values, kit: XmlElement, origin: FloatArray, axes: FloatArr
     if width <= 0.0 or height <= 0.0:
         raise values.error(
             aperture,
-            (
-                f"<ApertureRectangular>: width and height must both be above 0, not {width:g} m × "
-                f"{height:g} m"
-            ),
+            f"<ApertureRectangular>: width and height must both be above 0, not {width:g} m × "
+            f"{height:g} m",
         )
     return Surface(origin + axes @ middle, axes, width, height)
 
@@ -448,10 +446,7 @@ def to_plant(document: Document, site: Site) -> Plant:
         if not model.facets:
             raise FormatError(
                 path,
-                (
-                    f"HeliostatKit {model.name}: no <Facet>, so the mirror has no size; add a "
-                    "<Facet>"
-                ),
+                f"HeliostatKit {model.name}: no <Facet>, so the mirror has no size; add a <Facet>",
             )
         upright = int(np.argmax(np.abs(model.primary.direction)))
         key = (upright, len(model.facets), len(model.axes))

@@ -121,10 +121,8 @@ def _read_csv(file: Path) -> FloatArray:
     if int(np.prod(shape)) > 10 * len(whole):
         raise FormatError(
             file,
-            (
-                f"{len(whole)} rows for {' × '.join(map(str, shape))} cells; the table must "
-                "contain the whole map"
-            ),
+            f"{len(whole)} rows for {' × '.join(map(str, shape))} cells; the table must "
+            "contain the whole map",
         )
     slope = np.full((*shape, 2), np.nan)
     slope[whole[:, 0], whole[:, 1], whole[:, 2]] = 1e-3 * values
