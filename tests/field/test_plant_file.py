@@ -446,7 +446,7 @@ def test_group_without_a_machine_reads_and_is_refused_where_one_is_needed(tmp_pa
     assert plant.groups["azel"].machines == ()
     with pytest.raises(InputError, match=r"group azel: .* no table \[groups.azel.machine\]; add"):
         plant.machine("A1")
-    with pytest.raises(FormatError, match=r"columns machine\.…, but this table is missing; add it"):
+    with pytest.raises(FormatError, match=r"columns machine\.… need this table; add it"):
         plant_file.read_plant(with_machine(tmp_path, "", "machine.stow_steps.0", "1 2"))
 
 

@@ -267,7 +267,7 @@ def test_a_slope_map_that_does_not_fit_is_one_line(tmp_path: Path) -> None:
 
 
 def test_columns_of_mirrors_need_the_table(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"columns mirror\.…, but this table is missing; add it"):
+    with pytest.raises(FormatError, match=r"columns mirror\.… need this table; add it"):
         read(tmp_path, "", (",mirror.focal_m", ",70", ",80"))
 
 

@@ -180,9 +180,7 @@ class _Reader:
             missing += [f"drives.{joint}" for joint in names if joint not in group.drives]
         for joint in group.drives:
             if joint not in names:
-                raise self.fail(
-                    f"{joint!r} is not a driven joint; the driven joints are {names}", "drives"
-                )
+                raise self.fail(f"{joint!r} is not a driven joint; use one of {names}", "drives")
         self.check_missing(missing, f"kind {group.kind} needs")
         if group.drives:
             arguments["drives"] = tuple(self.drive(joint) for joint in names)
@@ -300,10 +298,7 @@ class _Reader:
         table = self.group.machine
         if table is None:
             if any(column.startswith("machine.") for column in self.table.numbers):
-                raise self.fail(
-                    "the heliostat table has columns machine.…, but this table is missing; add it",
-                    "machine",
-                )
+                raise self.fail("the columns machine.… need this table; add it", "machine")
             return ()
         joints = [mechanism.joints[d] for d in mechanism.driven]
         if sorted(table.axes) != sorted(joints):
@@ -314,9 +309,7 @@ class _Reader:
             )
         first = table.leaves_stow_first or joints[0]
         if first not in joints:
-            raise self.fail(
-                f"{first!r} is not a driven joint; the driven joints are {joints}", "machine"
-            )
+            raise self.fail(f"{first!r} is not a driven joint; use one of {joints}", "machine")
         if len(joints) != 2:
             raise self.fail(
                 "local controllers drive two joints, but this kind has one; remove the table",

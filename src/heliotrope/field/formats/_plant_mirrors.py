@@ -68,9 +68,7 @@ def read_facets(reader: _Numbers, size: tuple[FloatArray, FloatArray], site: Sit
             center, full, tilt = (np.stack(places[k::3], axis=1) for k in range(3))
             return Facets.of(center, 0.5 * full, 1e-3 * tilt)
     elif reader.columns("mirror."):
-        raise reader.fail(
-            "the heliostat table has columns mirror.…, but this table is missing; add it", "mirror"
-        )
+        raise reader.fail("the columns mirror.… need this table; add it", "mirror")
     if not whole:
         return None
     array = reader.array("facets", whole)
