@@ -188,7 +188,7 @@ def test_refusals(plant: Plant) -> None:
         made(spread=float(np.radians(60.0)))
     with pytest.raises(InputError, match="view must be above 0°"):
         made(view=0.0)
-    with pytest.raises(InputError, match="0 hours a day"):
+    with pytest.raises(InputError, match="the hours a day must be above 0"):
         made(hours_a_day=0.0)
     with pytest.raises(InputError, match="no heliostats"):
         plan_flight(plant.with_groups({}), PlanSettings())
