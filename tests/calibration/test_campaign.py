@@ -209,7 +209,7 @@ def test_campaign_refusals() -> None:
         plan_campaign([fleet], *run, START, START + 5.0)
     with pytest.raises(InputError, match="never reaches 10°"):
         plan_campaign([fleet], *run, START + 0.9 * DAY, START + 0.95 * DAY)
-    with pytest.raises(InputError, match="settle -1"):
+    with pytest.raises(InputError, match="settle must be 0 or more"):
         Timing(settle=-1.0)
     with pytest.raises(InputError, match="too short"):
         Timing(0.0, 0.0, 0.0)

@@ -215,7 +215,7 @@ def test_tables_and_page_hold_every_visit(
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"shots": 0}, "0 photographs per heliostat"),
+        ({"shots": 0}, "photographs per heliostat must be 1 or more"),
         ({"clear": 0.0}, "clear must be above 0 and at most 1, not 0.0"),
         ({"worth": 1.0}, "worth must be 0 or more and below 1, not 1.0"),
         ({"sigma": 0.0}, "sigma must be above 0, not 0.0"),
@@ -233,7 +233,7 @@ def test_terms_that_make_no_sense_are_refused(change: dict[str, float], text: st
         ({"least": 1}, "1 to 49 mirrors"),
         ({"first": 3}, "3 in a first visit"),
         ({"sigma": 0.0}, "sigma must be above 0, not 0.0"),
-        ({"tries": 0}, "0 tries"),
+        ({"tries": 0}, "1 or more, not 25.0 s and 0"),
     ],
 )
 def test_joint_visits_that_make_no_sense_are_refused(change: dict[str, float], text: str) -> None:

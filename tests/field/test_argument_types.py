@@ -26,7 +26,10 @@ UP = np.array([0.0, 0.0, 1.0])
         (lambda: ht.read_field_sightings("plant.toml", "plant.toml"), "plant is a str"),
         (lambda: ht.read_field_sightings(PLANT, None), "place is a NoneType"),
         (lambda: ht.read_field_sightings(PLANT, "p", now="today"), "now is a str, 'today'"),
-        (lambda: ht.read_field_sightings(PLANT, "p", now=float("nan")), "now is nan"),
+        (
+            lambda: ht.read_field_sightings(PLANT, "p", now=float("nan")),
+            "now must be in Unix seconds, not nan",
+        ),
         (
             lambda: ht.read_field_sightings(PLANT, "p", centroid="x"),
             "centroid must be 'utis' or 'helios', not 'x'",

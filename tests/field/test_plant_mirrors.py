@@ -219,9 +219,13 @@ BAD_MIRRORS = [
     ("slope_error_mrad = -1", "", "slope_error_mrad"),
     ("slope_error_mrad = 1", "mirror.slope_error_mrad", "heliostat A2: slope error must"),
     ("focal_m = 0", "", "focal_m"),
-    ("focal_m = 1", "mirror.focal", "column mirror.focal is no number of the mirror"),
+    ("focal_m = 1", "mirror.focal", "column mirror.focal is not a mirror property"),
     ("reflectivity = 1.1", "", "reflectivity"),
-    ("slope_error_mrad = 1\nslope_error_rad = 1", "", "slope_error_mrad and slope_error_rad; keep"),
+    (
+        "slope_error_mrad = 1\nslope_error_rad = 1",
+        "",
+        "slope_error_mrad and slope_error_rad are both set; keep",
+    ),
     ('slope_maps = "none"', "", "none: no such folder"),
     ("facet_focal_m = [1, 2]", "", "focal length of shape (2, 2) for 2 mirrors of 1 facets"),
     (
@@ -232,7 +236,7 @@ BAD_MIRRORS = [
     (
         f"facets = [2, 2]\n{ONE}",
         "",
-        "facets are given as mirror.facets and mirror.facet; keep one",
+        "facets are specified as mirror.facets and mirror.facet; keep one",
     ),
     (
         f"{ONE}\nfocal_m = 50\n{ONE}",

@@ -304,7 +304,9 @@ def test_field_check_lists_all_wrong_cells_of_a_table(tmp_path: Path) -> None:
     assert len(found) == 3
     assert found[0].startswith("line 2, column east_m: heliostat A1: '0,5' is not a finite number")
     assert found[1] == "line 3, column name: the heliostat has no name; enter one"
-    assert found[2].startswith("line 4, column name: heliostat a1: a1 is the name of line 2 too")
+    assert found[2].startswith(
+        "line 4, column name: heliostat a1: a1 is already the name of line 2"
+    )
 
 
 # -- layouts ---------------------------------------------------------------------------
@@ -575,7 +577,9 @@ def test_a_full_disk_is_called_full(tmp_path: Path) -> None:
     def write(_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with pytest.raises(InputError, match=r"No space left on device\); free some space, or give a"):
+    with pytest.raises(
+        InputError, match=r"No space left on device\); free some space, or choose a"
+    ):
         write_file(tmp_path / "a.csv", write)
     assert not list(tmp_path.iterdir())
     with pytest.raises(InputError, match="choose a folder that exists"):
