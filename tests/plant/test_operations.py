@@ -70,7 +70,7 @@ def test_only_light_on_the_target_is_seen() -> None:
     # A simulated camera tells where the beam is although it is beside the target.
     assert seen(target, Shot(target.point(np.array([2.1, 0.0])), 0.0)) is None
     assert seen(target, Shot(np.full(3, np.nan), 0.0)) is None
-    with pytest.raises(InputError, match="centring: pitch 0"):
+    with pytest.raises(InputError, match="centring: pitch must be above 0"):
         Centring(pitch=0.0)
 
 

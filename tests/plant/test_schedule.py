@@ -522,9 +522,9 @@ def test_what_cannot_be_used_is_refused() -> None:
     [
         ({"shots": 0}, "0 shots"),
         ({"sigma": 0.0}, "sigma must be above 0, not 0.0"),
-        ({"most_age": float("inf")}, "most_age inf"),
+        ({"most_age": float("inf")}, "most_age must be above 0, not inf"),
         ({"worth": 1.0}, "worth must be 0 or more and below 1, not 1.0"),
-        ({"look": 0.0}, "look 0.0 s"),
+        ({"look": 0.0}, "look must be above 0, or None, not 0.0 s"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings: dict[str, float], text: str) -> None:
