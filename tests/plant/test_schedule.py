@@ -520,7 +520,7 @@ def test_what_cannot_be_used_is_refused() -> None:
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        ({"shots": 0}, "0 shots"),
+        ({"shots": 0}, "shots must be 1 or more"),
         ({"sigma": 0.0}, "sigma must be above 0, not 0.0"),
         ({"most_age": float("inf")}, "most_age must be above 0, not inf"),
         ({"worth": 1.0}, "worth must be 0 or more and below 1, not 1.0"),
