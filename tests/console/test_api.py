@@ -738,7 +738,7 @@ def test_first_start_makes_one_account(tmp_path_factory: pytest.TempPathFactory)
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"port": 70_000}, "port 70000"),
+        ({"port": 70_000}, "for a free port, not 70000"),
         ({"host": "0.0.0.0"}, "without TLS passwords"),
         ({"certificate": "a.pem"}, "both files"),
         ({"session_s": 0.0}, "session_s"),
