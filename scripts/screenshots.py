@@ -141,7 +141,7 @@ def main() -> None:
         try:
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
             page = browser.new_page(viewport=WIDE, bypass_csp=True)
-            page.set_default_timeout(60_000)
+            page.set_default_timeout(600_000)
             page.goto(f"{shown.address}login")
             page.fill("[name=name]", NAME)
             page.fill("[name=password]", shown.password)
