@@ -180,7 +180,7 @@ def test_the_page_says_what_a_proof_has_measured_and_what_it_believes(
     folded = ".hx-plant dt:has-text('Believed by reports alone') + dd details"
     assert page.inner_text(folded).endswith(f"and {believed - 3} more")
     # A frame names twenty of them; unfolded, the list has all, on the tab and in the banner.
-    for place in (folded, ".hx-alert details"):
+    for place in (folded, ".hx-alert details"):  # the banner has first those that are not done
         page.click(f"{place} summary")
         page.wait_for_selector(f"{place}:not(:has-text('…'))")
         first, rest = page.inner_text(place).replace("\n", " ").split(f" and {believed - 3} more")

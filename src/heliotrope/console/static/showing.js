@@ -22,8 +22,8 @@ export function headOf(box) {
   mark(); show();
 }
 
-// The heliostats of an emergency that are known by their reports alone: the head of a frame names the first of many.
-export const believed = ({ believed: names, believed_count: all }, key, shown) => several(names, key, shown, all, async () => (await api("GET", "emergency")).believed);
+// Heliostats of an emergency, by the name of their list in its view: the head of a frame names the first of many.
+export const listed = (order, list, key, shown) => several(order[list], key, shown, list === "believed" ? order.believed_count : order.heliostats - order.done, async () => (await api("GET", "emergency"))[list]);
 
 // The emergency, or why automatic control waits; the names are drawn anew only when they change, so that they stay unfolded under the hand.
 export function alertText(box) {
@@ -33,8 +33,9 @@ export function alertText(box) {
   store.on("frame", (now) => {
     box.classList.toggle("on", now.emergency || Boolean(now.resume));
     box.classList.toggle("waits", !now.emergency);
-    const order = now.emergency && now.order.believed.length ? now.order : null, like = JSON.stringify([order?.believed, order?.believed_count]);
-    if (like !== drawn) { drawn = like; names.replaceChildren(...(order ? [": ", believed(order, "", shown)] : [])); }
+    // Those that have not done it; then those of which only their own reports say so, which the text before has counted.
+    const { order } = now, list = order.not_done.length ? "not_done" : "believed", like = JSON.stringify([now.emergency, list, order[list], order.done, order.believed_count]);
+    if (like !== drawn) { drawn = like; names.replaceChildren(...(now.emergency && order[list].length ? [list === "believed" ? ": " : ` · ${t("not done")}: `, listed(order, list, "", shown)] : [])); }
     text.textContent = now.emergency ? [t("EMERGENCY {act} by {who}", { act: t(now.order.act), who: now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || t("the safety table") }),
       t("acknowledged {n} of {all}", { n: count(now.order.acknowledged), all: count(now.order.heliostats) }), t("done {n}", { n: count(now.order.done) }),
       now.order.calls.length ? "" : t("when the causes have gone, Resume ends it and gives the field back to automatic control"), now.order.basis].filter(Boolean).join(" · ") : now.resume;
