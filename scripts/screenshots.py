@@ -102,7 +102,7 @@ def take(page: Any, into: Path) -> None:
     shot("plant", LIT)
     tab("Calibration")
     page.select_option(".hx-tools select", "error")
-    shot("calibration", ".hx-calibration h3:has-text('Last measurements')")
+    shot("calibration", ".hx-calibration td span.good")
     tab("Targets")
     shot("targets", ".hx-photo img[src]")
     page.fill(".hx-query", "sightings > 0")
