@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from screenshots import ARGS, CHROMIUM, WIDE
+from screenshots import ARGS, CHROMIUM, LIT, WIDE
 
 COMMAND = [sys.executable, "-c", "from heliotrope.cli import main; main()", "run"]
 
@@ -67,14 +67,16 @@ def take(page: Any, plant: Plant, into: Path) -> None:
         plant.say(f"picture {name}")
 
     page.wait_for_selector(".hx-legend b")
+    page.wait_for_selector(LIT, timeout=300_000)
     shot("start", 10.0)
     page.click(".hx-tabs >> text=Targets")
     shot("target", 60.0)
     page.click(".hx-tabs >> text=Calibration")
     shot("calibration", 300.0)
     # The newest row of the table.
-    page.click(".hx-table tbody tr >> nth=0")
+    page.click(".hx-table tbody tr.can >> nth=0", timeout=300_000)
     page.click(".hx-tabs >> text=Heliostat")
+    page.wait_for_selector(".hx-why")
     shot("heliostat")
 
 

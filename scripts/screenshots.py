@@ -27,6 +27,8 @@ from heliotrope.twin.live import CYCLE, PacedLoop, World
 NAME = "engineer"
 CHROMIUM = "/usr/bin/chromium"
 ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+#: What the tab of the plant has once the flux is predicted.
+LIT = ".hx-plant dt:has-text('Intercept')"
 WIDE, TABLET = {"width": 1600, "height": 900}, {"width": 1024, "height": 768}
 
 
@@ -86,8 +88,10 @@ class Shown:
 def take(page: Any, into: Path) -> None:
     """Take all pictures."""
 
-    def shot(name: str) -> None:
+    def shot(name: str, has: str = "body") -> None:
+        page.wait_for_selector(has)
         page.wait_for_timeout(1500)
+        page.wait_for_function("heliotrope.store.live")
         page.screenshot(path=into / f"console-{name}.png")
         print(into / f"console-{name}.png")
 
@@ -95,18 +99,18 @@ def take(page: Any, into: Path) -> None:
         page.click(f".hx-tabs >> text={title}")
 
     tab("Plant")
-    shot("plant")
+    shot("plant", LIT)
     tab("Calibration")
     page.select_option(".hx-tools select", "error")
-    shot("calibration")
+    shot("calibration", ".hx-calibration td span.good")
     tab("Targets")
-    shot("targets")
+    shot("targets", ".hx-photo img[src]")
     page.fill(".hx-query", "sightings > 0")
     page.keyboard.press("Enter")
     page.evaluate("heliotrope.store.select([...heliotrope.store.selection].slice(0, 1))")
     tab("Heliostat")
     page.select_option(".hx-tools select", "state")
-    shot("heliostat")
+    shot("heliostat", ".hx-why")
     page.click(".hx-menu summary")
     page.click(".hx-menu >> text=People")
     page.wait_for_selector("dialog.wide tr")
@@ -114,15 +118,15 @@ def take(page: Any, into: Path) -> None:
     page.click("dialog >> text=Close")
     page.set_viewport_size(TABLET)
     tab("Plant")
-    shot("tablet-dark")
+    shot("tablet-dark", LIT)
     page.click("[aria-label='Dark or light']")
     tab("Clusters")
-    shot("tablet")
+    shot("tablet", ".hx-clusters tbody tr")
     page.set_viewport_size(WIDE)
     tab("Plant")
-    shot("light")
+    shot("light", LIT)
     page.click("#emergency")
-    shot("emergency")
+    shot("emergency", ".hx-alert.on:has-text('reports alone')")
 
 
 def main() -> None:
@@ -141,7 +145,7 @@ def main() -> None:
         try:
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
             page = browser.new_page(viewport=WIDE, bypass_csp=True)
-            page.set_default_timeout(60_000)
+            page.set_default_timeout(600_000)
             page.goto(f"{shown.address}login")
             page.fill("[name=name]", NAME)
             page.fill("[name=password]", shown.password)

@@ -483,6 +483,85 @@ def test_no_button_moves_when_the_bar_says_something(enter: Callable[[str], Any]
 
 
 @pytest.mark.parametrize("width", [1440, 820])
+def test_a_long_text_of_the_bar_is_unfolded_by_touch_and_by_key(
+    enter: Callable[..., Any], width: int
+) -> None:
+    page = enter("operator", has_touch=True, viewport={"width": width, "height": 900})
+    say = "text => heliotrope.store.emit('said', {text})"
+    text, button = page.locator(".hx-bar .hx-said"), page.locator(".hx-unfold")
+    cut = "e => e.scrollWidth > e.clientWidth"
+    page.evaluate(say, "STOW: " + "; ".join(f"P{k:04d}A: it is out of service" for k in range(40)))
+    assert text.evaluate(cut)
+    for unfold in (button.tap, text.tap, lambda: button.press("Enter")):
+        unfold()
+        assert not text.evaluate(cut)
+        box = text.bounding_box()
+        assert 0 <= box["x"] <= width - box["width"]
+        assert 0 <= box["y"] <= 900 - box["height"]
+        # The progress of a command does not fold what is being read.
+        page.evaluate(say, "STOW: " + "; ".join(f"P{k:04d}A: it is on its way" for k in range(50)))
+        assert not text.evaluate(cut)
+        button.press("Escape")
+        assert text.evaluate(cut)
+    page.evaluate(say, "STOW: 1 done")
+    assert not button.is_visible()
+
+
+@pytest.mark.parametrize("width", [1440, 1280, 820])
+def test_the_legend_covers_no_heliostat(enter: Callable[..., Any], width: int) -> None:
+    page = enter("viewer", viewport={"width": width, "height": 900})
+    for view in ("state", "error", "cluster"):
+        page.select_option("[aria-label='Colour by']", view)
+        map_, legend = (page.locator(x).bounding_box() for x in (".hx-map-field", ".hx-legend"))
+        assert legend["height"] > 10
+        assert map_["y"] + map_["height"] <= legend["y"] + 0.5
+        assert map_["height"] > 250, view
+
+
+def test_what_is_drawn_anew_takes_no_click_and_no_focus_away(enter: Callable[..., Any]) -> None:
+    page = enter("operator")
+    row = {"at": 1.0, "condition": "wind_gust_stow", "subject": "", "severity": "alarm"}
+    row |= {"text": "gusts", "active": True, "acknowledged_by": "", "count": 1}
+    page.route("**/api/v1/alarms", lambda route: route.fulfill(json=[row]))
+    page.click(".hx-tabs >> text=Alarms")
+    page.focus(".hx-alarms td button")
+    held = page.evaluate(
+        """async () => {
+        const wait = (ms) => new Promise((wake) => setTimeout(wake, ms));
+        const press = (name) => old.dispatchEvent(new PointerEvent(name, {bubbles: true}));
+        const old = document.querySelector('.hx-alarms td button');
+        press('pointerdown');
+        heliotrope.store.head.alarms = -1;
+        heliotrope.store.emit('frame', heliotrope.store.head);
+        await wait(400);
+        const held = old.isConnected;
+        press('pointerup');
+        for (let i = 0; old.isConnected && i < 100; i++) await wait(100);
+        return [held, old.isConnected];
+        }"""
+    )
+    assert held == [True, False]
+    assert page.evaluate("document.activeElement.matches('.hx-alarms td button')")
+
+
+def test_a_row_of_the_table_takes_a_press_longer_than_a_frame(enter: Callable[..., Any]) -> None:
+    page = enter("viewer")
+    page.click("[data-tab=heliostats]")
+    page.locator(".hx-grid-body .hx-grid-row").nth(2).hover()
+    frames = "heliotrope.store.received"
+    page.mouse.down()
+    for _ in range(2):
+        until(page, f"{frames} > {page.evaluate(frames)}")
+    page.mouse.up()
+    until(page, "heliotrope.store.selection.size === 1")
+    # The column's button stays, and with it the keyboard's focus.
+    page.focus("[role=columnheader] >> nth=0")
+    page.keyboard.press("Enter")
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.activeElement.textContent") == "Name ↓"
+
+
+@pytest.mark.parametrize("width", [1440, 820])
 def test_the_table_draws_only_rows_in_view(enter: Callable[..., Any], width: int) -> None:
     page = enter("viewer", viewport={"width": width, "height": 1000})
     page.click("[data-tab=heliostats]")

@@ -179,11 +179,18 @@ def test_the_page_says_what_a_proof_has_measured_and_what_it_believes(
     page.wait_for_selector(f".hx-plant dd:has-text('{followed} by photograph')")
     folded = ".hx-plant dt:has-text('Believed by reports alone') + dd details"
     assert page.inner_text(folded).endswith(f"and {believed - 3} more")
-    page.click(f"{folded} summary")
-    first, rest = page.inner_text(folded).replace("\n", " ").split(f" and {believed - 3} more")
-    names = [*first.split(", "), *rest.strip().split(", ")]
-    assert names[-1] == f"… ({believed})"
-    assert set(names[:-1]) < set(field.live.names) - {name}
+    # A frame names twenty of them; unfolded, the list has all, on the tab and in the banner.
+    for place in (folded, ".hx-alert details"):  # the banner has first those that are not done
+        page.click(f"{place} summary")
+        page.wait_for_selector(f"{place}:not(:has-text('…'))")
+        first, rest = page.inner_text(place).replace("\n", " ").split(f" and {believed - 3} more")
+        names = {*first.split(", "), *rest.strip().split(", ")}
+        assert len(names) == believed
+        assert names <= set(field.live.names) - {name}
+    page.wait_for_timeout(2500)  # two frames
+    assert page.locator(".hx-alert details[open]").count() == 1
+    stop = page.locator("#emergency").bounding_box()
+    assert page.locator(".hx-alert").bounding_box()["y"] >= stop["y"] + stop["height"]
     page.click(".hx-alert button >> text=Withdraw")
     page.click("dialog >> text='Withdraw'")
     field.calm()

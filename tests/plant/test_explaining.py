@@ -38,10 +38,8 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         assert first.text == f"{other} is STOWED: it is not under automatic control"
         assert (first.button, first.order) == (Button.AUTOMATIC, None)
         await asyncio.sleep(20.0)
-        assert (
-            shown.why(name).text
-            == f"{name} is APPROACHING: it is under automatic control: APPROACHING"
-        )
+        going = f"{name} is APPROACHING: it is under automatic control, on its way to standby"
+        assert shown.why(name).text == going
         await _tracking(plant, name)
         up = shown.why(name)
         assert up.tracks

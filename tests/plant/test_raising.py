@@ -17,6 +17,7 @@ from heliotrope.links.messages import Stage
 from heliotrope.plant.motion.proofs import BeamError
 from heliotrope.plant.operations import Logbook
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
+from heliotrope.plant.operations.explaining import explain
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
 from heliotrope.plant.orders.authority import RefusedError
@@ -324,9 +325,10 @@ def test_a_mirror_at_standby_names_the_witness_that_it_waits_for(tmp_path: Path)
                 "it is waiting: no independent witness confirms this plant's sun position: none of"
             )
             steps = control.following(plant.now(), (NAME, OTHER))
-            assert steps[NAME].text.startswith(f"it is under automatic control: IDLE; {why}")
+            assert steps[NAME].text.startswith(f"it is under automatic control, at standby; {why}")
             assert steps[NAME].stage is Stage.DONE
-            assert steps[OTHER].text == "it is waiting its turn: IDLE", "it cannot join"
+            again = "it is waiting its turn to be raised again, because it can only track after"
+            assert steps[OTHER].text == f"{again} an approach from stow"
             assert bench.count(states.TRACKING) == 0
             plant.witnesses.take("sun sensor", plant.sun_vector(), 0.0)
             await bench.until(lambda: bench.count(states.TRACKING) > 0)
@@ -335,6 +337,34 @@ def test_a_mirror_at_standby_names_the_witness_that_it_waits_for(tmp_path: Path)
             await asyncio.gather(tasks, return_exceptions=True)
 
     run_virtual(main)
+
+
+def test_an_uncalibrated_mirror_at_standby_says_what_it_waits_for(tmp_path: Path) -> None:
+    """It was shown as "IDLE: it is under automatic control: IDLE", which explains nothing."""
+
+    async def scene(bench: Bench) -> None:
+        plant, log = bench.plant, Logbook(bench.clock)
+        # With this margin no uncalibrated beam counts as clear of the targets.
+        control = AutomaticControl(
+            plant, log, settings=AutomaticSettings(wanted=True, calibrate=False, margin=1e6)
+        )
+        running = asyncio.create_task(control.run())
+        await bench.wait(6.0)
+        step = control.following(plant.now(), (NAME,))[NAME]
+        assert step.stage is Stage.DONE
+        assert step.text == (
+            "it is under automatic control, at standby; it is waiting: it is not calibrated, and "
+            "its beam could hit a target on the way to the receiver, so a visit to a target comes "
+            "first"
+        )
+        why = explain(plant, control, log, NAME, "")
+        assert why.text == f"{NAME} is IDLE: {step.text}"
+        off = "It stays at standby while calibration is off: there is no camera."
+        assert (why.follows, why.remedy) == (off, "")
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    play(tmp_path, scene)
 
 
 def test_what_is_found_up_at_dusk_is_stowed_unless_a_person_commands(tmp_path: Path) -> None:

@@ -103,8 +103,8 @@ def orders_counted(page: Any) -> set[str]:
 def task(page: Any, name: str) -> Iterator[None]:
     """Print how many clicks and seconds a person's task takes."""
     page.evaluate(
-        "() => { window.clicks = 0; addEventListener('click', (e) => { window.clicks += "
-        "e.isTrusted && e.detail > 0; }, true); }"
+        "() => { if (window.clicks === undefined) addEventListener('click', (e) => { "
+        "window.clicks += e.isTrusted && e.detail > 0; }, true); window.clicks = 0; }"
     )
     begun = time.monotonic()
     yield

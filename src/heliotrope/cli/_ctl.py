@@ -1233,7 +1233,9 @@ def give_back(
     """Remove your locks; nothing moves. An object is in service when nobody's lock is left."""
     order = {**_places(heliostats, targets, receivers, tower), "owner": owner, "reason": reason}
     with _client(context) as client:
-        print_json(client.ask("POST", "holds/release", order))
+        left = client.ask("POST", "holds/release", order)
+    locked = ", ".join(f"{one['name']} ({one['who']}: {one['reason']})" for one in left)
+    print(f"lock removed; still locked: {locked}" if left else "lock removed; none is left")
 
 
 def _places(

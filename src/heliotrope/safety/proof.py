@@ -87,8 +87,8 @@ class ProofReport:
         return "; ".join([*parts, *self.unknown[:8], self.basis])
 
     @property
-    def basis(self) -> str:
-        """The measured and the reported parts of the confirmation, in one line."""
+    def evidence(self) -> str:
+        """The measured and the reported parts of the confirmation, without names."""
         parts = [self.flux.value]
         if self.flux is not FluxProof.BELOW and (self.complete or self.believed or self.followed):
             parts[0] += ", so this is not proven, because a stalled drive reports the same"
@@ -96,8 +96,14 @@ class ProofReport:
             f"{count} seen to move today by {by}" for by, count in sorted(self.followed.items())
         ]
         if self.believed:
-            parts.append(f"{len(self.believed)} by reports alone: {_first(self.believed)}")
+            parts.append(f"{len(self.believed)} by reports alone")
         return "; ".join(parts)
+
+    @property
+    def basis(self) -> str:
+        """The same, with the first of the heliostats that are believed."""
+        names = f": {_first(self.believed)}" if self.believed else ""
+        return f"{self.evidence}{names}"
 
     def with_evidence(self, done: Iterable[str], shown: Mapping[str, str]) -> "ProofReport":
         """Return the report with today's evidence that mirrors follow their drives, by heliostat.

@@ -38,7 +38,7 @@ function badge(box) {
 }
 
 function alert(box) {
-  const text = h("span"), viewer = me.role === "viewer";
+  const viewer = me.role === "viewer";
   const back = h("button", { className: "hx-button", onclick: async () => {
     // Each person withdraws their own order; an engineer withdraws another's by the owner's name.
     const { calls } = store.head.order, owners = calls.map((call) => call.who), own = !calls.length || owners.includes(me.name);
@@ -54,7 +54,7 @@ function alert(box) {
   const resume = h("button", { className: "hx-button", onclick: async () => {
     if (await ask(t("Resume automatic control? It raises the heliostats that it had."), [], t("Resume"))) await act(() => api("POST", "automatic/resume"), t("Resume"));
   } }, t("Resume"));
-  alertText(box, text);
+  alertText(box);
   box.append(viewer ? "" : back, viewer ? "" : resume);
   store.on("frame", (now) => {
     back.hidden = !now.emergency || !now.order.calls.length; resume.hidden = now.emergency ? now.order.calls.length > 0 : !now.resume;

@@ -46,14 +46,19 @@ export function table(columns, rows, act) {
   return h("div", { className: "hx-scroll" }, h("table", { className: "hx-table" }, h("thead", {}, head), h("tbody", {}, body)));
 }
 
-// The first names of many, all of them on a click; a list that is drawn anew stays as it was. Of `all` there may be more than the names.
+// The first names of many, all of them on a click; a list that is drawn anew stays as it was. Of `all` there may be more than the names: `rest` then gets them.
 const FEW = 3;
-export function several(names, key, shown, all = names.length) {
+export function several(names, key, shown, all = names.length, rest = null) {
   if (names.length <= FEW + 1) return h("b", {}, names.join(", "));
-  const rest = names.slice(FEW), more = all > names.length ? `, … (${count(all)})` : "";
+  const more = all > names.length ? `, … (${count(all)})` : "", others = h("span", {}, names.slice(FEW).join(", ") + more);
   const box = h("details", { className: "hx-several", open: shown.has(key) },
-    h("summary", { title: names.join(", ") + more }, h("b", {}, names.slice(0, FEW).join(", ")), " ", t("and {n} more", { n: count(all - FEW) })), rest.join(", ") + more);
-  box.ontoggle = () => (box.open ? shown.add(key) : shown.delete(key));
+    h("summary", { title: names.join(", ") + more }, h("b", {}, names.slice(0, FEW).join(", ")), " ", t("and {n} more", { n: count(all - FEW) })), others);
+  box.ontoggle = async () => {
+    if (!box.open) { shown.delete(key); return; }
+    shown.add(key);
+    // Those that cannot be had stay a number.
+    if (more && rest) others.textContent = await rest().then((found) => found.slice(FEW).join(", "), () => others.textContent);
+  };
   return box;
 }
 
@@ -71,6 +76,20 @@ export function facts(pairs) {
     h("div", { className: extra ?? "" }, h("dt", {}, name), h("dd", {}, value))));
 }
 
+// Where the keyboard's focus was last: the places of its ancestors among their siblings, so that it is found again in what is drawn anew.
+let focused = { element: null, path: [] };
+document.addEventListener("focusin", ({ target }) => {
+  const path = [];
+  for (let one = target; one !== document.body && one.parentElement; one = one.parentElement) path.unshift([...one.parentElement.children].indexOf(one));
+  focused = { element: target, path };
+});
+function keepFocus() {
+  const { element: old, path } = focused;
+  if (!old || old.isConnected || document.activeElement !== document.body) return;
+  const now = path.reduce((one, place) => one?.children[place], document.body);
+  if (now?.tagName === old.tagName && now.textContent === old.textContent) now.focus({ preventScroll: true });
+}
+
 // Calls `load` now, whenever `key()` changes, and every `every` seconds; never twice at once.
 export function refreshed(load, { key = () => "", every = Infinity } = {}) {
   let busy = false, last = "", at = -Infinity, over = false;
@@ -78,7 +97,7 @@ export function refreshed(load, { key = () => "", every = Infinity } = {}) {
     const now = performance.now(), present = String(key());
     if (busy || over || document.hidden || (present === last && now - at < 1e3 * every)) return;
     busy = true; last = present; at = now;
-    try { await load(); } catch (error) { store.emit("said", { text: error.message, bad: true }); }
+    try { await load(); keepFocus(); } catch (error) { store.emit("said", { text: error.message, bad: true }); }
     finally { busy = false; }
   };
   const off = store.on("frame", look);

@@ -17,7 +17,8 @@
 
   async function send(where, given) {
     const answer = await fetch(where, { method: "POST", keepalive: true, signal: AbortSignal.timeout(15000), ...given });
-    const data = await answer.json();
+    // A proxy, or a program that has failed, answers without JSON.
+    const data = await answer.json().catch(() => { throw Object.assign(new Error(t("the console answered with error {status}", { status: answer.status })), { status: answer.status }); });
     if (!answer.ok) throw Object.assign(new Error(data.detail), { status: answer.status });
     return data;
   }

@@ -120,6 +120,15 @@ export class ApiError extends Error {
   constructor(status, text) { super(text); this.status = status; }
 }
 
+// Ends with the press under way, within a second: what is drawn anew under a finger or a pointer swallows its click.
+let press = Promise.resolve();
+addEventListener("pointerdown", () => {
+  press = new Promise((end) => {
+    for (const name of ["pointerup", "pointercancel"]) addEventListener(name, () => setTimeout(end), { once: true, capture: true });
+    setTimeout(end, 1000);
+  });
+}, true);
+
 export async function api(method, path, body) {
   const options = { method, headers: { "X-CSRF-Token": meta("heliotrope-csrf") }, credentials: "same-origin" };
   if (body !== undefined) {
@@ -130,11 +139,12 @@ export async function api(method, path, body) {
   // The page was left alone for long: the person confirms, and the order goes again.
   if (answer.status === 423 && await store.confirm()) return api(method, path, body);
   if (answer.status === 401) { location.assign("/login"); throw new ApiError(401, t("signed out")); }
-  const data = answer.status === 204 ? null : await answer.json();
+  const data = answer.status === 204 ? null : await answer.json().catch(() => { throw new ApiError(answer.status, t("the console answered with error {status}", { status: answer.status })); });
   if (!answer.ok) {
     const detail = typeof data.detail === "string" ? data.detail : JSON.stringify(data.detail);
     throw new ApiError(answer.status, detail);
   }
+  if (method === "GET") await press;
   return data;
 }
 

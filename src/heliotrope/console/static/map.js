@@ -36,7 +36,9 @@ export class FieldMap {
     this.canvas = box.appendChild(document.createElement("canvas"));
     this.context = this.canvas.getContext("2d", { alpha: false });
     this.tip = box.appendChild(Object.assign(document.createElement("div"), { className: "hx-tip" }));
-    this.legend = box.appendChild(Object.assign(document.createElement("div"), { className: "hx-legend" }));
+    // Below the map, never over it: heliostats may be anywhere in it.
+    this.legend = Object.assign(document.createElement("div"), { className: "hx-legend" });
+    box.after(this.legend);
     for (const name of ["frame", "live", "theme"]) store.on(name, () => this.news());
     store.on("selection", () => { this.dirty = true; });
     store.on("view", (view) => { this.view = view; this.news(); });

@@ -122,9 +122,9 @@ const ORDERS = [
 ];
 
 export function bar(box) {
-  const said = h("div", { className: "hx-said", role: "status" });
+  const said = h("div", { className: "hx-said", role: "status" }), unfold = h("button", { type: "button", className: "hx-button hx-unfold", hidden: true, ariaLabel: t("Whole text") }, "…"), line = h("div", { className: "hx-line" }, said, unfold);
   if (me.role === "viewer") {
-    box.append(h("span", { className: "hx-hint" }, t("View only. EMERGENCY is open to everybody.")), said);
+    box.append(h("span", { className: "hx-hint" }, t("View only. EMERGENCY is open to everybody.")), line);
   } else {
     const to = h("select", { title: t("Scope (T)"), onchange: () => { scope = to.value; mark(); } },
       h("option", { value: "selection" }, t("Selection")), h("option", { value: "cluster" }, t("Clusters of the selection")), h("option", { value: "field" }, t("Whole field")));
@@ -140,7 +140,7 @@ export function bar(box) {
         button.disabled = !store.field || !may || (scope !== "field" && !n);
       }
     };
-    box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, t("Scope"), " ", to), groups), said);
+    box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, t("Scope"), " ", to), groups), line);
     // The whole field, or whole clusters, must be chosen anew after each selection.
     store.on("selection", () => { if (store.selection.size) scope = to.value = "selection"; mark(); });
     store.on("authority", mark);
@@ -151,7 +151,20 @@ export function bar(box) {
     });
     mark();
   }
-  store.on("said", ({ text, bad }) => { said.textContent = text; said.title = text; said.classList.toggle("bad", Boolean(bad)); });
+  // A text that is cut is unfolded above the bar by a press, a touch or a key; it stays so while longer ones follow.
+  const whole = (open) => { said.classList.toggle("whole", open); unfold.ariaExpanded = open; };
+  const fit = () => {
+    const open = said.classList.contains("whole");
+    whole(false);
+    unfold.hidden = true;
+    unfold.hidden = said.scrollWidth <= said.clientWidth;
+    whole(open && !unfold.hidden);
+  };
+  unfold.onclick = () => whole(!said.classList.contains("whole"));
+  said.onclick = () => { if (!unfold.hidden) whole(true); };
+  line.onkeydown = ({ key }) => { if (key === "Escape") whole(false); };
+  new ResizeObserver(fit).observe(line);
+  store.on("said", ({ text, bad }) => { said.textContent = text; said.title = text; said.classList.toggle("bad", Boolean(bad)); fit(); });
 }
 
 // The holder of the authority, and the button to take it and give it back.

@@ -36,8 +36,8 @@ export const VIEWS = {
     legend: () => {
       const counts = new Uint32Array(STATES.length + 1);
       for (let row = 0; row < store.state.length; row++) counts[VIEWS.state.of(row)]++;
-      return [...STATES, "stale"].map((name, i) => ({ name: t(name), colour: colourOf(name), count: counts[i] }))
-        .filter((entry) => entry.count);
+      // All of them, so that the map does not change its size with them.
+      return [...STATES, "stale"].map((name, i) => ({ name: t(name), colour: colourOf(name), count: counts[i] }));
     },
   },
   error: amounts(t("Predicted error (mrad)"), (row) => 1e3 * store.error[row], 0.1, 20,

@@ -3,7 +3,7 @@ import { api, me, store } from "./live.js";
 import { colourOf, dark } from "./palette.js";
 import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refreshed, saveCsv, several, span, table } from "./dom.js";
 import { act, aim, askAnd } from "./orders.js";
-import { drawFlux, fluxPoint } from "./showing.js";
+import { drawFlux, fluxPoint, listed as listedIn } from "./showing.js";
 import { markCorners } from "./marking.js";
 import { compareVersions, waitingChanges, waitingView } from "./versions.js";
 import { day as dayOf, fixed, monthDay, t, word } from "./words.js";
@@ -54,7 +54,8 @@ export function plant(box) {
       t("{act} of the field, ordered by {who}: {acknowledged} of {all} acknowledged, {done} done. {text}", { act: t(head.order.act), who: head.order.who, acknowledged: count(head.order.acknowledged), all: count(head.order.heliostats), done: count(head.order.done), text: head.order.text })), facts([
       [t("Measured"), head.order.measured ? t("the flux, below its limit") : t("nothing since the order")],
       [t("Seen to move today"), Object.entries(head.order.followed).map(([by, n]) => t("{n} by {by}", { n: count(n), by })).join(", ") || t("none")],
-      [t("Believed by reports alone"), head.order.believed.length ? several(head.order.believed, "believed", unfolded, head.order.believed_count) : t("none")]])] : []));
+      ...(head.order.not_done.length ? [[t("Not done"), listedIn(head.order, "not_done", "not_done", unfolded)]] : []),
+      [t("Believed by reports alone"), head.order.believed.length ? listedIn(head.order, "believed", "believed", unfolded) : t("none")]])] : []));
   };
   const draw = () => {
     if (!seen) return;

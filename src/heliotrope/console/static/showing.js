@@ -1,7 +1,7 @@
 // What the page and the wall screen both show: the head, what is open, and the flux on a receiver.
-import { store } from "./live.js";
+import { api, store } from "./live.js";
 import { cividis, dark } from "./palette.js";
-import { count, degrees, h, local, number } from "./dom.js";
+import { count, degrees, h, local, number, several } from "./dom.js";
 import { day as dayOf, t } from "./words.js";
 
 export function headOf(box) {
@@ -22,15 +22,23 @@ export function headOf(box) {
   mark(); show();
 }
 
-// The emergency, or why automatic control waits, in one line.
-export function alertText(box, text = h("span")) {
-  box.append(text);
+// Heliostats of an emergency, by the name of their list in its view: the head of a frame names the first of many.
+export const listed = (order, list, key, shown) => several(order[list], key, shown, list === "believed" ? order.believed_count : order.heliostats - order.done, async () => (await api("GET", "emergency"))[list]);
+
+// The emergency, or why automatic control waits; the names are drawn anew only when they change, so that they stay unfolded under the hand.
+export function alertText(box) {
+  const text = h("span"), names = h("span"), shown = new Set();
+  let drawn = "";
+  box.append(h("div", {}, text, names));
   store.on("frame", (now) => {
     box.classList.toggle("on", now.emergency || Boolean(now.resume));
     box.classList.toggle("waits", !now.emergency);
+    // Those that have not done it; then those of which only their own reports say so, which the text before has counted.
+    const { order } = now, list = order.not_done.length ? "not_done" : "believed", like = JSON.stringify([now.emergency, list, order[list], order.done, order.believed_count]);
+    if (like !== drawn) { drawn = like; names.replaceChildren(...(now.emergency && order[list].length ? [list === "believed" ? ": " : ` · ${t("not done")}: `, listed(order, list, "", shown)] : [])); }
     text.textContent = now.emergency ? [t("EMERGENCY {act} by {who}", { act: t(now.order.act), who: now.order.calls.length ? now.order.calls.map((call) => `${call.who} (${call.reason})`).join(", ") : now.order.who || t("the safety table") }),
-      t("acknowledged {n} of {all}", { n: count(now.order.acknowledged), all: count(now.order.heliostats) }), t("done {n}", { n: count(now.order.done) }), now.order.basis,
-      now.order.calls.length ? "" : t("when the causes have gone, Resume ends it and gives the field back to automatic control")].filter(Boolean).join(" · ") : now.resume;
+      t("acknowledged {n} of {all}", { n: count(now.order.acknowledged), all: count(now.order.heliostats) }), t("done {n}", { n: count(now.order.done) }),
+      now.order.calls.length ? "" : t("when the causes have gone, Resume ends it and gives the field back to automatic control"), now.order.basis].filter(Boolean).join(" · ") : now.resume;
   });
 }
 

@@ -30,6 +30,8 @@ export function heliostats(box) {
   const number = h("span", { className: "hx-hint" }), head = h("div", { className: "hx-grid-row head", role: "row" }), body = h("div", { className: "hx-grid-body" });
   const grid = h("div", { className: "hx-grid", role: "grid", tabIndex: 0 }, head, body);
   const lines = new Map(); // the rows in the page, by their places
+  const titles = COLUMNS.map(([, , , right], k) => h("button", { type: "button", role: "columnheader", className: right ? "num" : "", onclick: () => { down = k === by ? !down : Boolean(right); by = k; sorted(); } }));
+  head.append(...titles);
   const kept = h("select", { ariaLabel: t("Saved selections"), onchange: () => take(kept.value) });
 
   const sorted = () => {
@@ -38,15 +40,23 @@ export function heliostats(box) {
     // Those without a value come last in both directions.
     rows.sort((a, b) => { const x = key.get(a), y = key.get(b); return none(x) || none(y) ? none(x) - none(y) : sign * (x < y ? -1 : x > y ? 1 : 0); });
     number.textContent = t("{n} of {all}", { n: count(rows.length), all: count(store.field.names.length) });
-    head.replaceChildren(...COLUMNS.map(([title, , , right], k) => h("button", { type: "button", role: "columnheader", className: right ? "num" : "", ariaSort: k === by ? (down ? "descending" : "ascending") : "none",
-      onclick: () => { down = k === by ? !down : Boolean(right); by = k; sorted(); } }, t(title), k === by ? (down ? " ↓" : " ↑") : "")));
+    titles.forEach((button, k) => {
+      button.ariaSort = k === by ? (down ? "descending" : "ascending") : "none";
+      button.textContent = t(COLUMNS[k][0]) + (k === by ? (down ? " ↓" : " ↑") : "");
+    });
     body.style.height = `${rows.length * HIGH}px`;
     draw();
   };
+  const fill = (line, place) => {
+    const row = rows[place];
+    line.ariaSelected = store.selection.has(row);
+    COLUMNS.forEach(([, text], k) => { const cell = line.children[k], now = text(row); if (cell.textContent !== now) cell.textContent = now; });
+  };
   const lineOf = (place) => {
-    const row = rows[place], line = h("div", { className: "hx-grid-row", role: "row", ariaSelected: store.selection.has(row), onclick: (event) => pick(place, event) },
-      COLUMNS.map(([, text, , right]) => h("span", { role: "gridcell", className: right ? "num" : "" }, text(row))));
+    const line = h("div", { className: "hx-grid-row", role: "row", onclick: (event) => pick(place, event) },
+      COLUMNS.map(([, , , right]) => h("span", { role: "gridcell", className: right ? "num" : "" })));
     line.style.top = `${place * HIGH}px`;
+    fill(line, place);
     return line;
   };
   // Makes only the rows that come into view: making all of them takes longer than a frame.
@@ -60,14 +70,16 @@ export function heliostats(box) {
     }
     body.prepend(...above); body.append(...below);
   };
-  const draw = () => { lines.clear(); body.replaceChildren(); slide(); };
+  // The rows stay, with new texts: one that is made anew under a press swallows its click.
+  const draw = () => { for (const [place, line] of lines) if (place < rows.length) fill(line, place); slide(); };
   // A click selects one; with Ctrl one more or one less, with Shift all up to it.
   const pick = (at, event) => {
     const row = rows[at], chosen = event.ctrlKey || event.metaKey || event.shiftKey ? new Set(store.selection) : new Set();
-    if (event.shiftKey && last >= 0) for (const one of rows.slice(Math.min(last, at), Math.max(last, at) + 1)) chosen.add(one);
+    const from = rows.indexOf(last);
+    if (event.shiftKey && from >= 0) for (const one of rows.slice(Math.min(from, at), Math.max(from, at) + 1)) chosen.add(one);
     else if (chosen.has(row)) chosen.delete(row);
     else chosen.add(row);
-    if (!event.shiftKey) last = at;
+    if (!event.shiftKey) last = row;
     store.select(chosen, chosen.size === 1 ? [...chosen][0] : store.focus);
   };
   const list = () => kept.replaceChildren(h("option", { value: "" }, t("Saved selections…")), ...Object.entries(saved()).map(([name, names]) => h("option", { value: name }, `${name} (${count(names.length)})`)));
@@ -92,7 +104,7 @@ export function heliostats(box) {
   box.append(h("div", { className: "hx-row hx-search" }, which, button(t("Show"), sorted, "main"), number), h("div", { className: "hx-row hx-search" },
     button(t("Select these"), () => store.select(rows, rows.length === 1 ? rows[0] : -1)), button(t("Show the selection"), () => { which.value = store.selected().join(" "); sorted(); }), button(t("Save selection…"), keep), kept, button(t("Save as CSV"), csv)), grid);
   list(); sorted();
-  let at = 0; // values change with each frame, their order every five seconds
-  const off = [store.on("selection", draw), store.on("frame", () => (performance.now() - at > 5000 ? (at = performance.now(), sorted()) : draw()))];
+  let at = 0; // values change with each frame, their order every five seconds, but not under a pointer that chooses a row
+  const off = [store.on("selection", draw), store.on("frame", () => (performance.now() - at > 5000 && !body.matches(":hover") ? (at = performance.now(), sorted()) : draw()))];
   return () => off.forEach((end) => end());
 }

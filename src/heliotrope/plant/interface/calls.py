@@ -248,8 +248,8 @@ def live(desk: Desk) -> WithBlob:
 
 @_call("GET emergency", "safety")
 def emergency(desk: Desk) -> views.EmergencyView:
-    """Return the last emergency order with its proof."""
-    return desk.operations.viewer.emergency()
+    """Return the last emergency order with its proof, and the names of all its heliostats."""
+    return desk.operations.viewer.emergency(len(desk.operations.names))
 
 
 @_call("POST emergency", "safety", bare=True, urgent=True)

@@ -52,6 +52,19 @@ _REMEDIES = {
     states.FAULT: "find the cause, then clear the fault",
     states.UNCONFIGURED: "store its parameters",
 }
+#: What a heliostat under automatic control is doing, in the states in which it follows.
+_DOING = {
+    states.APPROACHING: "on its way to standby",
+    states.IDLE: "at standby",
+    states.TRACKING: "tracking its aim",
+}
+#: What a heliostat that waits for its turn will do next, in the other states.
+_NEXT = {
+    states.STOWED: "to leave stow",
+    states.STOWING: "to leave stow, and is still on its way there",
+    states.DEFOCUSED: "to return to standby",
+    states.IDLE: "to be raised again, because it can only track after an approach from stow",
+}
 #: Parts of the work that failed; each failure raises an alarm, and the part is soon retried.
 PARTS = RetryLaw(
     "part of automatic control",
@@ -406,11 +419,10 @@ class AutomaticControl:
         if why := self._raising.why_not(name):
             return Step(why, Stage.FAILED)
         if state == states.APPROACHING or (state in states.AVAILABLE and able):
-            text = f"it is under automatic control: {shown.condition}"
+            text = f"it is under automatic control, {_DOING[state]}"
             return Step(f"{text}; it is waiting: {waits}" if waits else text, Stage.DONE)
-        return Step(
-            f"it is waiting: {waits}" if waits else f"it is waiting its turn: {shown.condition}"
-        )
+        turn = f"it is waiting its turn {_NEXT.get(state, 'to move')}"
+        return Step(f"it is waiting: {waits}" if waits else turn)
 
     def calibrating(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
         """Return the progress of calibrations that operators requested at a given time, POSIX s."""
@@ -419,6 +431,10 @@ class AutomaticControl:
     def wants(self, heliostat: str) -> bool:
         """Return whether a heliostat is under automatic control."""
         return bool(self._raising.wanted[self._plant.field.place(heliostat)])
+
+    def needs_calibration(self, heliostat: str) -> bool:
+        """Return whether a heliostat goes no further until it is calibrated."""
+        return heliostat in self._raising.uncalibrated((heliostat,))
 
     def visit_of(self, heliostat: str) -> Running | None:
         """Return the visit of a heliostat that is in progress, None if there is none."""

@@ -3,7 +3,6 @@
 from datetime import UTC, datetime
 
 from heliotrope.errors import once
-from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.field.state import HeliostatState
@@ -98,15 +97,20 @@ def _case(
             "Find the cause at the heliostat, then clear the fault.",
             Button.CLEAR_FAULT,
         )
+    if shown.state == "UNCONFIGURED":
+        return (
+            "its board stores no parameters",
+            "It moves only to defocus or to stow until its parameters are stored.",
+            "An engineer stores its parameters (heliotrope run --configure).",
+            Button.NONE,
+        )
     if (run := automatic.visit_of(name)) is not None:
         follows = "It returns to the receiver when the visit has ended."
         return f"it is being calibrated at {run.target}: {run.stage}", follows, "", Button.NONE
-    return _automatic_case(plant, automatic, name, tracks=tracks)
+    return _automatic_case(automatic, name, tracks=tracks)
 
 
-def _automatic_case(
-    plant: PlantController, automatic: AutomaticControl, name: str, *, tracks: bool
-) -> _Case:
+def _automatic_case(automatic: AutomaticControl, name: str, *, tracks: bool) -> _Case:
     """Return the reason why a heliostat is not on the receiver, or its next step."""
     planned = next((visit for visit in automatic.plan(50) if visit.heliostat == name), None)
     follows = ""
@@ -148,10 +152,15 @@ def _automatic_case(
             f"{tried.work}: {tried.count} of {tried.most} attempts have failed ({tried.reason}); "
             f"the next attempt is {again}; after the last, {tried.following}."
         )
+    remedy = ""
+    if step.stage is Stage.DONE and automatic.needs_calibration(name):
+        off = automatic.view().reason
+        if off:
+            follows = f"It stays at standby while calibration is off: {off}."
+        else:
+            remedy = "Press Calibrate now to calibrate it before the others."
     if not follows and step.stage is not Stage.FAILED:
         follows = "It continues by itself."
-    state = plant.field.rows["state"][plant.field.place(name)]
-    remedy = "Store its parameters." if state == states.UNCONFIGURED else ""
     return step.text, follows, remedy, Button.NONE
 
 

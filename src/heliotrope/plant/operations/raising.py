@@ -38,6 +38,12 @@ RAISING = RetryLaw(
 )
 #: Number of heliostats per step for which the guards of a command are evaluated.
 ASKED = 1000
+#: What holds heliostats at standby.
+_UNCALIBRATED = (
+    "it is not calibrated, and its beam could hit a target on the way to the receiver, so a visit "
+    "to a target comes first"
+)
+_NO_AIM = "the flux limit leaves it no aim on the receiver"
 #: The next command of a heliostat on its way to the receiver, by its state.
 _NEXT = {states.STOWED: "APPROACH", states.DEFOCUSED: "IDLE", states.IDLE: "TRACK"}
 
@@ -166,9 +172,23 @@ class Raising:
         for state, command in _NEXT.items():
             there = asked & plant.field.among((state,), plant.now())
             if command == "TRACK":
-                there &= self._known() & self.able()
+                there &= self.able()
+                at_standby = [self._names[row] for row in np.flatnonzero(there)]
+                if plant.design.aims.limit is not None:
+                    found |= {name: _NO_AIM for name in at_standby if name not in self.aims}
+                found |= dict.fromkeys(self.uncalibrated(at_standby), _UNCALIBRATED)
+                there &= self._known()
             found |= plant.guards.reasons(self._asked(command, np.flatnonzero(there)))
         return found
+
+    def uncalibrated(self, heliostats: Sequence[str]) -> tuple[str, ...]:
+        """Return the heliostats that must be calibrated before they may go to the receiver."""
+        beliefs, place = self._plant.beliefs, self._plant.field.place
+        return tuple(
+            name
+            for name in heliostats
+            if not self._clear[place(name)] and beliefs.record(name) is None
+        )
 
     def _known(self) -> Mask:
         """Return a mask of the heliostats known well enough to go to the receiver, (N,)."""

@@ -181,8 +181,11 @@ class Viewer:
             )
         return found
 
-    def emergency(self) -> EmergencyView:
-        """Return the last emergency order, and whether it has been carried out."""
+    def emergency(self, most: int = _SOME) -> EmergencyView:
+        """Return the last emergency order, and whether it has been carried out.
+
+        ``most``: number of heliostats that each of its lists may name.
+        """
         plant, order = self._plant, self._plant.sentinel.order
         if order is None:
             return EmergencyView(False, "", "", "", 0.0, 0, 0, 0, (), "no emergency so far")
@@ -206,14 +209,14 @@ class Viewer:
             count,
             count - len(report.unacknowledged),
             count - len(report.not_done),
-            report.not_done[:_SOME],
+            report.not_done[:most],
             report.text,
             plant.sentinel.calls,
             report.flux is FluxProof.BELOW,
             report.followed,
-            report.believed[:_SOME],
+            report.believed[:most],
             len(report.believed),
-            report.basis,
+            report.evidence,
         )
 
 

@@ -730,7 +730,7 @@ class EmergencyView:
         Names of the first heliostats counted as done only by their reports, and the number of all
         such heliostats.
     basis
-        What is measured and what is believed, in words.
+        What is measured and how many are believed, in words.
     """
 
     on: bool
