@@ -9,9 +9,8 @@
   cells; `rays` is an independent check by ray tracing, and `canting` tilts facets.
 - `plant_flux` and `flux_files`: efficiencies and flux of a plant at a sun position, over a day or a
   year, and their files.
-- `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation.
-- `obstruction`: the mirror elements that neighbours shade and block, and the resulting centroid
-  shift.
+- `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation, and
+  the shift of its centroid by neighbours that shade and block it.
 - `coverage`: the fraction of a grid's cells that polygons cover (a function of the same name, so it
   stays there).
 - `keep_out`: beams that enter keep-out volumes; `glare`: the eye hazard, for information only.
@@ -71,12 +70,13 @@ from heliotrope.optics.keep_out import (
 )
 from heliotrope.optics.mirror_image import (
     Beam,
+    CentroidShift,
+    centroid_shift,
     flat_top_beam,
     gaussian_beam,
     reflected_beam,
 )
 from heliotrope.optics.mirror_surface import equal_facets
-from heliotrope.optics.obstruction import CentroidShift, Neighbours, centroid_shift, nearest
 from heliotrope.optics.offsets import ImageOffsets, image_offsets, target_offsets
 from heliotrope.optics.plant_flux import (
     EFFICIENCIES,
@@ -92,7 +92,7 @@ from heliotrope.optics.plant_scene import scene_of
 from heliotrope.optics.rays import RayTrace, trace
 from heliotrope.optics.receiver_flux import Efficiencies, FieldFlux, Images
 from heliotrope.optics.scene import FacetTable, Mirrors, Scene
-from heliotrope.optics.shading import Lit, Shading
+from heliotrope.optics.shading import Lit, Shading, nearest
 from heliotrope.optics.sun_shape import SUN_SHAPES, Gaussians, SunShape, sun_profile
 from heliotrope.optics.surfaces import Cavity, Cells, Cylinder, Mesh, Plate, Surface, surface_of
 
@@ -132,7 +132,6 @@ __all__ = [
     "Mesh",
     "MirrorOptics",
     "Mirrors",
-    "Neighbours",
     "PlantFlux",
     "Plate",
     "RayTrace",
