@@ -418,7 +418,7 @@ def reflected_beam(
     ray = normalize(power @ rays)
     distance = float(power @ np.linalg.norm(hits - points, axis=-1) / power.sum())
     plane = target.plane_coordinates(hits)
-    spread = _spread(target, to_sun, R[:, 2], ray, distance)
+    spread = ray_spread(target, to_sun, R[:, 2], ray, distance)
     return _gather(plane, power, spread, slope_error, light, step)
 
 
@@ -568,7 +568,7 @@ def _mirror_axes(
     return mirror_axes(n)
 
 
-def _spread(
+def ray_spread(
     target: Target, sun: FloatArray, normal: FloatArray, ray: FloatArray, distance: float
 ) -> tuple[FloatArray, float]:
     """Return metres on the plane per rad off the ray (2, 2), and the cosine of incidence.
@@ -615,18 +615,41 @@ def _gather(
         )
     columns, rows = (next_fast_len(int(n), real=True) for n in needed)
     cloud = deposit((plane - low) / step, power, (rows, columns))
-    kernel = np.zeros((rows, columns))
-    disk = _sun_kernel(per_rad, sun_reach, light, step)
-    kernel[: disk.shape[0], : disk.shape[1]] = disk
-    kernel = np.roll(kernel, (-(disk.shape[0] // 2), -(disk.shape[1] // 2)), axis=(0, 1))
-    fy, fx = np.fft.fftfreq(rows, step)[:, None], np.fft.rfftfreq(columns, step)
-    exponent = (
-        covariance[0, 0] * fx**2 + 2.0 * covariance[0, 1] * fx * fy + covariance[1, 1] * fy**2
-    )
-    spectrum = rfft2(cloud) * rfft2(kernel) * np.exp(-2.0 * np.pi**2 * exponent)
+    blur = np.exp(slope_error**2 * slope_exponent(spread, (rows, columns), step))
+    spectrum = rfft2(cloud) * blur_response(spread, light, (rows, columns), step) * blur
     flux = np.maximum(irfft2(spectrum, s=(rows, columns)), 0.0)
     flux[flux < 1e-9 * flux.max()] = 0.0  # rounding residue
     return Beam(flux, step, low).of_power(float(power.sum()))
+
+
+def blur_response(
+    spread: tuple[FloatArray, float], light: SunShape, shape: tuple[int, int], step: float
+) -> npt.NDArray[np.complex128]:
+    """Return the spectrum of the sun's image from one ray on a grid, as of ``rfft2``."""
+    from scipy.fft import rfft2
+
+    reach = light.radius * np.linalg.norm(spread[0], axis=1)
+    disk = _sun_kernel(spread[0], reach, light, step)
+    kernel = np.zeros(shape)
+    kernel[: disk.shape[0], : disk.shape[1]] = disk
+    half = (-(disk.shape[0] // 2), -(disk.shape[1] // 2))
+    return np.asarray(rfft2(np.roll(kernel, half, axis=(0, 1))))
+
+
+def slope_exponent(
+    spread: tuple[FloatArray, float], shape: tuple[int, int], step: float
+) -> FloatArray:
+    """Return the logarithm of the spectrum of slope errors of 1 rad on a grid, as of ``rfft2``."""
+    per_rad, cosine = spread
+    # A slope error rotates the ray by twice its size in the plane of incidence. Across that plane
+    # it is multiplied by the cosine of incidence as well, because r = 2 (n·s) n − s.
+    sigma = per_rad * (2.0 * np.array([1.0, cosine]))
+    covariance = sigma @ sigma.T
+    fy, fx = np.fft.fftfreq(shape[0], step)[:, None], np.fft.rfftfreq(shape[1], step)
+    exponent = (
+        covariance[0, 0] * fx**2 + 2.0 * covariance[0, 1] * fx * fy + covariance[1, 1] * fy**2
+    )
+    return as_float(-2.0 * np.pi**2 * exponent)
 
 
 def _sun_kernel(per_rad: FloatArray, reach: FloatArray, light: SunShape, step: float) -> FloatArray:
