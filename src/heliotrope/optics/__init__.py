@@ -11,6 +11,7 @@
   year, and their files.
 - `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation, and
   the shift of its centroid by neighbours that shade and block it.
+- `learnt_surface`: the slopes of a mirror, learnt from photographs of its beam.
 - `coverage`: the fraction of a grid's cells that polygons cover (a function of the same name, so it
   stays there).
 - `keep_out`: beams that enter keep-out volumes; `glare`: the eye hazard, for information only.
@@ -68,6 +69,12 @@ from heliotrope.optics.keep_out import (
     safe_way,
     sweep,
 )
+from heliotrope.optics.learnt_surface import (
+    BeamPhotograph,
+    LearntSurface,
+    beam_accuracy,
+    learn_surface,
+)
 from heliotrope.optics.mirror_image import (
     Beam,
     CentroidShift,
@@ -107,6 +114,7 @@ __all__ = [
     "SUN_SHAPES",
     "SUN_SIGMA",
     "Beam",
+    "BeamPhotograph",
     "Beams",
     "Cavity",
     "Cells",
@@ -128,6 +136,7 @@ __all__ = [
     "Hazard",
     "ImageOffsets",
     "Images",
+    "LearntSurface",
     "Lit",
     "Mesh",
     "MirrorOptics",
@@ -142,6 +151,7 @@ __all__ = [
     "Sweep",
     "Way",
     "air_loss",
+    "beam_accuracy",
     "beam_sigma",
     "beams",
     "canted",
@@ -166,6 +176,7 @@ __all__ = [
     "intercept_circle",
     "intercept_disks",
     "intercept_rectangle",
+    "learn_surface",
     "mean_concentration",
     "nearest",
     "reflected_beam",

@@ -196,6 +196,20 @@ def learn_surface(
     return LearntSurface(facets, focal, own, rough, np.array(right))
 
 
+def spread_over_suns(photographs: Sequence[BeamPhotograph], count: int) -> list[int]:
+    """Return the places of up to ``count`` photographs whose suns are far apart, in order.
+
+    The first is nearest to the mean sun; each next is the farthest from those before it.
+    """
+    suns = np.array([p.sun for p in photographs])
+    chosen = [int(np.argmax(suns @ suns.mean(axis=0)))]
+    while len(chosen) < min(count, len(suns)):
+        nearest = (suns @ suns[chosen].T).max(axis=1)
+        nearest[chosen] = np.inf
+        chosen.append(int(np.argmin(nearest)))
+    return sorted(chosen)
+
+
 def _degrees(degree: int) -> list[tuple[int, int]]:
     return [(i, n - i) for n in range(1, degree + 1) for i in range(n + 1)]
 
@@ -240,17 +254,17 @@ class _View:
     ) -> None:
         target, R, sun = photograph.target, photograph.R_enu_mirror, photograph.sun
         half, grid = facets.half_size[0], grid_of(ELEMENTS)
-        points, normals = surface_at(
-            facets, focal, np.broadcast_to(grid, (len(grid), len(half), 2))
-        )
+        places = np.broadcast_to(grid, (len(grid), len(half), 2))
+        points, normals = surface_at(facets, focal, places)
         points, normals = photograph.center + points @ R.T, normals @ R.T
         axes = facets.axes[0, :, :2] @ R.T
-        plane = self._land(target, points, normals, sun)
-        if not np.isfinite(plane).all() or (normals @ sun).min() <= 0.0:
+        hits = target.intersect(points, reflect(sun, normals))
+        if not np.isfinite(hits).all() or (normals @ sun).min() <= 0.0:
             raise InputError(
                 f"surface: the mirror does not send the sun to target {target.name}; check the "
                 "sun and the drive positions of the photograph"
             )
+        plane = target.plane_coordinates(hits)
         # A slope ∂z/∂u tilts the normal against u.
         tiny = 1e-5
         turned = [self._land(target, points, normals - tiny * axes[:, k], sun) for k in range(2)]
