@@ -94,7 +94,7 @@ class LearntSurface:
     @property
     def degree(self) -> int:
         """Highest degree of the polynomials."""
-        return round(np.sqrt(2.0 * self.coefficients.shape[1] + 2.25) - 1.5)
+        return round(float(np.sqrt(2.0 * self.coefficients.shape[1] + 2.25)) - 1.5)
 
     def slopes(self, cells: int = 32) -> FloatArray:
         """Return the map of slope deviations in cells of each facet, rad, (F, cells, cells, 2).
