@@ -1,6 +1,7 @@
 """The surface of a mirror, learnt from its beams: synthetic truth recovered, and real beams."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,9 +83,9 @@ def test_the_gradient_is_that_of_the_misfit(
     single = _View(truth[1][0], FACETS, np.inf, SunShape.of("limb"), 3)
 
     def at(step: float, part: int) -> float:
-        moved = [own, variance, shift]
+        moved: list[Any] = [own, variance, shift]
         moved[part] = moved[part] + step * (by, 1e-6, np.array([0.3, 0.4]))[part]
-        return single.misfit(*moved)[0]  # type: ignore[arg-type]
+        return single.misfit(*moved)[0]
 
     _, by_own, by_variance, by_shift = single.misfit(own, variance, shift)
     wanted = (float((by_own * by).sum()), 1e-6 * by_variance, float(by_shift @ [0.3, 0.4]))
