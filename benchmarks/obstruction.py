@@ -21,7 +21,7 @@ from heliotrope.imaging.synthetic.rendering import (
     exposed,
     render,
 )
-from heliotrope.optics import Beam, Neighbours, centroid_shift, equal_facets, reflected_beam
+from heliotrope.optics import Beam, Mirrors, centroid_shift, equal_facets, reflected_beam
 
 #: Size of the mirrors and distances of their feet across and along the rows, m.
 WIDTH, HEIGHT, ACROSS, ALONG = 3.2, 2.6, 4.5, 5.5
@@ -41,7 +41,7 @@ class Case:
     target: Target
     center: np.ndarray
     sun: np.ndarray
-    neighbours: Neighbours
+    neighbours: Mirrors
 
     def beam(self, *, alone: bool) -> Beam:
         """Return the beam without or with its neighbours."""
@@ -79,8 +79,7 @@ def cases() -> list[Case]:
                     ]
                 )
                 normal = bisector(np.broadcast_to(sun, feet.shape), normalize(receiver - feet))
-                size = np.ones(len(feet))
-                beside = Neighbours(feet, normal, WIDTH * size, HEIGHT * size)
+                beside = Mirrors.of(feet, normal, (WIDTH, HEIGHT), receiver)
                 found.append(Case(target, center, sun, beside))
     return found
 

@@ -230,8 +230,7 @@ def stored_beam(number: int) -> Beam:
             focal=focal,
             facet_focal=focal if rng.random() < 0.5 else np.inf,
             slope_error=rng.uniform(0.4e-3, 1.8e-3),
-            sun_shape=("limb", "pillbox", "buie")[rng.integers(3)],
-            circumsolar=rng.uniform(0.01, 0.05),
+            sun_shape=("limb", "pillbox", f"buie:{rng.uniform(0.01, 0.05)}")[rng.integers(3)],
             step=0.04,
             elements=10,
         )

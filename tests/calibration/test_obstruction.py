@@ -8,7 +8,7 @@ from heliotrope.calibration.obstruction import Unobstructed, unobstructed
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import bisector, normalize
-from heliotrope.optics import Neighbours, reflected_beam
+from heliotrope.optics import Mirrors, reflected_beam
 
 PLANT = malan_plant(60)
 (FIELD,) = PLANT.groups.values()
@@ -26,9 +26,8 @@ def beams(time: float, *, alone: bool) -> Sightings:
     normals = bisector(np.broadcast_to(sun, aims.shape), aims)
     for i in ROWS:
         others = np.flatnonzero(np.arange(60) != i)
-        beside = Neighbours(
-            FIELD.position[others], normals[others], FIELD.width[others], FIELD.height[others]
-        )
+        size = FIELD.width[others], FIELD.height[others]
+        beside = Mirrors.of(FIELD.position[others], normals[others], size, AIM)
         beam = reflected_beam(
             LEFT,
             FIELD.position[i],

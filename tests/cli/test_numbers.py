@@ -63,6 +63,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "view": ("plant.toml", "v.html", "--heliostat", "A1", "--time", NOON, "--every", "4h"),
     "flux": ("flux.toml", "--sun", "0,0.6,0.8", "--cells", "4x8"),
     "aim": ("flux.toml", "--limit", "1e4", "--sun", "0,0.6,0.8", "--cells", "4x8"),
+    "surface": ("plant.toml", ".", "--heliostat", "A1"),
     "image": ("a.png", "--plant", "plant.toml", "--no-pictures", "--processes", "1"),
     "calibrate": ("plant.toml", "--sightings", "s.csv", "--model", "tilt_north,tilt_east"),
     "evaluate": ("plant.toml", "--sightings", "s.csv", "--model", "tilt_north,tilt_east"),

@@ -9,7 +9,14 @@ from benchmarks.obstruction import Case, cases, compare, hidden
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, bisector, direction, normalize, reflect
 from heliotrope.imaging.synthetic.scenes import example_target
-from heliotrope.optics import CentroidShift, Neighbours, centroid_shift, equal_facets
+from heliotrope.optics import (
+    CentroidShift,
+    Mirrors,
+    Scene,
+    Shading,
+    centroid_shift,
+    equal_facets,
+)
 from heliotrope.optics.mirror_surface import mirror_axes
 
 TARGET = example_target()
@@ -25,14 +32,13 @@ def axes(sun: FloatArray = SUN) -> tuple[FloatArray, FloatArray, FloatArray]:
     return tuple(mirror_axes(normal).T)  # type: ignore[return-value]
 
 
-def parallel(*places: FloatArray) -> Neighbours:
+def parallel(*places: FloatArray) -> Mirrors:
     """Mirrors of the same size and normal at places from this one."""
     center = np.array([MIRROR + place for place in places]).reshape(-1, 3)
-    normal = np.broadcast_to(axes()[2], center.shape)
-    return Neighbours(center, normal, np.full(len(center), WIDTH), np.full(len(center), HEIGHT))
+    return Mirrors.of(center, axes()[2], (WIDTH, HEIGHT), TARGET.center)
 
 
-def shift(neighbours: Neighbours, focal: float = np.inf, sun: FloatArray = SUN) -> CentroidShift:
+def shift(neighbours: Mirrors, focal: float = np.inf, sun: FloatArray = SUN) -> CentroidShift:
     facets = equal_facets(WIDTH, HEIGHT, (2, 2), focal)
     normal = axes(sun)[2]
     return centroid_shift(TARGET, MIRROR, sun, normal, facets, neighbours, facet_focal=focal)
@@ -57,8 +63,6 @@ def test_a_flat_mirrors_beam_moves_with_the_middle_of_what_is_left(
     found = shift(parallel(6.0 * light + right * WIDTH * x + up * HEIGHT * y))
     share = (1.0 - abs(right)) * (1.0 - abs(up))
     assert found.hidden == pytest.approx(share, abs=1e-9)
-    expected = (share, 0.0) if way == "sun" else (0.0, share)
-    assert (found.shaded, found.blocked) == pytest.approx(expected, abs=1e-12)
     # What is left is as wide as |right| or |up|, at the other side.
     away = -np.sign(right) * 0.5 * (1 - abs(right)) * (right != 0.0) * WIDTH * x
     away = away - np.sign(up) * 0.5 * (1 - abs(up)) * (up != 0.0) * HEIGHT * y
@@ -75,10 +79,21 @@ def test_a_mirror_behind_or_beside_hides_nothing() -> None:
     assert shift(parallel()).hidden == 0.0
 
 
+def test_only_neighbours_in_the_light_can_hide_a_part() -> None:
+    x, _, _ = axes()
+    around = parallel(0.0 * x, 6.0 * SUN + 0.5 * WIDTH * x, -6.0 * SUN, 1.01 * WIDTH * x)
+    for focal in (np.inf, 180.0):
+        mirrors = around.with_numbers(focal=focal)
+        shading = Shading(Scene(SUN, 0.0, mirrors, ()))
+        assert shading.hiding(0).tolist() == [1]
+        assert shading.hiding(2).tolist() == [0, 1]
+        np.testing.assert_array_equal(mirrors.take(shading.hiding(0)).center, around.center[[1]])
+
+
 def test_a_focused_beam_moves_by_its_astigmatism() -> None:
     """At the incidence θ rays meet at f cos θ in its plane (Coddington): h/4 (cos θ − 1)."""
     half = np.linalg.norm(TARGET.center - MIRROR)
-    for degrees in (4.0, 20.0, 40.0, 60.0):
+    for degrees in (12.0, 20.0, 40.0, 60.0):
         # In the vertical plane of the ray, so that the lower half of the mirror is hidden evenly.
         to_target = normalize(TARGET.center - MIRROR)
         across = np.array([1.0, 0.0, 0.0])
@@ -92,9 +107,9 @@ def test_a_focused_beam_moves_by_its_astigmatism() -> None:
         _, up, normal = axes(sun)
         ray = reflect(sun, normal)
         center = MIRROR + 6.0 * ray - 0.5 * HEIGHT * up
-        below = Neighbours(center[None], normal[None], np.array([9.0]), np.array([HEIGHT]))
+        below = Mirrors.of(center, normal, (9.0, HEIGHT), TARGET.center)
         found = shift(below, half, sun)
-        assert found.blocked == pytest.approx(0.5, abs=0.01)
+        assert found.hidden == pytest.approx(0.5, abs=0.01)
         cos = np.cos(np.radians(degrees))
         wanted = 0.25 * HEIGHT * (1.0 - cos)
         # On the target's plane the ray is oblique.
@@ -119,8 +134,7 @@ def test_a_hidden_mirror_has_no_beam() -> None:
     assert np.isnan(found.shift).all()
     case = cases()[0]
     normal = bisector(case.sun, normalize(case.target.center - case.center))
-    front = (case.center + 0.1 * normal)[None]
-    wall = Neighbours(front, normal[None], np.array([9.0]), np.array([9.0]))
+    wall = Mirrors.of(case.center + 0.1 * normal, normal, (9.0, 9.0), case.target.center)
     walled: Case = replace(case, neighbours=wall)
     with pytest.raises(InputError, match="neighbours hide the whole mirror"):
         walled.beam(alone=False)

@@ -30,10 +30,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.field.formats.frames import mirror_frame
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.geometry import FloatArray, as_float, as_vectors, bisector, normalize, rotation
-from heliotrope.mechanism.chain import Mechanism
 
 IntArray = npt.NDArray[np.intp]
 
@@ -358,24 +356,6 @@ def tiled(
     right = normalize(np.cross((0.0, 1.0, 0.0), out))
     half = 0.5 * width * right, 0.5 * height * np.cross(out, right)
     return MirrorShape(center, *half, as_float(focal))
-
-
-def orientation(mechanism: Mechanism, counts: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return rotations from concentrator coordinates to ENU (..., 3, 3) and vertices (..., 3).
-
-    Parameters
-    ----------
-    mechanism
-        Batch shape (...).
-    counts
-        Counts of the drives, (..., D).
-    """
-    frame = mirror_frame(mechanism.normal)
-    # A mechanism rotates any direction fixed to the mirror in the same way as the normal.
-    right = replace(mechanism, normal=frame[..., 0]).pose(counts)
-    pose = mechanism.pose(counts)
-    up = np.cross(pose.normal, right.normal)
-    return np.stack([right.normal, up, pose.normal], axis=-1), pose.vertex
 
 
 def measured_normal(point: npt.ArrayLike, camera: npt.ArrayLike, led: npt.ArrayLike) -> FloatArray:

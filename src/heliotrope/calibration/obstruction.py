@@ -13,8 +13,10 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, bisector, normalize
+from heliotrope.optics.mirror_image import centroid_shift
 from heliotrope.optics.mirror_surface import equal_facets
-from heliotrope.optics.obstruction import Neighbours, centroid_shift, nearest
+from heliotrope.optics.scene import Mirrors
+from heliotrope.optics.shading import nearest
 
 #: A mirror with unknown facets is assumed to have its distance to the target as focal length, to
 #: within this share.
@@ -102,11 +104,11 @@ def unobstructed(
         i, sun = int(sightings.heliostat[m]), sightings.source[m]
         others = near[i]
         directions = normalize(aims[others] - place[others])
-        beside = Neighbours(
+        beside = Mirrors.of(
             place[others],
             bisector(np.broadcast_to(sun, directions.shape), directions),
-            heliostats.width[others],
-            heliostats.height[others],
+            (heliostats.width[others], heliostats.height[others]),
+            aims[others],
         )
         moved, spread, hidden[m] = shift_of(
             heliostats, i, target, sightings.destination[m], sun, place[i], beside
@@ -138,7 +140,7 @@ def shift_of(
     centroid: FloatArray,
     sun: FloatArray,
     center: FloatArray,
-    neighbours: Neighbours,
+    neighbours: Mirrors,
     *,
     unknown: float = UNKNOWN,
 ) -> tuple[FloatArray, npt.NDArray[np.float64], float]:
@@ -164,20 +166,15 @@ def shift_of(
         Right and up on the target, m, (2,), and m², (2, 2); zeros if nothing is hidden.
     """
     slant = float(np.linalg.norm(centroid - center))
-    direction = (centroid - center) / slant
-    normal = bisector(sun, direction)
-    size = float(heliostats.width[i]), float(heliostats.height[i])
-    hides = neighbours.before(center, normal, size, sun, direction)
-    nothing = np.zeros(2), np.zeros((2, 2)), 0.0
-    if not hides.any():
-        return nothing
-    near = neighbours.of(hides)
+    normal = bisector(sun, (centroid - center) / slant)
     shifts = []
     for focal in (slant, slant / (1.0 + _FOCAL), slant * (1.0 + _FOCAL)):
         facets = _facets(heliostats, i, focal)
-        shifts.append(centroid_shift(target, center, sun, normal, facets, near, facet_focal=focal))
+        shifts.append(
+            centroid_shift(target, center, sun, normal, facets, neighbours, facet_focal=focal)
+        )
         if not shifts[0].hidden:
-            return nothing
+            return np.zeros(2), np.zeros((2, 2)), 0.0
     usual = shifts[0].shift
     other = np.max([np.linalg.norm(candidate.shift - usual) for candidate in shifts[1:]])
     covariance = other**2 * np.eye(2) + unknown**2 * np.outer(usual, usual)

@@ -33,6 +33,7 @@ from heliotrope.cli.plan import plan
 from heliotrope.cli.run.command import GroupedCommand, run
 from heliotrope.cli.simulate import simulate
 from heliotrope.cli.sun import sun
+from heliotrope.cli.surface import surface
 from heliotrope.cli.track import track
 from heliotrope.cli.twin import twin
 from heliotrope.cli.view import view
@@ -75,6 +76,7 @@ app.add_typer(camera_app, name="camera")
 app.command()(flux)
 app.command()(aim)
 app.command()(image)
+app.command()(surface)
 app.command()(calibrate)
 app.command()(plan)
 app.command()(commission)

@@ -1,6 +1,6 @@
 """A plant: site, tower, targets, receivers and the heliostats, group by group."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
@@ -119,13 +119,13 @@ class Plant(Value, Framed):
                 f'aims: strategy "limit" needs a planar or cylindrical receiver, and '
                 f"{self.receivers[0].name} is a {self.receivers[0].kind}; leave [aims] out"
             )
-        self._check_towers()
+        self.check_towers(self.towers)
         if self.timetable:
             check_timetable(self.timetable, self.names, (t.name for t in self.targets))
 
-    def _check_towers(self) -> None:
-        """Refuse a heliostat inside a tower."""
-        for tower in self.towers:
+    def check_towers(self, towers: Sequence[Tower]) -> None:
+        """Raise InputError if a heliostat stands inside one of some towers."""
+        for tower in towers:
             east, north, up = self.position.T
             away = np.hypot(east - tower.east, north - tower.north)
             inside = (away < tower.radius) & (up < tower.top)

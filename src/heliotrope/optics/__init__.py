@@ -9,9 +9,9 @@
   cells; `rays` is an independent check by ray tracing, and `canting` tilts facets.
 - `plant_flux` and `flux_files`: efficiencies and flux of a plant at a sun position, over a day or a
   year, and their files.
-- `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation.
-- `obstruction`: the mirror elements that neighbours shade and block, and the resulting centroid
-  shift.
+- `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation, and
+  the shift of its centroid by neighbours that shade and block it.
+- `learnt_surface`: the slopes of a mirror, learnt from photographs of its beam.
 - `coverage`: the fraction of a grid's cells that polygons cover (a function of the same name, so it
   stays there).
 - `keep_out`: beams that enter keep-out volumes; `glare`: the eye hazard, for information only.
@@ -69,14 +69,21 @@ from heliotrope.optics.keep_out import (
     safe_way,
     sweep,
 )
+from heliotrope.optics.learnt_surface import (
+    BeamPhotograph,
+    LearntSurface,
+    beam_accuracy,
+    learn_surface,
+)
 from heliotrope.optics.mirror_image import (
     Beam,
+    CentroidShift,
+    centroid_shift,
     flat_top_beam,
     gaussian_beam,
     reflected_beam,
 )
 from heliotrope.optics.mirror_surface import equal_facets
-from heliotrope.optics.obstruction import CentroidShift, Neighbours, centroid_shift, nearest
 from heliotrope.optics.offsets import ImageOffsets, image_offsets, target_offsets
 from heliotrope.optics.plant_flux import (
     EFFICIENCIES,
@@ -92,7 +99,7 @@ from heliotrope.optics.plant_scene import scene_of
 from heliotrope.optics.rays import RayTrace, trace
 from heliotrope.optics.receiver_flux import Efficiencies, FieldFlux, Images
 from heliotrope.optics.scene import FacetTable, Mirrors, Scene
-from heliotrope.optics.shading import Lit, Shading
+from heliotrope.optics.shading import Lit, Shading, nearest
 from heliotrope.optics.sun_shape import SUN_SHAPES, Gaussians, SunShape, sun_profile
 from heliotrope.optics.surfaces import Cavity, Cells, Cylinder, Mesh, Plate, Surface, surface_of
 
@@ -107,6 +114,7 @@ __all__ = [
     "SUN_SHAPES",
     "SUN_SIGMA",
     "Beam",
+    "BeamPhotograph",
     "Beams",
     "Cavity",
     "Cells",
@@ -128,11 +136,11 @@ __all__ = [
     "Hazard",
     "ImageOffsets",
     "Images",
+    "LearntSurface",
     "Lit",
     "Mesh",
     "MirrorOptics",
     "Mirrors",
-    "Neighbours",
     "PlantFlux",
     "Plate",
     "RayTrace",
@@ -143,6 +151,7 @@ __all__ = [
     "Sweep",
     "Way",
     "air_loss",
+    "beam_accuracy",
     "beam_sigma",
     "beams",
     "canted",
@@ -167,6 +176,7 @@ __all__ = [
     "intercept_circle",
     "intercept_disks",
     "intercept_rectangle",
+    "learn_surface",
     "mean_concentration",
     "nearest",
     "reflected_beam",

@@ -581,3 +581,20 @@ def touched(spans, near, moved, into):
             if moved[near[k]]:
                 into[i] = True
                 break
+
+
+@njit(**OPTIONS)
+def hiding(i, mirrors, sun, rays, reaches, near, spans, into):
+    """Mark the mirrors whose outline, along the sunlight or the beam, overlaps mirror i."""
+    corners, spare, polygon = np.empty((CORNERS, 3)), np.empty((CORNERS, 3)), np.empty((CORNERS, 2))
+    straight, bend = np.zeros((3, 2)), np.zeros((3, 2))
+    bend_of(mirrors[i], sun, bend)
+    for k in range(spans[i, 0], spans[i, 2]):
+        j, shades = near[k], k < spans[i, 1]
+        m = _mirror_corners(i, j, mirrors, corners)
+        if shades:
+            m = _carry(i, mirrors, sun, straight, np.inf, corners, m, spare, polygon)
+        else:
+            m = _carry(i, mirrors, rays[i], bend, reaches[i], corners, m, spare, polygon)
+        if m:
+            into[j] = True

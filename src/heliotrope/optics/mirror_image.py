@@ -21,9 +21,10 @@ from heliotrope.geometry import (
 )
 from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.optics.coverage import coverage
-from heliotrope.optics.mirror_surface import elements_of, equal_facets, mirror_axes
-from heliotrope.optics.obstruction import Neighbours
-from heliotrope.optics.sun_shape import AUREOLE_RADIUS, PROFILES, sun_profile
+from heliotrope.optics.mirror_surface import equal_facets, grid_of, mirror_axes, surface_at
+from heliotrope.optics.scene import FacetTable, Mirrors, Scene
+from heliotrope.optics.shading import Shading
+from heliotrope.optics.sun_shape import SunShape
 
 #: A Gaussian is drawn to this many σ; 4e-6 of a two-dimensional Gaussian lies beyond.
 _REACH = 5.0
@@ -31,6 +32,8 @@ _REACH = 5.0
 _LARGEST = 4096
 #: Samples of several beams must coincide on one grid to within this share of a step.
 _ALIGNED = 1e-6
+#: Share of a mirror below which nothing counts as hidden: rounding of the clipped areas.
+_SPECK = 1e-9
 
 
 @dataclass(frozen=True)
@@ -317,11 +320,10 @@ def reflected_beam(
     focal: float | None = None,
     facet_focal: float | None = None,
     slope_error: float = 1e-3,
-    sun_shape: str = "limb",
-    circumsolar: float = 0.05,
+    sun_shape: str | SunShape = "limb",
     reflectivity: float = 0.9,
     dni: float = 900.0,
-    neighbours: Neighbours | None = None,
+    neighbours: Mirrors | None = None,
     step: float = 0.02,
     elements: int = 24,
 ) -> Beam:
@@ -355,14 +357,12 @@ def reflected_beam(
     slope_error
         Standard deviation of the surface normal per axis, rad.
     sun_shape
-        "pillbox", "limb" or "quartic" (limb darkening), or "buie" (with aureole).
-    circumsolar
-        Parameter χ of Buie's shape, approximately the circumsolar ratio, 0.01 to 0.8.
+        Shape of the sun, or its name; see `SunShape`.
     reflectivity, dni
         Reflectivity (0 to 1) and irradiance (W/m²). Their product with the area and the cosine of
         incidence is the power; atmospheric attenuation is not included.
     neighbours
-        Mirrors that shade and block elements of this mirror; None: no shading or blocking.
+        Mirrors that shade and block parts of this mirror; None: no shading or blocking.
     step
         Grid step, m.
     elements
@@ -381,7 +381,8 @@ def reflected_beam(
     and linear in the angles. At an angle φ between the beam and the target normal, this neglects a
     shift of about d tan φ / cos φ · σ² (0.4 mm at d = 200 m, φ = 30°, σ = 1.7 mrad).
     """
-    _reflection_guards(slope_error, sun_shape, circumsolar, reflectivity, dni, step, elements)
+    light = SunShape.of(sun_shape)
+    _reflection_guards(slope_error, reflectivity, dni, step, elements)
     center = _vector(mirror_center, "mirror_center")
     to_sun = normalize(_vector(sun, "sun"), "sun")
     aimed = target.center if aim is None else _vector(aim, "aim")
@@ -400,8 +401,11 @@ def reflected_beam(
         shape = facets
     else:
         shape = equal_facets(width, height, facets, cant)
-    points, normals, areas = elements_of(shape, curve, elements)
-    points, normals = center + points @ R.T, normals @ R.T
+    points, normals, areas = _lit_elements(
+        target, center, R, to_sun, shape, curve, neighbours, elements
+    )
+    if not areas.any():
+        raise InputError("reflected beam: neighbours hide the whole mirror")
     incidence = normals @ to_sun
     rays = reflect(to_sun, normals)
     hits = target.intersect(points, rays)
@@ -411,15 +415,138 @@ def reflected_beam(
             "mirror, and the mirror in front of the target"
         )
     power = reflectivity * dni * areas * incidence
-    if neighbours is not None:
-        power = power * ~(neighbours.hide(points, to_sun) | neighbours.hide(points, rays))
-        if not power.any():
-            raise InputError("reflected beam: neighbours hide the whole mirror")
     ray = normalize(power @ rays)
     distance = float(power @ np.linalg.norm(hits - points, axis=-1) / power.sum())
     plane = target.plane_coordinates(hits)
-    spread = _spread(target, to_sun, R[:, 2], ray, distance)
-    return _gather(plane, power, spread, slope_error, sun_shape, circumsolar, step)
+    spread = ray_spread(target, to_sun, R[:, 2], ray, distance)
+    return _gather(plane, power, spread, slope_error, light, step)
+
+
+@dataclass(frozen=True)
+class CentroidShift:
+    """The effect of neighbours on one beam.
+
+    Attributes
+    ----------
+    shift
+        Centroid with neighbours minus centroid without, right and up on the target plane, m, (2,);
+        NaN if they hide the whole mirror.
+    hidden
+        Fraction of the mirror's area that is shaded, blocked on the way to the target, or both.
+    """
+
+    shift: FloatArray
+    hidden: float
+
+
+def centroid_shift(
+    target: Target,
+    center: FloatArray,
+    sun: FloatArray,
+    normal: FloatArray,
+    facets: Facets,
+    neighbours: Mirrors,
+    *,
+    facet_focal: float = np.inf,
+    elements: int = 4,
+) -> CentroidShift:
+    """Return how far neighbours shift the centroid of a beam.
+
+    The unobstructed part of the mirror has a different centre. The beam of a flat mirror shifts by
+    the same amount. The beam of a mirror focused on the target hardly shifts while light arrives
+    along the axis; at oblique incidence, where the mirror is astigmatic, the beam shifts by a
+    fraction of that amount.
+
+    Parameters
+    ----------
+    target
+        The target; the beam falls on its plane.
+    center, normal
+        Centre of the mirror, ENU metres, and its unit normal, (3,).
+    sun
+        Unit vector to the sun, (3,).
+    facets
+        Facets of one heliostat, with their actual tilts.
+    neighbours
+        Mirrors that may shade or block this mirror.
+    facet_focal
+        Focal length of each facet's own curvature, m.
+    elements
+        Each facet is divided into the square of this number of elements.
+
+    Notes
+    -----
+    The lit part of each element is exact (`Shading`). The shift is that of the central rays,
+    because sun shape and slope errors widen the beam without shifting it. The centroid includes all
+    light, on the target or beside it.
+    """
+    R, centroids, areas = mirror_axes(normal), [], []
+    for beside in (None, neighbours):
+        points, normals, area = _lit_elements(
+            target, center, R, sun, facets, facet_focal, beside, elements
+        )
+        power = area * np.maximum(normals @ sun, 0.0)
+        plane = target.plane_coordinates(target.intersect(points, reflect(sun, normals)))
+        areas.append(float(area.sum()))
+        centroids.append(power @ plane / power.sum() if power.any() else np.full(2, np.nan))
+    hidden = 1.0 - areas[1] / areas[0]
+    if hidden < _SPECK:
+        return CentroidShift(np.zeros(2), 0.0)
+    return CentroidShift(as_float(centroids[1] - centroids[0]), hidden)
+
+
+def _lit_elements(
+    target: Target,
+    center: FloatArray,
+    R: FloatArray,
+    sun: FloatArray,
+    facets: Facets,
+    focal: float,
+    neighbours: Mirrors | None,
+    n: int,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the elements of a mirror that are at least partly lit.
+
+    Returns
+    -------
+    tuple
+        Centroids of their lit parts, ENU m, and normals, (E, 3), and lit areas, m², (E,).
+    """
+    half, middle = facets.half_size[0], facets.center[0, :, :2]
+    places = np.broadcast_to(grid_of(n), (n * n, len(half), 2))
+    areas = np.broadcast_to(4.0 * half.prod(axis=-1) / n**2, places.shape[:2])
+    if neighbours is not None and len(neighbours):
+        aim = center + np.linalg.norm(target.center - center) * reflect(sun, R[:, 2])
+        parts = middle + places * half
+        lit = _moments(parts, half / n, Mirrors.of(
+            center, R[:, 2], tuple(2.0 * (np.abs(middle) + half).max(axis=0)), aim,
+            right=R[:, 0], focal=focal,
+        ), neighbours, sun)  # fmt: skip
+        areas = lit[..., 0]
+        places = np.where(areas[..., None] > 0.0, (lit[..., 1:3] - middle) / half, places)
+    points, normals = surface_at(facets, focal, places)
+    some = areas > 0.0
+    return center + points[some] @ R.T, normals[some] @ R.T, as_float(areas[some])
+
+
+def _moments(
+    middle: FloatArray, half: FloatArray, mirror: Mirrors, neighbours: Mirrors, sun: FloatArray
+) -> FloatArray:
+    """Return the moments (E, F, 6; see `Lit`) of parts (E, F, 2) of a mirror beside others."""
+    names = ("center", "normal", "width", "height", "aim", "right", "focal")
+    c, n, width, height, aim, right, focal = (
+        np.concatenate([getattr(mirror, name), getattr(neighbours, name)]) for name in names
+    )
+    # The first kind has the parts; the neighbours are of a kind without any.
+    center, sizes = (
+        np.broadcast_to(value, middle.shape).reshape(1, -1, 2) for value in (middle, half)
+    )
+    center, sizes = (np.concatenate([value, np.zeros_like(value)]) for value in (center, sizes))
+    table = FacetTable(center, np.zeros_like(center), sizes, np.full(center.shape[:2], np.inf))
+    kind = np.minimum(np.arange(len(c)), 1)
+    every = Mirrors.of(c, n, (width, height), aim, right=right, focal=focal)
+    shading = Shading(Scene(sun, 0.0, every.with_facets(table, kind), ()))
+    return shading.lit.moments[: center.shape[1]].reshape(*middle.shape[:2], 6)
 
 
 def _mirror_axes(
@@ -441,7 +568,7 @@ def _mirror_axes(
     return mirror_axes(n)
 
 
-def _spread(
+def ray_spread(
     target: Target, sun: FloatArray, normal: FloatArray, ray: FloatArray, distance: float
 ) -> tuple[FloatArray, float]:
     """Return metres on the plane per rad off the ray (2, 2), and the cosine of incidence.
@@ -464,20 +591,18 @@ def _gather(
     power: FloatArray,
     spread: tuple[FloatArray, float],
     slope_error: float,
-    sun_shape: str,
-    circumsolar: float,
+    light: SunShape,
     step: float,
 ) -> Beam:
     """Return the beam of rays that meet the plane at (E, 2), each spread by sun and slope."""
     from scipy.fft import irfft2, next_fast_len, rfft2
 
     per_rad, cosine = spread
-    radius = AUREOLE_RADIUS if sun_shape == "buie" else SUN_RADIUS
     # A slope error rotates the ray by twice its size in the plane of incidence. Across that plane
     # it is multiplied by the cosine of incidence as well, because r = 2 (n·s) n − s.
     sigma = per_rad * (2.0 * slope_error * np.array([1.0, cosine]))
     covariance = sigma @ sigma.T
-    sun_reach = radius * np.linalg.norm(per_rad, axis=1)
+    sun_reach = light.radius * np.linalg.norm(per_rad, axis=1)
     margin = sun_reach + _REACH * np.sqrt(np.diag(covariance)) + 2.0 * step
     # Samples lie at multiples of the step, so that beams can be added.
     low, high = plane.min(axis=0) - margin, plane.max(axis=0) + margin
@@ -490,45 +615,57 @@ def _gather(
         )
     columns, rows = (next_fast_len(int(n), real=True) for n in needed)
     cloud = deposit((plane - low) / step, power, (rows, columns))
-    kernel = np.zeros((rows, columns))
-    disk = _sun_kernel(per_rad, sun_reach, radius, sun_shape, circumsolar, step)
-    kernel[: disk.shape[0], : disk.shape[1]] = disk
-    kernel = np.roll(kernel, (-(disk.shape[0] // 2), -(disk.shape[1] // 2)), axis=(0, 1))
-    fy, fx = np.fft.fftfreq(rows, step)[:, None], np.fft.rfftfreq(columns, step)
-    exponent = (
-        covariance[0, 0] * fx**2 + 2.0 * covariance[0, 1] * fx * fy + covariance[1, 1] * fy**2
-    )
-    spectrum = rfft2(cloud) * rfft2(kernel) * np.exp(-2.0 * np.pi**2 * exponent)
+    blur = np.exp(slope_error**2 * slope_exponent(spread, (rows, columns), step))
+    spectrum = rfft2(cloud) * blur_response(spread, light, (rows, columns), step) * blur
     flux = np.maximum(irfft2(spectrum, s=(rows, columns)), 0.0)
     flux[flux < 1e-9 * flux.max()] = 0.0  # rounding residue
     return Beam(flux, step, low).of_power(float(power.sum()))
 
 
-def _sun_kernel(
-    per_rad: FloatArray,
-    reach: FloatArray,
-    radius: float,
-    shape: str,
-    circumsolar: float,
-    step: float,
+def blur_response(
+    spread: tuple[FloatArray, float], light: SunShape, shape: tuple[int, int], step: float
+) -> npt.NDArray[np.complex128]:
+    """Return the spectrum of the sun's image from one ray on a grid, as of ``rfft2``."""
+    from scipy.fft import rfft2
+
+    reach = light.radius * np.linalg.norm(spread[0], axis=1)
+    disk = _sun_kernel(spread[0], reach, light, step)
+    kernel = np.zeros(shape)
+    kernel[: disk.shape[0], : disk.shape[1]] = disk
+    half = (-(disk.shape[0] // 2), -(disk.shape[1] // 2))
+    return np.asarray(rfft2(np.roll(kernel, half, axis=(0, 1))))
+
+
+def slope_exponent(
+    spread: tuple[FloatArray, float], shape: tuple[int, int], step: float
 ) -> FloatArray:
+    """Return the logarithm of the spectrum of slope errors of 1 rad on a grid, as of ``rfft2``."""
+    per_rad, cosine = spread
+    # A slope error rotates the ray by twice its size in the plane of incidence. Across that plane
+    # it is multiplied by the cosine of incidence as well, because r = 2 (n·s) n − s.
+    sigma = per_rad * (2.0 * np.array([1.0, cosine]))
+    covariance = sigma @ sigma.T
+    fy, fx = np.fft.fftfreq(shape[0], step)[:, None], np.fft.rfftfreq(shape[1], step)
+    exponent = (
+        covariance[0, 0] * fx**2 + 2.0 * covariance[0, 1] * fx * fy + covariance[1, 1] * fy**2
+    )
+    return as_float(-2.0 * np.pi**2 * exponent)
+
+
+def _sun_kernel(per_rad: FloatArray, reach: FloatArray, light: SunShape, step: float) -> FloatArray:
     """Return the sun's image from one ray, centred and with sum 1."""
     columns, rows = (np.ceil(reach / step).astype(int) + 1).tolist()
-    value = _sun_cells(per_rad, (columns, rows), 1, shape, circumsolar, step)
+    value = _sun_cells(per_rad, (columns, rows), 1, light, step)
     # The limb is sharp, unlike the aureole: cells around the disk are means of 4 × 4 points.
-    j, i = (np.ceil(reach * SUN_RADIUS / radius / step).astype(int) + 1).tolist()
-    inner = _sun_cells(per_rad, (j, i), 4, shape, circumsolar, step)
+    disk = reach * min(SUN_RADIUS / light.radius, 1.0)
+    j, i = (np.ceil(disk / step).astype(int) + 1).tolist()
+    inner = _sun_cells(per_rad, (j, i), 4, light, step)
     value[rows - i : rows + i + 1, columns - j : columns + j + 1] = inner
     return as_float(value / value.sum())
 
 
 def _sun_cells(
-    per_rad: FloatArray,
-    half: tuple[int, int],
-    fine: int,
-    shape: str,
-    circumsolar: float,
-    step: float,
+    per_rad: FloatArray, half: tuple[int, int], fine: int, light: SunShape, step: float
 ) -> FloatArray:
     """Return means of the profile over cells, ``half`` columns and rows to each side of 0."""
     shift = (np.arange(fine) + 0.5) / fine - 0.5
@@ -537,7 +674,7 @@ def _sun_cells(
     theta = np.hypot(
         back[0, 0] * x + back[0, 1] * y[:, None], back[1, 0] * x + back[1, 1] * y[:, None]
     )
-    value = sun_profile(theta, shape, circumsolar)
+    value = light.radiance(theta)
     return as_float(value.reshape(2 * half[1] + 1, fine, 2 * half[0] + 1, fine).mean(axis=(1, 3)))
 
 
@@ -588,21 +725,11 @@ def _above_zero(what: str, value: float, unit: str) -> None:
 
 
 def _reflection_guards(
-    slope_error: float,
-    sun_shape: str,
-    circumsolar: float,
-    reflectivity: float,
-    dni: float,
-    step: float,
-    elements: int,
+    slope_error: float, reflectivity: float, dni: float, step: float, elements: int
 ) -> None:
     name = "reflected beam"
     if not 0.0 <= slope_error < 0.1:
         raise InputError(f"{name}: slope_error {slope_error} rad must be 0 or more, below 0.1")
-    if sun_shape not in PROFILES:
-        raise InputError(f"{name}: sun_shape {sun_shape!r}; known: {', '.join(PROFILES)}")
-    if not 0.01 <= circumsolar <= 0.8:
-        raise InputError(f"{name}: circumsolar {circumsolar} must be from 0.01 to 0.8")
     if not 0.0 < reflectivity <= 1.0:
         raise InputError(f"{name}: reflectivity {reflectivity} must be above 0 and at most 1")
     _above_zero(f"{name}: dni", dni, "W/m²")

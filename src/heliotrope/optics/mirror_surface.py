@@ -43,26 +43,26 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
     return Facets(center[None], half_width[None], half_height[None])
 
 
-def elements_of(facets: Facets, focal: float, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return positions and normals (E, 3) and areas (E,) of the elements, in the mirror's frame.
+def grid_of(n: int) -> FloatArray:
+    """Return the places of n × n equal elements on a facet, from −1 to 1 along it, (E, 1, 2)."""
+    grid = (np.arange(n) + 0.5) / n * 2.0 - 1.0
+    return np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 1, 2)
+
+
+def surface_at(facets: Facets, focal: float, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points on facets and their normals, (E, F, 3), in the mirror's frame.
 
     Parameters
     ----------
     facets
-        Facets of one heliostat.
+        Facets of one heliostat, F.
     focal
         Focal length of each facet's own curvature, m; infinity: flat.
-    n
-        Each facet is divided into the square of this number.
+    places
+        Places on the facets, from −1 to 1 along their width and height, (E, F or 1, 2).
     """
     center, a, b = facets.center[0], facets.half_width[0], facets.half_height[0]
-    grid = (np.arange(n) + 0.5) / n * 2.0 - 1.0
-    s, t = (g.ravel()[:, None, None] for g in np.meshgrid(grid, grid))
-    flat = s * a + t * b
-    cross = np.cross(a, b)
-    normal = normalize(cross, "facets: normal")
+    flat = places[..., :1] * a + places[..., 1:] * b
+    normal = normalize(np.cross(a, b), "facets: normal")
     sag = np.sum(flat**2, axis=-1, keepdims=True) / (4.0 * focal)
-    points = center + flat + sag * normal
-    normals = normalize(normal - flat / (2.0 * focal))
-    areas = np.broadcast_to(4.0 * np.linalg.norm(cross, axis=-1) / n**2, points.shape[:2])
-    return points.reshape(-1, 3), normals.reshape(-1, 3), areas.reshape(-1)
+    return center + flat + sag * normal, normalize(normal - flat / (2.0 * focal))

@@ -91,6 +91,7 @@ def scene_of(
     built = Mirrors.of(vertex, normal, (size[0], size[1]), ends, **mirrors)
     built = shaped(built, plant, focus=focus, slope=slope, reflectivity=reflectivity)
     dark = ~np.asarray(tracking.reachable)
+    plant.check_towers(towers)
     return Scene(light, dni, built, surfaces, (*plant.towers, *towers), dark)
 
 

@@ -191,6 +191,11 @@ class Mirrors:
         changes: dict[str, Any] = {k: _numbers(k, value, count) for k, value in numbers.items()}
         return replace(self, **changes)
 
+    def take(self, rows: npt.NDArray[np.intp]) -> "Mirrors":
+        """Return some of the mirrors, in the order of ``rows`` (M,)."""
+        own = {k: v[rows] for k, v in vars(self).items() if k != "facets" and len(v) == len(self)}
+        return replace(self, **own)
+
     def toward(self, sun: FloatArray, aim: npt.ArrayLike) -> "Mirrors":
         """Return the mirrors rotated about their centres to reflect the sun to other aims.
 

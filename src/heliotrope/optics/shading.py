@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from heliotrope.geometry import FloatArray, as_float, reflect
 from heliotrope.jit import as_input
@@ -26,6 +27,8 @@ from heliotrope.optics import _clip_kernels as kernels
 from heliotrope.optics.scene import Mirrors, Scene
 from heliotrope.parallel import run_blocks
 
+#: Neighbours that can shade or block a mirror.
+NEAREST = 12
 IntArray = npt.NDArray[np.int64]
 #: Allowance for the displacement of a vertex when its mirror moves, m; beyond it the grid is
 #: rebuilt.
@@ -185,6 +188,22 @@ class Shading:
             self._near, self._spans,
         )  # fmt: skip
         return [corners[a:b] for a, b in pairwise(begins)]
+
+    def hiding(self, row: int) -> IntArray:
+        """Return the mirrors that may shade or block a part of one mirror, (J,)."""
+        hides = np.zeros(len(self.table), dtype=np.bool_)
+        kernels.hiding(
+            row, self.table, self._sun, as_input(self._ways), self._reaches, self._near,
+            self._spans, hides,
+        )  # fmt: skip
+        return np.flatnonzero(hides)
+
+
+def nearest(places: FloatArray, count: int = NEAREST) -> npt.NDArray[np.intp]:
+    """Return the indices of the J nearest neighbours of each position (N, 3), (N, J)."""
+    most = min(count + 1, len(places))
+    neighbours = np.asarray(cKDTree(places).query(places, k=most)[1]).reshape(len(places), most)
+    return np.asarray(neighbours[:, 1:], dtype=np.intp)
 
 
 def parts_of(begin: IntArray, rows: IntArray) -> IntArray:

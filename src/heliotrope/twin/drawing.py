@@ -24,9 +24,8 @@ from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.optics import Beam, reflected_beam
 from heliotrope.twin.true_mirrors import NEAR, TrueMirror, within
 
-#: Least unshaded share of a mirror for which a beam is drawn, and the number of elements along a
-#: side of the mirror that determine this share.
-LEAST, _COARSE = 0.05, 6
+#: Least unshaded share of a mirror for which a beam is drawn.
+LEAST = 0.05
 #: Step of the beams' grids, m; a beam is more than ten steps wide.
 _STEP = 0.04
 #: Brightest reading after exposure, as a share of full scale.
@@ -196,7 +195,7 @@ def thrown(
     for mirror in mirrors:
         if not within(target, mirror.on(target, sun), NEAR):
             continue
-        if mirror.lit_centroid(target, sun, _COARSE)[1] < LEAST:
+        if mirror.lit_centroid(target, sun)[1] < LEAST:
             continue
         # Facets are canted at the distance of the target, wherever the mirror looks.
         slant = float(np.linalg.norm(target.center - mirror.vertex))

@@ -8,15 +8,13 @@ import numpy.typing as npt
 
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, reflect
-from heliotrope.optics import Neighbours, centroid_shift, equal_facets
+from heliotrope.optics import Mirrors, Scene, Shading, centroid_shift, equal_facets
 from heliotrope.twin.boards.board import Board
 
 #: Light further from a target's centre than this many half diagonals is left out.
 NEAR = 2.0
 #: Cosine of incidence below which the light of a mirror is too weak to draw.
 GRAZING = 0.05
-#: Number of elements along a side of a mirror, for the computation of its shaded and blocked part.
-_ELEMENTS = 24
 
 
 @dataclass(frozen=True)
@@ -42,15 +40,13 @@ class TrueMirror:
     normal: FloatArray
     width: float = 3.0
     height: float = 2.0
-    neighbours: Neighbours | None = None
+    neighbours: Mirrors | None = None
 
-    def lit_centroid(
-        self, target: Target, sun: FloatArray, elements: int = _ELEMENTS
-    ) -> tuple[FloatArray, float]:
+    def lit_centroid(self, target: Target, sun: FloatArray) -> tuple[FloatArray, float]:
         """Return the beam centroid on a target's plane, ENU, m, (3,), and the mirror's lit share.
 
         NaN and 0 if neighbours hide the whole mirror. The facets are canted at the target's
-        distance, and the mirror is divided into a square grid of elements.
+        distance.
         """
         point = self.on(target, sun)
         if self.neighbours is None or not np.isfinite(point).all():
@@ -65,7 +61,6 @@ class TrueMirror:
             facets,
             self.neighbours,
             facet_focal=slant,
-            elements=elements,
         )
         return point + effect.shift @ target.axes, 1.0 - effect.hidden
 
@@ -124,17 +119,21 @@ def mirrors_near(
         along = ((middle - vertex) @ target.normal) / (rays @ target.normal)
     away = np.linalg.norm(vertex + along[:, None] * rays - middle, axis=-1)
     hits = np.flatnonzero((cosine > GRAZING) & (along > 0.0) & (away <= limit)).tolist()
-    mirrors = []
-    for i in hits:
-        size = float(sizes[i, 0]), float(sizes[i, 1])
-        hiding = None
-        if beside is not None and beside.shape[1]:
-            near = beside[i]
-            others = Neighbours(vertex[near], facing[near], *sizes[near].T)
-            hides = others.before(vertex[i], facing[i], size, sun, rays[i])
-            hiding = others.of(hides) if hides.any() else None
-        mirrors.append(TrueMirror(names[i], vertex[i], facing[i], *size, hiding))
-    return mirrors
+    hiding: dict[int, Mirrors] = {}
+    if beside is not None and beside.shape[1] and hits:
+        rows = np.unique(np.concatenate([np.array(hits), beside[hits].ravel()]))
+        aims = vertex + np.linalg.norm(middle - vertex, axis=-1, keepdims=True) * rays
+        there = Mirrors.of(vertex[rows], facing[rows], tuple(sizes[rows].T), aims[rows])
+        shading = Shading(Scene(sun, 0.0, there, ()))
+        for i, row in zip(hits, np.searchsorted(rows, hits).tolist(), strict=True):
+            if len(others := shading.hiding(row)):
+                hiding[i] = there.take(others)
+    return [
+        TrueMirror(
+            names[i], vertex[i], facing[i], float(sizes[i, 0]), float(sizes[i, 1]), hiding.get(i)
+        )
+        for i in hits
+    ]
 
 
 def within(target: Target, point: FloatArray, share: float = 0.0) -> bool:

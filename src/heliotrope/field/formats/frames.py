@@ -1,9 +1,12 @@
-"""The mirror frame within the last frame of a mechanism, and Euler angles in files."""
+"""The mirror frame within the last frame of a mechanism and in ENU, and Euler angles in files."""
+
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray, as_float, normalize
+from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.kinds import NORTH, UP
 
 
@@ -41,3 +44,21 @@ def euler_matrix(angles: npt.ArrayLike) -> FloatArray:
         (-sy, sx * cy, cx * cy),
     )
     return as_float(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
+
+
+def orientation(mechanism: Mechanism, counts: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return rotations from concentrator coordinates to ENU (..., 3, 3) and vertices (..., 3).
+
+    Parameters
+    ----------
+    mechanism
+        Batch shape (...).
+    counts
+        Counts of the drives, (..., D).
+    """
+    frame = mirror_frame(mechanism.normal)
+    # A mechanism rotates any direction fixed to the mirror in the same way as the normal.
+    right = replace(mechanism, normal=frame[..., 0]).pose(counts)
+    pose = mechanism.pose(counts)
+    up = np.cross(pose.normal, right.normal)
+    return np.stack([right.normal, up, pose.normal], axis=-1), pose.vertex

@@ -29,6 +29,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.drives import SLOTS
+from heliotrope.optics.shading import nearest
 from heliotrope.plant.schedule.settings import Settings
 from heliotrope.sun import Site
 
@@ -310,7 +311,7 @@ class FieldKnowledge:
             self.group[rows], self._place[rows] = g, np.arange(len(rows))
             self.position[rows] = group.position
             self.size[rows] = np.stack([group.width, group.height], axis=1)
-        self.near = neighbours(self.position)
+        self.near = nearest(self.position, NEIGHBOURS)
 
     def __len__(self) -> int:
         return len(self.row)
@@ -381,15 +382,6 @@ class FieldKnowledge:
     def doubt(self, row: int, factor: float) -> None:
         """Multiply the variances of a heliostat by a factor."""
         self._groups[self.group[row]].doubt(int(self._place[row]), factor)
-
-
-def neighbours(position: FloatArray) -> npt.NDArray[np.intp]:
-    """Return the nearest neighbours of each heliostat, (N, K)."""
-    count = len(position)
-    if count < 2:
-        return np.empty((count, 0), dtype=np.intp)
-    _, found = cKDTree(position).query(position, k=min(NEIGHBOURS + 1, count))
-    return np.asarray(found, dtype=np.intp)[:, 1:]
 
 
 def _nearest(places: FloatArray, samples: FloatArray) -> Rows:

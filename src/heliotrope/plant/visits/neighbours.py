@@ -15,7 +15,7 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
-from heliotrope.optics import Neighbours, nearest
+from heliotrope.optics import Mirrors, Scene, Shading, nearest
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.field.state import FieldState
 from heliotrope.plant.visits.photographs import Shot, TargetCamera
@@ -100,15 +100,13 @@ class Unhidden:
         normals, vertices = Armature(plant.beams.armature.table[rows]).pose(angles)
         turns = np.abs(np.asarray(drives.angles(stood.goals[rows])) - angles).max(axis=-1) > _TURNS
         unsure = (turns | (shot.at - stood.at[rows] > _OLD))[1:]
-        beside = Neighbours(vertices[1:], normals[1:], *self._size[rows[1:]].T)
         sun = plant.sun_vector(shot.at - plant.now())
-        way = (shot.point - vertices[0]) / np.linalg.norm(shot.point - vertices[0])
-        size = float(self._size[row, 0]), float(self._size[row, 1])
-        hides = beside.before(vertices[0], normals[0], size, sun, way)
-        if not hides.any():
+        mirrors = Mirrors.of(vertices, normals, tuple(self._size[rows].T), shot.point)
+        hides = Shading(Scene(sun, 0.0, mirrors, ())).hiding(0)
+        if not len(hides):
             return shot
         group, place = plant.design.find(heliostat)
-        unknown = 1.0 if (unsure & hides).any() else UNKNOWN
+        unknown = 1.0 if unsure[hides - 1].any() else UNKNOWN
         shift, spread, hidden = await self._worker(
             partial(shift_of, unknown=unknown),
             group,
@@ -117,7 +115,7 @@ class Unhidden:
             shot.point,
             sun,
             vertices[0],
-            beside.of(hides),
+            mirrors.take(hides),
         )
         if not hidden or not np.isfinite(shift).all():
             return shot
