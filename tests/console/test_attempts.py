@@ -12,6 +12,7 @@ from heliotrope.console._attempts import AN_HOUR, SPAN, SignInFailures
 from heliotrope.console.headers import address_of
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
+from heliotrope.store.records import StoreError
 from support.live_console import PASSWORD, LiveConsole
 
 HOME, AWAY, PROXY = "192.0.2.1", "192.0.2.2", "192.0.2.9"
@@ -191,3 +192,19 @@ def test_a_colleague_signs_in_while_one_is_locked_out(console: LiveConsole) -> N
         assert client.post("session", json=right).status_code == 429  # still too early
     attempts = console.server.app.state.console.attempts
     console.call(lambda: attempts.good("viewer", "127.0.0.1"))
+
+
+def test_a_store_that_fails_counts_as_no_guess(
+    console: LiveConsole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(name: str) -> None:
+        raise StoreError("store: cannot be read (gone)")
+
+    given = {"name": "viewer", "password": PASSWORD}
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        with monkeypatch.context() as patch:
+            patch.setattr(console.keeper.people, "account", gone)
+            answers = [client.post("session", json=given) for _ in range(13)]
+            assert {answer.status_code for answer in answers} == {503}
+            assert "cannot be read (gone)" in answers[0].json()["detail"]
+        assert client.post("session", json=given).status_code == 200
