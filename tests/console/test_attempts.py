@@ -61,6 +61,15 @@ def test_no_hour_has_more_than_twelve_guesses(clock: Clock) -> None:
         assert sum(begin <= at < begin + SPAN for at in times) <= AN_HOUR
 
 
+@pytest.mark.parametrize("most", [3, 40])
+def test_the_number_of_guesses_in_an_hour_is_a_setting(clock: Clock, most: int) -> None:
+    attempts = SignInFailures(clock, an_hour=most)
+    times = guess(attempts, clock, lambda _: ("ada", HOME))
+    hours = [sum(begin <= at < begin + SPAN for at in times) for begin in times]
+    assert max(hours) <= most
+    assert most > 3 or max(hours) == most
+
+
 def test_delays_grow_slowly(clock: Clock) -> None:
     attempts = SignInFailures(clock)
     fail(attempts, "ada", HOME, 4)

@@ -23,6 +23,8 @@ TRUSTED, LONG_TRUSTED = 5.0, 3600.0
 _PAUSE, _PERIOD = 0.25, 2.5
 #: An EMERGENCY, and everyone in the snapshot, waits this long for a read, s.
 _WAITS = 1.0
+#: Others wait this long, s.
+_LONGEST = 5.0
 
 T = TypeVar("T")
 #: "session" or "token", and the SHA-256 of its secret.
@@ -99,14 +101,15 @@ class Roster(Generic[T]):
             If the store does not respond, and the snapshot does not tell.
         """
         key = _key(by, secret)
-        if key not in self._kept or self._at < self._least:
-            await self._next_read()
-        elif self._at < self._now() - TRUSTED:
+        known = key in self._kept and self._at >= self._least
+        if not known or self._at < self._now() - TRUSTED:
             try:
-                async with asyncio.timeout(self._patience()):
+                async with asyncio.timeout(self._patience() if known else _LONGEST):
                     await self._next_read()
             except (HeliotropeError, TimeoutError) as error:
-                return self._last(key, error)
+                if known:
+                    return self._last(key, error)
+                raise _silent(error) from None
         if by == "token" and key in self._kept:
             self._used.add(key[1])
         return self._kept.get(key)
@@ -127,8 +130,7 @@ class Roster(Generic[T]):
         """Return the owner as last known; raises `HeliotropeError` if that is too long ago."""
         last = self._kept.get(key)
         if last is None or self._at < self._now() - LONG_TRUSTED:
-            why = str(error) or "no answer"
-            raise HeliotropeError(f"the store cannot say who this is ({why})") from None
+            raise _silent(error) from None
         return last
 
     async def find_for_emergency(self, by: str, secret: str) -> T | None:
@@ -142,6 +144,11 @@ class Roster(Generic[T]):
     def forget(self) -> None:
         """Accept nobody on the basis of the present snapshot, because something has changed."""
         self._least = self._now()
+        self._wanted.set()
+
+
+def _silent(error: Exception) -> HeliotropeError:
+    return HeliotropeError(f"the store cannot say who this is ({str(error) or 'no answer'})")
 
 
 def _key(by: str, secret: str) -> Key:

@@ -93,7 +93,6 @@ async def _begin(
     now, lifetime = console.now(), console.settings.session_s
     address = console.address(connection)
     secret = await console.ask(lambda: console.people.open_session(name, now, lifetime, address))
-    console.roster.forget()
     await console.note(SecurityEvent.SIGNED_IN, connection, name, detail)
     return secret, now + lifetime
 
