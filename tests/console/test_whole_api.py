@@ -29,10 +29,10 @@ CHECKS = [
     openapi.status_code_conformance,
     openapi.response_schema_conformance,
 ]
-#: Time for the slow test, min; memory that it may take from its first to its last third, MB, and
-#: longest answer of the console meanwhile, s.
+#: Time for the slow test, min; memory that it may take from its first to its last third, MB,
+#: longest answer of the console meanwhile, s, and patience with any answer, s.
 MINUTES = float(os.environ.get("HELIOTROPE_API_MINUTES", "2"))
-GROWTH, ANSWER = 150.0, 5.0
+GROWTH, ANSWER, PATIENCE = 150.0, 5.0, 60.0
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def described(
 ) -> Iterator[tuple[Any, dict[str, dict[str, str]]]]:
     bearers = {role: {"Authorization": f"Bearer {token}"} for role, token in tokens.items()}
     url, headers = f"{console.address}api/v1/openapi.json", bearers["engineer"]
-    yield schemathesis.openapi.from_url(url, headers=headers), {**bearers, "": {}}
+    yield schemathesis.openapi.from_url(url, headers=headers, timeout=PATIENCE), {**bearers, "": {}}
     # Whatever was ordered, the plant and its console are still at work.
     assert httpx.get(f"{console.address}api/v1/health", trust_env=False).json()["ok"]
     summary = httpx.get(f"{console.address}api/v1/summary", headers=headers, trust_env=False)
@@ -68,7 +68,7 @@ def test_each_request_is_answered_as_described(
     schema, headers = described
 
     def take(case: Any) -> None:
-        answer = case.call(headers=headers[role])
+        answer = case.call(headers=headers[role], timeout=PATIENCE)
         case.validate_response(answer, checks=CHECKS)
         if not role and not case.path.endswith(("/health", "/session")):
             assert answer.status_code in (401, 403, 404, 405, 413, 422, 429), case.path
@@ -123,7 +123,7 @@ def bearers(target: Target) -> list[dict[str, str]]:
 def test_use_of_the_whole_api_for_a_long_time(target: Target) -> None:
     people, watch, since = bearers(target), Watch(target), time.time()
     url = f"{target.url}api/v1/openapi.json"
-    schema = schemathesis.openapi.from_url(url, headers=people[-1])
+    schema = schemathesis.openapi.from_url(url, headers=people[-1], timeout=PATIENCE)
     operations = [found.ok() for found in schema.get_all_operations()]
     until, statuses = time.monotonic() + 60.0 * MINUTES, Counter[int]()
     watching = threading.Thread(target=watch.run)
@@ -135,7 +135,7 @@ def test_use_of_the_whole_api_for_a_long_time(target: Target) -> None:
             headers = people[number // len(operations) % len(people)]
 
             def take(case: Any, headers: dict[str, str] = headers) -> None:
-                answer = case.call(headers=headers)
+                answer = case.call(headers=headers, timeout=PATIENCE)
                 statuses[answer.status_code] += 1
                 case.validate_response(answer, checks=CHECKS)
 
