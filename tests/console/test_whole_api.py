@@ -126,6 +126,7 @@ def test_use_of_the_whole_api_for_a_long_time(target: Target) -> None:
     schema = schemathesis.openapi.from_url(url, headers=people[-1], timeout=PATIENCE)
     operations = [found.ok() for found in schema.get_all_operations()]
     until, statuses = time.monotonic() + 60.0 * MINUTES, Counter[int]()
+    begun = [(since, "nothing")]
     watching = threading.Thread(target=watch.run)
     watching.start()
     try:
@@ -135,6 +136,7 @@ def test_use_of_the_whole_api_for_a_long_time(target: Target) -> None:
             headers = people[number // len(operations) % len(people)]
 
             def take(case: Any, headers: dict[str, str] = headers) -> None:
+                begun.append((time.time(), f"{case.method} {case.path}"))
                 answer = case.call(headers=headers, timeout=PATIENCE)
                 statuses[answer.status_code] += 1
                 case.validate_response(answer, checks=CHECKS)
@@ -144,11 +146,14 @@ def test_use_of_the_whole_api_for_a_long_time(target: Target) -> None:
         watch.over.set()
         watching.join()
     rows = target.noted(since)
-    lag, lease = max(row[1] for row in rows), max(row[2] for row in rows)
+    at, lag, _, _ = max(rows, key=lambda row: row[1])
+    lease = max(row[2] for row in rows)
+    during = [what for when, what in begun if when < at][-3:]
     print(
         f"{MINUTES:g} min: {dict(sorted(statuses.items()))}, memory {watch.memory[0]:.0f} to "
         f"{watch.memory[-1]:.0f} MB, growth {watch.growth:.0f} MB, longest answer "
-        f"{max(watch.answers):.2f} s, loop behind {lag:.2f} s, lease {lease:.2f} s"
+        f"{max(watch.answers):.2f} s, loop behind {lag:.2f} s "
+        f"at {during}, lease {lease:.2f} s"
     )
     assert statuses[200] > 100
     assert watch.growth < GROWTH
