@@ -374,9 +374,7 @@ def run(
             every=every,
             plant=PlantSettings(stow_rate=stow_rate),
             evidence=Evidence(syslog, syslog_authority, heads, heads_every),
-            photographs=PictureSettings(
-                min(30.0, photographs_days), photographs_days, 1e9 * photographs_gb
-            ),
+            photographs=PictureSettings(*_kept(photographs_days, photographs_gb)),
         )
         if twin is not None:
             twin.wait()
@@ -390,6 +388,11 @@ def run(
         folder = field if field.is_dir() else field.parent
         choice = PlantChoice(folder, clusters, idle is not False, configure, check)
         run_plant(open_plant(field), choice, shown)
+
+
+def _kept(days: float, gigabytes: float) -> tuple[float, float, float]:
+    """Return for how many days all photographs are kept, then one a day, and their bytes."""
+    return min(30.0, days), days, 1e9 * gigabytes
 
 
 def _measured(heliostats: int) -> int:
