@@ -190,13 +190,13 @@ def test_a_fit_of_many_moves_one_heliostat_by_name() -> None:
     assert moved.deviations["canting"].tolist() == [1e-3] * 3 + [0.0] * 15
     assert moved.deviations["tilt_north"][:3].tolist() == [5e-3] * 3
     for owner in (plant, plant["P6A"], plant.nominal):
-        with pytest.raises(InputError, match="calibration: a dict; give what fit returns"):
+        with pytest.raises(InputError, match="calibration: a dict; pass the result of fit"):
             owner.with_calibration({"canting": 1e-3})  # type: ignore[arg-type]
     with pytest.raises(UnknownNameError, match=plant.names[0]):
         plant[plant.names[0]].with_calibration(fitted)
     with pytest.raises(UnknownNameError, match="fitted"):
         fitted["P9Z"]
-    with pytest.raises(InputError, match="heliostat 15: 15 were fitted"):
+    with pytest.raises(InputError, match="heliostat 15: the fit has 15 heliostats"):
         fitted[15]
     with pytest.raises(InputError, match=r"calibration of 15 heliostats.*fitted\[name\]"):
         plant["P6A"].nominal.with_calibration(fitted)

@@ -82,7 +82,7 @@ def test_a_day_of_a_heliostat_is_drawn_from_the_day_alone(ax: Axes) -> None:
     np.testing.assert_array_equal(
         ax.lines[0].get_xdata(), day.time.tz_localize(None).to_numpy("datetime64[us]")
     )
-    with pytest.raises(InputError, match="the day has its own path; give the day alone"):
+    with pytest.raises(InputError, match="the day has its own path; pass the day alone"):
         plot.day(day, day.path, ax=ax)
     field = ht.track_day(plant(), "2026-09-02", every=timedelta(hours=6))
     with pytest.raises(InputError, match="track one heliostat"):
@@ -144,7 +144,7 @@ def test_a_drift_shows_one_unit_with_its_band(ax: Axes) -> None:
     assert ax.get_ylabel() == "deviation, mrad"
     np.testing.assert_allclose(ax.lines[1].get_ydata(), -2.0)
     assert len(ax.collections) == 2
-    with pytest.raises(InputError, match="mrad and mm; give some of one unit"):
+    with pytest.raises(InputError, match="mrad and mm; choose parameters with the same unit"):
         plot.drift(TIMES, values, spread, names, shown=names, ax=ax)
     with pytest.raises(UnknownNameError, match="no parameter 'tilt_nort'"):
         plot.drift(TIMES, values, spread, names, shown=["tilt_nort"], ax=ax)
@@ -210,7 +210,7 @@ def test_a_mechanism_has_a_slider_of_time() -> None:
     [
         (lambda ax: plot.day(TIMES[:3], tracked(), ax=ax), r"tracked: shape \(12,\) for 3 times"),
         (lambda ax: plot.day(TIMES, np.zeros(3), ax=ax), "tracked: a numpy ndarray"),
-        (lambda ax: plot.day(TIMES, ax=ax), "give a day of track_day alone"),
+        (lambda ax: plot.day(TIMES, ax=ax), "pass a day from track_day alone"),
         (lambda ax: plot.residuals([1.0], np.zeros((2, 2)), ax=ax), r"x: shape \(1,\) for 2"),
         (lambda ax: plot.residuals([1.0], [1.0], ax=ax), r"beam: got the shape \(1,\); expected"),
         (lambda ax: plot.ellipses(np.zeros((3, 2)), np.eye(3), ax=ax), r"covariance: shape \(3"),

@@ -62,7 +62,7 @@ def require(name: str, value: object, kind: type | tuple[type, ...], advice: str
     """
     counted = kind in (numbers.Integral, numbers.Real) and isinstance(value, bool)
     if counted or not isinstance(value, kind):
-        raise InputError(f"{name} is {kind_of(value)}, {shown(value)}; give {advice}")
+        raise InputError(f"{name} is {kind_of(value)}, {shown(value)}; pass {advice}")
 
 
 class FormatError(InputError):

@@ -64,10 +64,12 @@ def as_numbers(
         where = tuple(int(i) for i in np.argwhere(wrong)[0])
         place = f"{name}{list(where)}" if where else name
         if np.isnan(array[where]):
-            raise InputError(f"{place}: nan is not a number; give a number")
+            raise InputError(f"{place}: nan is not a number; pass a number")
         number = f"{array[where]:.6g} {unit}".strip()
         limits = f"{low:.6g} to {high:.6g} {unit}".strip()
-        raise InputError(f"{place}: {number} is not within {limits}; {advice or 'change it'}")
+        raise InputError(
+            f"{place}: {number} is not within {limits}; {advice or 'correct the value'}"
+        )
     return array
 
 
@@ -129,7 +131,8 @@ def common_batch(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, ...]:
             first.setdefault(shape, name)
         listed = ", ".join(f"{name} {shape}" for shape, name in first.items() if shape)
         raise InputError(
-            f"shapes do not broadcast together: {listed}; give one of each, or equally many"
+            f"shapes do not broadcast together: {listed}; pass one of each, or equal numbers of "
+            "them"
         ) from None
 
 
@@ -152,7 +155,7 @@ def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
     # Scaling by the largest component keeps the digits of tiny and huge vectors.
     largest = np.abs(array).max(axis=-1, keepdims=True, initial=0.0)
     if (largest == 0.0).any():
-        raise InputError(f"{name}: a vector of length 0 has no direction; give a direction")
+        raise InputError(f"{name}: a vector of length 0 has no direction; pass a nonzero vector")
     scaled = array / largest
     return as_float(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True))
 
@@ -292,8 +295,8 @@ def _check_origin(origin: tuple[float, float, float]) -> None:
     values = as_numbers(origin, "origin")
     if values.shape != (3,):
         raise InputError(
-            f"origin: {shown(origin)} is not latitude, longitude and height; give two angles in "
-            "degrees and metres"
+            f"origin: {shown(origin)} is not latitude, longitude and height; pass two angles in "
+            "degrees and a height in metres"
         )
     as_numbers(values[0], "origin: latitude", -90.0, 90.0, "°")
     as_numbers(values[1], "origin: longitude", -360.0, 360.0, "°")

@@ -29,7 +29,8 @@ def threads() -> int:
     if text:
         if not text.isdigit() or not 1 <= int(text) <= 1024:
             raise InputError(
-                f"HELIOTROPE_THREADS={text!r}: give a whole number from 1 to 1024, or unset it"
+                f"HELIOTROPE_THREADS must be a whole number from 1 to 1024, not {text!r}; correct "
+                "it or unset it"
             )
         return int(text)
     return len(os.sched_getaffinity(0))

@@ -82,7 +82,7 @@ def _less(root: h5py.File) -> None:
         (_short, "facet1: 4000 points and 3 normals"),
         (_linked, "facet1 has no dataset surface_points"),
         (_flat, "facet3/surface_points: float64 of shape"),
-        (_less, "a map of 3 facets, but the mirror has 4"),
+        (_less, "the map has 3 facets, but the mirror has 4"),
     ],
 )
 def test_a_wrong_file_is_refused(
@@ -96,7 +96,7 @@ def test_a_wrong_file_is_refused(
 def test_a_file_that_is_no_hdf5_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "A.h5"
     path.write_bytes(b"\x89HDF\r\n\x1a\nnothing more")
-    with pytest.raises(FormatError, match="no readable HDF5"):
+    with pytest.raises(FormatError, match="not a readable HDF5 file"):
         read_deflectometry(path, SHAPE.facets, SHAPE.focal)
 
 

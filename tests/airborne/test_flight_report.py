@@ -267,12 +267,12 @@ def test_impossible_reflections_are_refused() -> None:
     assert one()
     for changes, text in (
         ({"facet": -1}, "facet -1 is below 0"),
-        ({"sigma": 0.0}, "sigma 0.0 m must be above 0"),
+        ({"sigma": 0.0}, "sigma must be above 0, not 0.0 m"),
         ({"xy": [[np.nan, 0.0]]}, "xy .* is not finite"),
         ({"camera": [np.inf, 0, 0]}, "camera .* is not finite"),
     ):
         with pytest.raises(InputError, match=text):
             one(**changes)
     table = reflections(0, 3, 0, [[0.0, 0.0]], [0.0, 0, 9], [0.1, 0, 9], 0.01)
-    with pytest.raises(InputError, match="row 3 of 1 names"):
+    with pytest.raises(InputError, match="row 3, but there are only 1 names"):
         write_reflections(Path("x.csv"), table, ("A",))

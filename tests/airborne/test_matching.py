@@ -149,7 +149,7 @@ def test_tables_are_read_row_by_row(case: Case, tmp_path: Path) -> None:
     assert len(lines) == 3
     assert "line 5" in lines[0]
     assert "'top' is not one of upper left" in lines[1]
-    assert "is not a finite number; give pixels" in lines[2]
+    assert "is not a finite number; enter pixels" in lines[2]
     path.write_text(HEAD + "b,,middle,3,4\n")
     with pytest.raises(FormatError, match="no row names a heliostat"):
         read_matches(path, case.stand.names)

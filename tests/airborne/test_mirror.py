@@ -227,10 +227,10 @@ def test_random_surfaces_are_surfaces() -> None:
 @pytest.mark.parametrize(
     ("slope", "text"),
     [
-        (np.zeros((3, 4, 4, 2)), "a map of 3 facets, but the mirror has 4"),
+        (np.zeros((3, 4, 4, 2)), "the map has 3 facets, but the mirror has 4"),
         (np.full((4, 4, 4, 2), 0.4), "400 mrad is above 100 mrad"),
         (np.full((4, 4, 4, 2), np.nan), "facet 0: 100 % of its map is missing"),
-        (np.zeros((4, 4, 2)), "they must be"),
+        (np.zeros((4, 4, 2)), "slopes must have the shape"),
     ],
 )
 def test_wrong_slope_maps_are_refused(slope: np.ndarray, text: str, tmp_path: Path) -> None:
@@ -250,7 +250,7 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
     )
     for name, text in (
         ("other.npz", "no array 'slope' in it, only height"),
-        ("no.npz", "it should be a slope map: an .npz file written by NumPy"),
+        ("no.npz", "expected a slope map: an .npz file written by NumPy"),
         ("part.csv", "1 rows for 4 × 91 × 91 cells"),
         ("half.csv", "are not whole numbers"),
         ("missing.npz", "no such file"),
@@ -267,7 +267,7 @@ def test_wrong_mirrors_are_refused() -> None:
         MirrorShape(whole.center, whole.half_width, whole.half_width, whole.focal)
     with pytest.raises(InputError, match="focal length is 0"):
         rectangle(2.0, 1.0, 0.0)
-    with pytest.raises(InputError, match="slope map of shape"):
+    with pytest.raises(InputError, match="the slope map has"):
         whole.with_slopes(np.zeros((2, 4, 4, 2)))
     with pytest.raises(InputError, match="has holes"):
         whole.with_slopes(np.full((1, 4, 4, 2), np.nan))

@@ -156,9 +156,12 @@ def test_file_refusals(tmp_path: Path, text: str, message: str) -> None:
     ("make", "text"),
     [
         (lambda: KeepOut("k", as_float([[0.0, 0.0]])), "1 corners; specify three or more"),
-        (lambda: KeepOut("k", as_float([[0.0, np.nan]]), 1.0), "give finite"),
-        (lambda: KeepOut("k", as_float([[0.0, 0.0]]), 1.0, 5.0, 5.0), "top 5.0 m must be above"),
-        (lambda: Airspace(margin=-1.0), "margin -1.0 m"),
+        (lambda: KeepOut("k", as_float([[0.0, np.nan]]), 1.0), "specify finite"),
+        (
+            lambda: KeepOut("k", as_float([[0.0, 0.0]]), 1.0, 5.0, 5.0),
+            r"top \(5.0 m\) must be above",
+        ),
+        (lambda: Airspace(margin=-1.0), "margin must be 0 or more, not -1.0 m"),
         (lambda: Airspace(fence=as_float([[0.0, 0.0]])), "fence of shape"),
         (lambda: Airspace(fence=as_float([[0, 0], [9, 9], [9, 0], [0, 9]])), "edges cross"),
         (lambda: KeepOut("k", as_float([[0, 0], [1, 1], [2, 2]])), "enclose no area"),

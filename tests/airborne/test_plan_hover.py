@@ -304,11 +304,11 @@ def test_pattern_keeps_off_the_limits() -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"distance": 0.0}, "distance 0 m: must be above 0"),
-        ({"pointing": 0.2}, "pointing error 200 mrad: must be 0 to 100 mrad"),
-        ({"focal": 0.0}, "focal length 0 m"),
+        ({"distance": 0.0}, "distance must be above 0, not 0 m"),
+        ({"pointing": 0.2}, "pointing error must be between 0 and 100 mrad, not 200"),
+        ({"focal": 0.0}, "focal length must not be 0 m"),
         ({"led_offset": (1.0, np.nan, 0.0)}, "led_offset: use three numbers"),
-        ({"samples": -1.0}, "samples -1: must be above 0"),
+        ({"samples": -1.0}, "samples must be above 0, not -1"),
     ],
 )
 def test_sampling_refuses(change: dict[str, float], text: str) -> None:

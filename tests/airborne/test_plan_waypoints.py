@@ -331,7 +331,7 @@ def test_document_says_when_mirrors_move(plan: FlightPlan) -> None:
     ("name", "read", "text"),
     [
         ("a.csv", read_litchi, "the header is not Litchi's"),
-        ("a.kmz", read_wpml, "not a readable archive; it should be a KMZ with wpmz/template.kml"),
+        ("a.kmz", read_wpml, "not a readable archive; expected a KMZ with wpmz/template.kml"),
         ("a.plan", read_qgc, "not valid JSON"),
     ],
 )

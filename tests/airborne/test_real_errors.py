@@ -71,9 +71,9 @@ def test_drone_leaves_its_pattern_and_knows() -> None:
 
 
 def test_errors_below_zero_are_refused() -> None:
-    with pytest.raises(InputError, match=r"errors: hover -0\.1 must be 0 or more"):
+    with pytest.raises(InputError, match=r"errors: hover must be 0 or more, not -0\.1"):
         Errors(hover=-0.1)
-    with pytest.raises(InputError, match=r"conditions: speed -1\.0 must be 0 or more"):
+    with pytest.raises(InputError, match=r"conditions: speed must be 0 or more, not -1\.0"):
         rendering.Conditions(speed=-1.0)
 
 

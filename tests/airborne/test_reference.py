@@ -218,7 +218,7 @@ def test_the_command_compares(folder: Path, tmp_path: Path) -> None:
     [
         ("heliostat,azimuth_deg\nA,1\n", "there is no column elevation_deg"),
         ("heliostat,azimuth_deg,elevation_deg\nA,1,95\n", "95° is beyond ±90°"),
-        ("heliostat,azimuth_deg,elevation_deg\nA,x,5\n", "is not a finite number; give degrees"),
+        ("heliostat,azimuth_deg,elevation_deg\nA,x,5\n", "is not a finite number; enter degrees"),
         ("heliostat,azimuth_deg,elevation_deg\n", "no rows"),
         ("heliostat,azimuth_deg,elevation_deg\nA,1,5\nA,2,5\n", "heliostat A is listed twice"),
     ],

@@ -193,7 +193,7 @@ def test_guards(change: dict, text: str) -> None:
         ({"counts": [[np.nan, 0.0]]}, r"sighting 0: counts"),
         ({"source": [[0.0, 0.0, 0.0]]}, "source: .*length 0"),
         ({"destination": [[np.inf, 0.0, 0.0]]}, "sighting 0: destination"),
-        ({"sigma": 0.0}, "sigma 0.0 rad must be 1e-06 to 0.2 rad"),
+        ({"sigma": 0.0}, "sigma must be between 1e-06 and 0.2 rad, not 0.0 rad"),
         ({"heliostat": [-1]}, "heliostat -1 is not a heliostat index"),
     ],
 )

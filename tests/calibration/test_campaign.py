@@ -199,9 +199,9 @@ def test_campaign_refusals() -> None:
         plan_campaign([fleet], PLANT.site, (), START, START + DAY)
     with pytest.raises(InputError, match="at least one target"):
         plan_campaign([], *run, START, START + DAY)
-    with pytest.raises(InputError, match="must be 1 or more measurements"):
+    with pytest.raises(InputError, match="count must be 1 measurement or more"):
         plan_campaign([fleet], *run, START, START + DAY, count=0)
-    with pytest.raises(InputError, match="fraction from 0"):
+    with pytest.raises(InputError, match="worth must be 0 or more"):
         plan_campaign([fleet], *run, START, START + DAY, worth=1.0)
     with pytest.raises(InputError, match="finite numbers"):
         plan_campaign([fleet], *run, START, np.inf)
@@ -209,7 +209,7 @@ def test_campaign_refusals() -> None:
         plan_campaign([fleet], *run, START, START + 5.0)
     with pytest.raises(InputError, match="never reaches 10°"):
         plan_campaign([fleet], *run, START + 0.9 * DAY, START + 0.95 * DAY)
-    with pytest.raises(InputError, match="settle -1"):
+    with pytest.raises(InputError, match="settle must be 0 or more"):
         Timing(settle=-1.0)
     with pytest.raises(InputError, match="too short"):
         Timing(0.0, 0.0, 0.0)

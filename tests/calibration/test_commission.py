@@ -215,11 +215,11 @@ def test_tables_and_page_hold_every_visit(
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"shots": 0}, "0 photographs per heliostat"),
-        ({"clear": 0.0}, "clear 0.0 must be above 0 and at most 1"),
-        ({"worth": 1.0}, "worth 1.0: must be a fraction"),
-        ({"sigma": 0.0}, "sigma 0.0 must be above 0"),
-        ({"repeat": -1.0}, "repeat -1.0 must be 0 or more"),
+        ({"shots": 0}, "photographs per heliostat must be 1 or more"),
+        ({"clear": 0.0}, "clear must be above 0 and at most 1, not 0.0"),
+        ({"worth": 1.0}, "worth must be 0 or more and below 1, not 1.0"),
+        ({"sigma": 0.0}, "sigma must be above 0, not 0.0"),
+        ({"repeat": -1.0}, "repeat must be 0 or more, not -1.0"),
     ],
 )
 def test_terms_that_make_no_sense_are_refused(change: dict[str, float], text: str) -> None:
@@ -232,8 +232,8 @@ def test_terms_that_make_no_sense_are_refused(change: dict[str, float], text: st
     [
         ({"least": 1}, "1 to 49 mirrors"),
         ({"first": 3}, "3 in a first visit"),
-        ({"sigma": 0.0}, "sigma 0.0 must be above 0"),
-        ({"tries": 0}, "0 tries"),
+        ({"sigma": 0.0}, "sigma must be above 0, not 0.0"),
+        ({"tries": 0}, "1 or more, not 25.0 s and 0"),
     ],
 )
 def test_joint_visits_that_make_no_sense_are_refused(change: dict[str, float], text: str) -> None:
@@ -403,7 +403,7 @@ def test_receiver_visits_take_the_photographs_and_the_time_of_the_simulated_plan
     assert terms.known == pytest.approx(3e-3)
     known = replace(terms, settings=replace(terms.settings, visit=2.5e-3)).known
     assert known == pytest.approx(np.sqrt(16.0 - 12.5) * 1e-3)
-    with pytest.raises(InputError, match=r"sigma 0\.0 must be above 0"):
+    with pytest.raises(InputError, match=r"sigma must be above 0, not 0\.0"):
         replace(terms, sigma=0.0)
 
 

@@ -328,7 +328,7 @@ def test_the_expected_error_comes_true(possible: CandidateSightings, year: Float
 def test_refusals(possible: CandidateSightings, year: FloatArray) -> None:
     information = precision(FIELD, NAMES)[0]
     own = possible.of(0)
-    with pytest.raises(InputError, match="must be 1 or more"):
+    with pytest.raises(InputError, match="count must be 1 sighting or more"):
         plan_sightings(own, 0, information, year[0])
     with pytest.raises(InputError, match="no candidate"):
         plan_sightings(own.take([]), 3, information, year[0])
@@ -506,8 +506,8 @@ def test_command_campaign(run: Any, plant_file: Path, tmp_path: Path) -> None:
 REFUSED: list[tuple[list[str], str]] = [
     (["--from", "2026-09-02"], "has no time zone"),
     (["--heliostat", "P9Z"], "there is no heliostat 'P9Z'"),
-    (["--days", "0"], "--days '0': give a number from 0.01 to 3,660"),
-    (["--days", "99999"], "--days '99999': give a number from 0.01 to 3,660"),
+    (["--days", "0"], "--days must be a number from 0.01 to 3,660"),
+    (["--days", "99999"], "--days must be a number from 0.01 to 3,660"),
     (["--days", "1", "--to", "2027-01-01T00:00Z"], "not both"),
     (["--to", "2020-01-01T00:00Z"], "is not after --from"),
     (["--every", "1s"], "exceed 200,000"),
@@ -515,13 +515,13 @@ REFUSED: list[tuple[list[str], str]] = [
     (["--target", "x"], "there is no target 'x'"),
     (["--model", "jacks"], "tilt_up"),
     (["--model", "foo"], "there is no model 'foo'"),
-    (["--count", "0"], "--count '0': give a whole number from 1 to"),
-    (["--campaign", "--count", "0"], "--count '0': give a whole number from 1 to"),
-    (["--campaign", "--worth", "2"], "--worth '2': give a number from 0 to 1"),
+    (["--count", "0"], "--count must be a whole number from 1 to"),
+    (["--campaign", "--count", "0"], "--count must be a whole number from 1 to"),
+    (["--campaign", "--worth", "2"], "--worth must be a number from 0 to 1"),
     (["--picture", "a.bmp"], "use one of .png"),
     (["--csv", "nowhere/x.csv"], "there is no folder nowhere"),
     (["--sightings", "no.csv"], "no such file"),
-    (["--sigma-mrad", "nan"], "--sigma-mrad 'nan': give a number from 0.001"),
+    (["--sigma-mrad", "nan"], "--sigma-mrad must be a number from 0.001"),
     (["--from", "2026-09-02T20:00Z", "--to", "2026-09-02T22:00Z"], "no measurement is possible"),
     (
         ["--campaign", "--from", "2026-09-02T20:00Z", "--to", "2026-09-02T22:00Z"],

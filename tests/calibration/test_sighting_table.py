@@ -357,8 +357,8 @@ BAD: list[tuple[str, int, str, str]] = [
     ("no time", 1, "noon", "column time: 'noon' is not an ISO 8601 time; write it like"),
     ("no day", 1, "2026-02-30T12:00Z", "column time: '2026-02-30T12:00Z' is not a valid time (day"),
     ("unknown kind", 2, "camera", "column kind: there is no kind of sighting 'camera'; did you"),
-    ("no count", 3, "", "column count_1: the cell is empty; give drive counts"),
-    ("words", 4, "two", "column count_2: 'two' is not a finite number; give drive counts"),
+    ("no count", 3, "", "column count_1: the cell is empty; enter drive counts"),
+    ("words", 4, "two", "column count_2: 'two' is not a finite number; enter drive counts"),
     ("underscore", 4, "1_000", "column count_2: '1_000' is not a finite number"),
     ("decimal comma", 5, '"0,5"', "column source_east: '0,5' is not a finite number; write a"),
     ("NaN", 6, "nan", "column source_north: 'nan' is not a finite number"),
@@ -372,7 +372,7 @@ BAD: list[tuple[str, int, str, str]] = [
     ("wide sigma", 13, "500", "column sigma_mrad: 500 mrad is outside 0.001 to 200 mrad"),
     ("tiny sigma", 13, "1e-300", "column sigma_mrad: 1e-300 mrad is outside 0.001 to 200 mrad"),
     ("sigma in rad", 13, "0.0003", "column sigma_mrad: 0.0003 mrad is outside 0.001 to 200 mrad"),
-    ("no sigma", 13, "", "column sigma_mrad: the cell is empty; give the ray's standard"),
+    ("no sigma", 13, "", "column sigma_mrad: the cell is empty; enter the ray's standard"),
     ("half a covariance", 15, "", "column destination_cov_en: the cell is empty; enter m² of a"),
     ("no variance", 14, "-1e-4", "column destination_cov_ee to destination_cov_uu: [-0.0001, "),
     ("not definite", 15, "2e-4", "is not a covariance (not positive semidefinite); correct it"),
@@ -470,7 +470,7 @@ def test_parquet_rows_are_named_too(tmp_path: Path) -> None:
         ("sigma_mrad", "sigma_mm", "there is no column sigma_rad"),
         ("destination_cov_nu", "cov_nu", "there is no column destination_cov_nu"),
         ("count_2", "count_b", "column count_b is not known; did you mean count_2?"),
-        ("kind", "sigma_rad", "sigma is given in rad and mrad; keep one column"),
+        ("kind", "sigma_rad", "sigma is specified both in rad and in mrad; keep one column"),
         ("time", "kind", "column kind occurs twice; name each column once"),
         ("kind", "", "column 3 has no name"),
         ("heliostat", '"a\nb"', "there is no column heliostat; add it. There are a b, time,"),
@@ -489,7 +489,7 @@ def test_an_unusable_table_is_refused(old: str, new: str, says: str, tmp_path: P
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("s.csv", None, "no such file; give the path of a table of sightings"),
+        ("s.csv", None, "no such file; specify the path of a table of sightings"),
         ("s.csv", b"", "the file is empty"),
         ("s.csv", b"\n\n \n", "the file has no rows"),
         ("s.csv", b"\x7fELF\0\0", "the file is binary"),
@@ -528,7 +528,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
     seen, kinds = _awkward()
     path = tmp_path / "s.csv"
     path.write_text("before")
-    with pytest.raises(InputError, match="row 2 of 2 names"):
+    with pytest.raises(InputError, match="row 2, but there are only 2 names"):
         write_sightings(path, seen, NAMES[:2])
     with pytest.raises(InputError, match="A: the name occurs twice"):
         write_sightings(path, seen, ("A", "B", "A"))
@@ -582,7 +582,7 @@ MALAN_GOOD = "2026-06-21T12:00:00Z;30;45;0.25;-0.5;1000;2000"
     ("old", "new", "says"),
     [
         ("00Z", "00", "column timestamp: 2026-06-21T12:00:00 has no time zone; append Z"),
-        ("2026-06-21T12:00:00Z", "", "column timestamp: the cell is empty; give a time in ISO"),
+        ("2026-06-21T12:00:00Z", "", "column timestamp: the cell is empty; enter a time in ISO"),
         (";30;", ";400;", "column sun_azimuth_deg: 400° is outside −180° to 360°; use degrees"),
         (";45;", ";95;", "column sun_elevation_deg: 95° is outside −5° to 90°"),
         (
@@ -591,7 +591,7 @@ MALAN_GOOD = "2026-06-21T12:00:00Z;30;45;0.25;-0.5;1000;2000"
             "column horizontal_offset_m: '0,25' is not a finite number; write a point",
         ),
         ("-0.5", "-500", "column vertical_offset_m: -500 m is more than 50 m; is it in another"),
-        ("1000", "", "column azimuth_counts: the cell is empty; give drive counts"),
+        ("1000", "", "column azimuth_counts: the cell is empty; enter drive counts"),
         ("2000", "nan", "column elevation_counts: 'nan' is not a finite number"),
         (";2000", "", "6 cells under 7 columns"),
     ],

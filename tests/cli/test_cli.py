@@ -266,7 +266,7 @@ def test_track_follows_the_sun_with_a_single_axis(call: Any, tmp_path: Path) -> 
     day = json.loads(call(*words, "--time", "2026-06-21T10:00Z", "--every", "3h", "--json"))
     assert day["joints"] == ["rotation"]
     assert any(row["reachable"] for row in day["day"])
-    with pytest.raises(AssertionError, match="give one heliostat with two drives"):
+    with pytest.raises(AssertionError, match="pass one heliostat with two drives"):
         call("view", path, tmp_path / "day.glb", "--heliostat", "HeliostatA")
 
 

@@ -93,7 +93,7 @@ def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> N
         (("--limit=much",), "--limit 'much': use 0.001 to 64000 kW/m²"),
         (("--limit=none.csv",), "none.csv"),
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
-        (("--limit=100", "--wanted=even"), "--wanted 'even': give uniform"),
+        (("--limit=100", "--wanted=even"), "--wanted must be uniform"),
         (("--limit=100", "--time=now"), "--time or --sun"),
         (("--limit=100", "--receiver=other"), "other"),
     ],

@@ -293,12 +293,12 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         ((*TEACH, *points(), "--kind", "dot=disc"), "point dot: a disc needs its size in metres"),
         ((*TEACH, *points(), "--kind", "nose=disc", "--size", "1"), "among those given: 'nose'"),
         ((*TEACH, *points(), "--size", "big"), "'big' is not a number of metres"),
-        ((*TEACH, *points(), "--size", "0"), "size 0.0 m; must be above 0"),
-        ((*TEACH, *points(), "--size", "1", "--size", "2"), "'2': given twice"),
+        ((*TEACH, *points(), "--size", "0"), "size must be above 0, not 0.0 m"),
+        ((*TEACH, *points(), "--size", "1", "--size", "2"), "'2': specified twice"),
         ((*TEACH, *points(), "--size", "dot=1", "--size", "dot=2"), "given twice for point dot"),
         (
             (*TEACH, *points(), "--sigma-px", "0"),
-            "--sigma-px '0': give a number from 0.001 to 1,000",
+            "--sigma-px must be a number from 0.001 to 1,000",
         ),
         ((*TEACH, *points(), "--out", "plant.xml"), "plant.xml: only plant files (TOML)"),
         (
@@ -364,7 +364,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
                 "--square",
                 "-1",
             ),
-            "--square '-1': give a number from 0.001 to 100",
+            "--square must be a number from 0.001 to 100",
         ),
         (
             (

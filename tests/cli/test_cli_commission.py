@@ -81,8 +81,8 @@ def test_the_receiver_is_one_more_place_where_the_plant_file_says_so(
 @pytest.mark.parametrize(
     ("option", "text"),
     [
-        (["--goal-mrad", "0"], "--goal-mrad '0': give a number from 0.001 to 1,000"),
-        (["--together", "0"], "--together '0': give a whole number from 1 to 1,000"),
+        (["--goal-mrad", "0"], "--goal-mrad must be a number from 0.001 to 1,000"),
+        (["--together", "0"], "--together must be a whole number from 1 to 1,000"),
         (["--together", "1", "--first", "8"], "joint visits are switched off; set --together to 2"),
         (["--target", "middle"], "middle"),
         (["--drone", "3"], "3 calibration points: the model malan8 has 8 unknowns"),

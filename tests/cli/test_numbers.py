@@ -272,9 +272,15 @@ def test_every_number_ends_in_a_value_or_in_one_line(
     ("line", "says"),
     [
         (("sun", "--height", "0,5"), "a number from -500 to 9,000 with a point, not a comma (He"),
-        (("sun", "--height", "5 m"), "--height '5 m': give a number from -500 to 9,000 (Height"),
-        (("field", "layout", "radial", "--heliostats", "1.5"), "give a whole number from 1 to 1,"),
-        (("ctl", "reading", "wind", "inf"), "value 'inf': give a number from -1,000,000,000 to"),
+        (
+            ("sun", "--height", "5 m"),
+            "--height must be a number from -500 to 9,000, not '5 m' (Height",
+        ),
+        (
+            ("field", "layout", "radial", "--heliostats", "1.5"),
+            "must be a whole number from 1 to 1,",
+        ),
+        (("ctl", "reading", "wind", "inf"), "value must be a number from -1,000,000,000 to"),
         (("sun", "--every", "123456789012345678901234567890h"), "from 1 s to 1000 h"),
         (("sun", "--every", "0.1s"), "from 1 s to 1000 h"),
         (("parameters", "psi_t=1e300"), "write NAME=VALUE with a number"),

@@ -125,8 +125,8 @@ def test_it_goes_on_alone_within_its_autonomy() -> None:
 @pytest.mark.parametrize(
     ("lease", "text"),
     [
-        (Lease(TOKEN, lifetime=60.0), "lease of 60 s: give 1 to 3 s"),
-        (Lease(TOKEN, lifetime=0.5), "lease of 0.5 s: give 1 to 3 s"),
+        (Lease(TOKEN, lifetime=60.0), "the lease must last 1 to 3 s, not 60 s"),
+        (Lease(TOKEN, lifetime=0.5), "the lease must last 1 to 3 s, not 0.5 s"),
         (Lease(-1), "token -1 and autonomy 0 s: out of range"),
         (Lease(TOKEN, autonomy=-1.0), "autonomy -1 s: out of range"),
     ],

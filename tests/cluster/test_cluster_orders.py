@@ -82,7 +82,10 @@ async def final(field: Field, identity: str, name: str = "A1", limit: float = 15
         (Command("c", "AIM", (1.0, 2.0), token=TOKEN), "AIM: 4 values, 5 needed"),
         (Command("c", "JOG", (0.0, 1.5), token=TOKEN), "JOG, value 4: 1.5 is not a whole number"),
         (Command("c", "LOCK_AIM", (300.0,), token=TOKEN), "300 is not within 0 to 255"),
-        (Command("c", "TRACK", token=TOKEN, lifetime=-1.0), "a lifetime of -1 s"),
+        (
+            Command("c", "TRACK", token=TOKEN, lifetime=-1.0),
+            "the lifetime must be above 0 and at most 3600 s, not -1 s",
+        ),
     ],
 )
 def test_a_command_that_cannot_be_is_refused(command: Command, text: str) -> None:

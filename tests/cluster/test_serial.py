@@ -383,7 +383,7 @@ def test_a_bus_runs_once_and_refuses_what_it_cannot_do(line: Line) -> None:
             await bus.opened()
             with pytest.raises(LinkError, match="it is already running"):
                 await bus.run()
-            with pytest.raises(InputError, match="a timeout of 0 s"):
+            with pytest.raises(InputError, match="the timeout must be above 0, not 0 s"):
                 await bus.transact(b"", 0)
 
     real(main)

@@ -209,7 +209,7 @@ def test_a_name_that_no_path_can_name_gets_no_account(
 ) -> None:
     answer = behind.get("login", headers={"X-Heliotrope-Person": name})
     assert answer.status_code == 422
-    assert "give a name of 1 to 100" in answer.json()["detail"]
+    assert "the name must have 1 to 100" in answer.json()["detail"]
     assert console.keeper.people.account(name) is None
 
 
@@ -252,7 +252,7 @@ def test_files_that_are_refused(tmp_path: Path, change: dict[str, Any], text: st
 def test_it_needs_the_address_of_the_proxy(tmp_path: Path) -> None:
     file = written(tmp_path)
     assert tomllib.loads(FILE)["version"] == 1
-    with pytest.raises(InputError, match="addresses of --proxy only"):
+    with pytest.raises(InputError, match="trusts only the addresses of --proxy"):
         ConsoleSettings(people_by_proxy=file)
     given = ConsoleSettings(people_by_proxy=file, proxies=("::1",))
     assert ConsoleSettings.of(given.values) == given

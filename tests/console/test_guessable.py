@@ -33,7 +33,7 @@ from support.live_console import PASSWORD, LiveConsole
 )
 def test_what_is_guessed_first_is_refused(password: str, reason: str) -> None:
     assert reason in (weakness(password, "anna.smith") or "")
-    with pytest.raises(InputError, match="give another one, as three words"):
+    with pytest.raises(InputError, match="choose a different one, such as three"):
         _secrets.check_password(password, "anna.smith")
 
 

@@ -218,7 +218,7 @@ def test_a_point_is_expected_only_on_the_pixels_of_a_picture(
             lambda p: {**p, "upper_left": p["upper_right"], "upper_right": p["upper_left"]},
             "swapped",
         ),
-        (lambda p: {**p, "upper_left": p["upper_right"]}, "are at the same place"),
+        (lambda p: {**p, "upper_left": p["upper_right"]}, "are in the same place"),
         (lambda p: {**p, "elsewhere": [5.0, 5.0]}, "elsewhere"),
         # A quadrilateral that is not convex.
         (

@@ -65,7 +65,7 @@ def test_the_view_stays_and_orders_ask_again(
     ):
         refused = signed_in.request(method, path, json=body)
         assert refused.status_code == 423, path
-        assert "give your password again" in refused.json()["detail"]
+        assert "enter your password again" in refused.json()["detail"]
     # Safe orders never ask, and are no proof that the person is there.
     for path, safe in (("stow", {"heliostats": []}), ("defocus", {"heliostats": []}),
                        ("commands", {"command": "STOW", "heliostats": []}),

@@ -38,7 +38,7 @@ def test_one_person_takes_few_places() -> None:
     stream = Stream(cast("Any", None), most=100)
     with contextlib.ExitStack() as stack:
         assert taken(stack, stream, lambda _: viewer(1)) == OWN
-        with pytest.raises(BusyError, match=f"{OWN} streams of viewer 1 are open"):
+        with pytest.raises(BusyError, match=f"{OWN} streams of viewer 1 are already open"):
             stack.enter_context(stream.place(viewer(1)))
         stack.enter_context(stream.place(viewer(2)))
     with contextlib.ExitStack() as stack:  # all were given back
@@ -50,7 +50,7 @@ def test_viewers_leave_places_to_operators() -> None:
     with contextlib.ExitStack() as stack:
         assert taken(stack, stream, viewer) == round(100 * (1.0 - RESERVED))
         assert taken(stack, stream, lambda _: OLGA) == OWN
-        with pytest.raises(BusyError, match="100 streams are open"):
+        with pytest.raises(BusyError, match="100 streams are already open"):
             stack.enter_context(stream.place(Person("Otto", Role.OPERATOR)))
 
 

@@ -170,7 +170,7 @@ def test_old_events_are_let_go_once_a_day(tmp_path: Path) -> None:
 
 
 def test_events_are_kept_for_some_time() -> None:
-    with pytest.raises(InputError, match="events are kept for 0"):
+    with pytest.raises(InputError, match="events must be kept for more than 0 days"):
         AutomaticSettings(events=0.0)
 
 

@@ -69,15 +69,27 @@ def test_a_table_is_read_with_its_panels_and_kept_as_a_map(tmp_path: Path) -> No
         ("limit_kw_m2 = 600.0", "", "needs limit_kw_m2, limit_map or limit_table"),
         ("limit_kw_m2 = 600.0", "limit_kw_m2 = -3.0", "limit_kw_m2"),
         ("limit_kw_m2 = 600.0", 'limit_map = "none.csv"', "none.csv"),
-        ("limit_kw_m2 = 600.0", 'limit_kw_m2 = 1.0\nlimit_map = "a.csv"', "give one of them"),
+        (
+            "limit_kw_m2 = 600.0",
+            'limit_kw_m2 = 1.0\nlimit_map = "a.csv"',
+            "exclude each other; keep one",
+        ),
         ("limit_kw_m2 = 600.0", 'limit_table = "a.csv"', "limit_panels belong together"),
-        ("limit_kw_m2 = 600.0", 'limit_map = "b"\nlimit_table = "a.csv"', "give one of them"),
+        (
+            "limit_kw_m2 = 600.0",
+            'limit_map = "b"\nlimit_table = "a.csv"',
+            "exclude each other; keep one",
+        ),
         ('strategy = "limit"', 'strategy = "spread"', 'needs strategy = "limit"'),
         ('strategy = "limit"', 'strategy = "best"', "aims.strategy"),
-        ("margin = 0.1", "margin = 0.7", "a margin of 0.7"),
-        ("probability = 0.95", "probability = 0.3", "probability 0.3 must be from 0.5"),
-        ("moves_per_minute = 12.0", "moves_per_minute = 0", "moves_per_minute 0 must be from 1"),
-        ("deadline_s = 120.0", "deadline_s = 20.0", "deadline_s 20 s must be from 60 to 3600 s"),
+        ("margin = 0.1", "margin = 0.7", "the margin must be between 0 and 0.5, not 0.7"),
+        ("probability = 0.95", "probability = 0.3", "probability must be between 0.5"),
+        ("moves_per_minute = 12.0", "moves_per_minute = 0", "moves_per_minute must be between 1"),
+        (
+            "deadline_s = 120.0",
+            "deadline_s = 20.0",
+            "deadline_s must be between 60 and 3600 s, not 20 s",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(

@@ -29,8 +29,16 @@ def test_the_table_is_written_and_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "text"),
     [
-        ("within_s = 3600.0", "within_s = 59", "within_s 59; use 60 to 604800 (7 days)"),
-        ("within_s = 3600.0", "within_s = 604801", "within_s 604801; use 60 to 604800"),
+        (
+            "within_s = 3600.0",
+            "within_s = 59",
+            "within_s must be between 60 and 604800 (7 days), not 59",
+        ),
+        (
+            "within_s = 3600.0",
+            "within_s = 604801",
+            "within_s must be between 60 and 604800 (7 days), not 604801",
+        ),
         ("within_s = 3600.0", "within = 3600", "approval.within"),
         ("parameters = true", "parameter = true", "did you mean 'parameters'"),
     ],

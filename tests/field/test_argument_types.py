@@ -17,18 +17,24 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: ht.open(5), "path is an int, 5; give the path of a file or folder"),
+        (lambda: ht.open(5), "path is an int, 5; pass the path of a file or folder"),
         (lambda: ht.open(None), "path is a NoneType, None"),
         (lambda: ht.open(""), "path is empty"),
-        (lambda: ht.calibrate("base.csv"), "field is a str, 'base.csv'; give what read_field"),
+        (lambda: ht.calibrate("base.csv"), "field is a str, 'base.csv'; pass the result of"),
         (lambda: ht.calibrate(PLANT), "field is a heliotrope Plant"),
         (lambda: ht.predict(PLANT, None), "learned is a heliotrope Plant"),
         (lambda: ht.read_field_sightings("plant.toml", "plant.toml"), "plant is a str"),
         (lambda: ht.read_field_sightings(PLANT, None), "place is a NoneType"),
         (lambda: ht.read_field_sightings(PLANT, "p", now="today"), "now is a str, 'today'"),
-        (lambda: ht.read_field_sightings(PLANT, "p", now=float("nan")), "now is nan"),
-        (lambda: ht.read_field_sightings(PLANT, "p", centroid="x"), "centroid 'x': use 'utis'"),
-        (lambda: ht.track(ONE, UP, UP, local="no"), "local is a str, 'no'; give True or False"),
+        (
+            lambda: ht.read_field_sightings(PLANT, "p", now=float("nan")),
+            "now must be in Unix seconds, not nan",
+        ),
+        (
+            lambda: ht.read_field_sightings(PLANT, "p", centroid="x"),
+            "centroid must be 'utis' or 'helios', not 'x'",
+        ),
+        (lambda: ht.track(ONE, UP, UP, local="no"), "local is a str, 'no'; pass True or False"),
         (lambda: ht.track(ONE, UP, UP, newton=None), "newton is a NoneType"),
     ],
 )

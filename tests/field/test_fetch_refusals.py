@@ -279,12 +279,12 @@ def test_kinds_and_images_are_checked(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("wrong", "problem"),
     [
-        ({"workers": 0}, "workers 0: must be 1 to 32"),
-        ({"workers": 33}, "workers 33"),
-        ({"timeout": 0.0}, "timeout 0.0 s must be above 0"),
-        ({"timeout": float("nan")}, "timeout nan s"),
-        ({"retries": -1}, "retries -1"),
-        ({"backoff": -0.1}, "backoff -0.1 s"),
+        ({"workers": 0}, "workers must be between 1 and 32, not 0"),
+        ({"workers": 33}, "between 1 and 32, not 33"),
+        ({"timeout": 0.0}, "timeout must be above 0 s"),
+        ({"timeout": float("nan")}, "not nan s"),
+        ({"retries": -1}, "s and -1"),
+        ({"backoff": -0.1}, "-0.1 s and 5"),
     ],
 )
 def test_settings_are_checked(wrong: dict[str, Any], problem: str) -> None:

@@ -34,17 +34,17 @@ WRONG = [
         "<Primary> rotationAngles 90° to -90°: the lower stop",
     ),
     ('normal="0, 1, 0"', 'normal="0, 0, 0"', "<Tracking> normal: a vector of length 0"),
-    ('normal="0, 1, 0"', 'normal="2, 0, 0"', "the normal lies along the secondary axis"),
+    ('normal="0, 1, 0"', 'normal="2, 0, 0"', "the normal is parallel to the secondary axis"),
     (
         '<Aiming point="0, 0, 20"/>',
         "<Tracking/>",
         "<HeliostatKit> AzEl has 2 elements <Tracking>; it needs exactly one",
     ),
-    ('xWidth="2.4"', 'xWidth="-2.4"', "<ApertureRectangular> -2.4 m × 1.8 m: both must be above 0"),
+    ('xWidth="2.4"', 'xWidth="-2.4"', "must both be above 0, not -2.4 m × 1.8 m"),
     (
         '<Facet rotation="90, 0, 180">',
         "<Facet>",
-        "<Facet> rotation: its normal stands 90° from that",
+        "<Facet> rotation: the facet's normal is 90° from the",
     ),
     ('xWidth="2.4"', "", "<ApertureRectangular> has no x; add the attribute"),
     (
@@ -119,21 +119,21 @@ def test_a_truncated_file_is_refused(tmp_path: Path, share: float) -> None:
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.xml"
-    with pytest.raises(FormatError, match="no such file; give the path of a HelioK file"):
+    with pytest.raises(FormatError, match="no such file; specify the path of a HelioK file"):
         heliok.read(path)
     with pytest.raises(FormatError, match="this is a folder"):
         heliok.read(tmp_path)
     path.write_bytes(b"")
-    with pytest.raises(FormatError, match="the file is empty; it should be a HelioK file"):
+    with pytest.raises(FormatError, match="the file is empty; expected a HelioK file"):
         heliok.read(path)
     path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0")
     with pytest.raises(FormatError, match="this is a photograph, not a HelioK file"):
         heliok.read(path)
     path.write_bytes(b"\x7fELF\0\0\0")
-    with pytest.raises(FormatError, match="the file is binary; it should be a HelioK file"):
+    with pytest.raises(FormatError, match="the file is binary; expected a HelioK file"):
         heliok.read(path)
     path.write_text("<svg/>", encoding="utf-8")
-    with pytest.raises(FormatError, match="the root element is <svg>; it should be <HelioK>"):
+    with pytest.raises(FormatError, match="the root element is <svg>; expected <HelioK>"):
         heliok.read(path)
     (tmp_path / "loop.xml").symlink_to(tmp_path / "loop.xml")
     with pytest.raises(FormatError, match="cannot be read"):

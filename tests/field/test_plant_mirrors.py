@@ -215,13 +215,17 @@ BAD_MIRRORS = [
         "",
         "keep one",
     ),
-    ('canting = "slant"', "", "canting and gap_m are of equal facets; add facets"),
+    ('canting = "slant"', "", "canting and gap_m apply only to equal facets; add facets"),
     ("slope_error_mrad = -1", "", "slope_error_mrad"),
-    ("slope_error_mrad = 1", "mirror.slope_error_mrad", "heliostat A2: slope error 0.5 rad must"),
+    ("slope_error_mrad = 1", "mirror.slope_error_mrad", "heliostat A2: slope error must"),
     ("focal_m = 0", "", "focal_m"),
-    ("focal_m = 1", "mirror.focal", "column mirror.focal is no number of the mirror"),
+    ("focal_m = 1", "mirror.focal", "column mirror.focal is not a mirror property"),
     ("reflectivity = 1.1", "", "reflectivity"),
-    ("slope_error_mrad = 1\nslope_error_rad = 1", "", "slope_error_mrad and slope_error_rad; keep"),
+    (
+        "slope_error_mrad = 1\nslope_error_rad = 1",
+        "",
+        "slope_error_mrad and slope_error_rad are both set; keep",
+    ),
     ('slope_maps = "none"', "", "none: no such folder"),
     ("facet_focal_m = [1, 2]", "", "focal length of shape (2, 2) for 2 mirrors of 1 facets"),
     (
@@ -232,7 +236,7 @@ BAD_MIRRORS = [
     (
         f"facets = [2, 2]\n{ONE}",
         "",
-        "facets are given as mirror.facets and mirror.facet; keep one",
+        "facets are specified as mirror.facets and mirror.facet; keep one",
     ),
     (
         f"{ONE}\nfocal_m = 50\n{ONE}",
@@ -259,15 +263,15 @@ def test_a_mirror_that_cannot_be_is_one_line(
 def test_a_slope_map_that_does_not_fit_is_one_line(tmp_path: Path) -> None:
     _maps(tmp_path, (3, 4, 4, 2))
     more = '[groups.a.mirror]\nfacets = [2, 2]\nslope_maps = "maps"\n'
-    with pytest.raises(FormatError, match=r"A1\.npz: a map of 3 facets, but the mirror has 4"):
+    with pytest.raises(FormatError, match=r"A1\.npz: the map has 3 facets, but the mirror has 4"):
         read(tmp_path, more)
     (tmp_path / "maps" / "A1.npz").unlink()
-    with pytest.raises(FormatError, match="no slope map of any heliostat of the group"):
+    with pytest.raises(FormatError, match="no slope map for any heliostat of the group"):
         read(tmp_path, more)
 
 
 def test_columns_of_mirrors_need_the_table(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"columns mirror\.…; add it"):
+    with pytest.raises(FormatError, match=r"columns mirror\.… need this table; add it"):
         read(tmp_path, "", (",mirror.focal_m", ",70", ",80"))
 
 
@@ -343,9 +347,9 @@ SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        ("v 0 0 0\n", "it has no face"),
-        ("v 0 0\n", "line 1: 'v 0 0': give three coordinates in m"),
-        (f"{SQUARE}f 1 2\n", "line 5: 'f 1 2': give three vertex numbers or more"),
+        ("v 0 0 0\n", "the mesh has no faces"),
+        ("v 0 0\n", "line 1: 'v 0 0': expected three coordinates in m"),
+        (f"{SQUARE}f 1 2\n", "line 5: 'f 1 2': expected three vertex numbers or more"),
         (f"{SQUARE}f 1 2 9\n", "a face has vertex 8, but there are only 4"),
         (f"{SQUARE}f 1 1 2\n", "triangle 0 has no area; leave it out"),
     ],
@@ -365,9 +369,15 @@ def test_a_mesh_that_cannot_be_is_one_line(content: str, text: str, tmp_path: Pa
     [
         ('kind = "mesh"\n', "receiver receiver: kind mesh needs mesh, a file"),
         ('kind = "cavity"\n', "kind cavity needs mesh, a file, or radius_m and height_m"),
-        ('kind = "cavity"\nradius_m = 3\nmesh = "m.obj"\n', "mesh and radius_m or opening_angle"),
+        (
+            'kind = "cavity"\nradius_m = 3\nmesh = "m.obj"\n',
+            "mesh cannot be combined with radius_m or opening_angle",
+        ),
         ('mesh = "m.obj"\n', "kind planar takes no mesh; remove it"),
-        ("inner_height_m = 3\n", "inner_height_m is of a cavity's cylindrical wall; remove it"),
+        (
+            "inner_height_m = 3\n",
+            "inner_height_m applies only to a cavity's cylindrical wall; remove it",
+        ),
         ('kind = "cavity"\nradius_m = 3\nopening_angle_rad = 4\n', "opening angle 4 rad"),
         ('kind = "cavity"\nmesh = "front.obj"\n', "reaches 1.000 m in front of the aperture"),
         ('kind = "cavity"\nmesh = "away.obj"\n', "no triangle of its inner surface faces the"),

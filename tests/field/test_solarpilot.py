@@ -136,7 +136,7 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
         ("0,1,2,3,4\n", "5 columns; a layout has 14"),
         (ROW * 2 + "0,1,1,10,20,0\n", "line 3: 6 cells under 14 columns"),
         (ROW.replace("10", "ten"), "line 1, column 4 (Loc. X): 'ten' is not a finite number"),
-        (ROW.replace("10", "nan"), "'nan' is not a finite number; give m from"),
+        (ROW.replace("10", "nan"), "'nan' is not a finite number; enter m from"),
         (ROW.replace("10", "inf"), "'inf' is not a finite number"),
         (ROW.replace("10", "1_0"), "'1_0' is not a finite number"),
         (
@@ -144,7 +144,7 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
             "'10,5' is not a finite number; write a point, not a comma",
         ),
         (ROW.replace("10", "NULL"), "column 4 (Loc. X): 'NULL' is not a finite number"),
-        (ROW.replace("10", ""), "column 4 (Loc. X): the cell is empty; give m"),
+        (ROW.replace("10", ""), "column 4 (Loc. X): the cell is empty; enter m"),
         (
             ROW.replace("2,90", "2,NULL"),
             "column 14 (Aim pt. Z): NULL beside numbers; all 3 columns",
@@ -165,10 +165,10 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
             "'732.3' is neither true nor false; write 0 or 1; with 6 columns a row begins",
         ),
         ("Template,Loc. X,Loc. Y,Loc. Z\n", "there are no heliostats"),
-        (" \n,,,\n\n", "the file has no rows; it should be a table of heliostats"),
-        ("Σ" * 40, "names no position columns; give id,x,y,z (m east, north, up), id,latitude"),
+        (" \n,,,\n\n", "the file has no rows; expected a table of heliostats"),
+        ("Σ" * 40, "names no position columns; use id,x,y,z (m east, north, up), id,latitude"),
         ("NULL\n", "line 1: 1 columns; a layout has 14"),
-        ("", "the file is empty; it should be a table of heliostats (SolarPILOT or OpenCSP)"),
+        ("", "the file is empty; expected a table of heliostats (SolarPILOT or OpenCSP)"),
     ],
 )
 def test_a_wrong_file_gets_one_line(tmp_path: Path, text: str, problem: str) -> None:

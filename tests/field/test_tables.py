@@ -232,9 +232,9 @@ def test_every_table_is_read_in_every_fashion(table: str, fashion: str, tmp_path
     ("number", "says"),
     [
         ("0,25", "write a point, not a comma"),
-        ("1.250,5", "leave out the separators of thousands"),
-        ("1,250.5", "leave out the separators of thousands"),
-        ("1 250.5", "leave out the separators of thousands"),
+        ("1.250,5", "omit the thousands separators"),
+        ("1,250.5", "omit the thousands separators"),
+        ("1 250.5", "omit the thousands separators"),
         ("\u22120.25", "write the minus sign as -"),
         ("٣", "is not a finite number"),
         ("1_0", "is not a finite number"),
@@ -270,9 +270,9 @@ def test_a_decimal_comma_between_commas_is_never_read(table: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("other", "says"),
     [
-        ("Süd1", "Süd1 is the name of line 2 too; names are unique"),
-        ("SÜD 1", "SÜD 1 is the name of line 2 too but for case or blanks (Süd1)"),
-        ("Su\u0308d1", "Süd1 is the name of line 2 too; names are unique"),
+        ("Süd1", "Süd1 is already the name of line 2; each name must be unique"),
+        ("SÜD 1", "SÜD 1 is already the name of line 2 apart from case or blanks (Süd1)"),
+        ("Su\u0308d1", "Süd1 is already the name of line 2; each name must be unique"),
     ],
 )
 @pytest.mark.parametrize("table", ["plant", "layout", "opencsp"])
@@ -303,8 +303,10 @@ def test_field_check_lists_all_wrong_cells_of_a_table(tmp_path: Path) -> None:
     ]
     assert len(found) == 3
     assert found[0].startswith("line 2, column east_m: heliostat A1: '0,5' is not a finite number")
-    assert found[1] == "line 3, column name: a heliostat without a name; give it one"
-    assert found[2].startswith("line 4, column name: heliostat a1: a1 is the name of line 2 too")
+    assert found[1] == "line 3, column name: the heliostat has no name; enter one"
+    assert found[2].startswith(
+        "line 4, column name: heliostat a1: a1 is already the name of line 2"
+    )
 
 
 # -- layouts ---------------------------------------------------------------------------
@@ -351,7 +353,7 @@ def test_degrees_of_a_header_become_metres(tmp_path: Path) -> None:
     [
         (
             "id,x,y\n1,2,3\n",
-            "line 1: the header (id, x, y) names no position columns; give id,x,y,z",
+            "line 1: the header (id, x, y) names no position columns; use id,x,y,z",
         ),
         ("Vorlage,Länge,Höhe,z\n0,1,2,3\n", "the header (Vorlage, Länge, Höhe, z) names no"),
         ("id,lat,lon\n1,37.5,-5.25\n", "the header (id, lat, lon) names no position columns"),
@@ -517,11 +519,11 @@ def test_spoilt_tables_end_in_a_value_or_one_line(tmp_path: Path, data: st.DataO
 @pytest.mark.parametrize(
     ("names", "says"),
     [
-        (("A1", "A1"), "heliostat A1: the name occurs twice; names are unique"),
-        (("A1", "B", "a 1"), "heliostat a 1: there is A1 too; names differ by more than case"),
-        (("\u00e9", "e\u0301"), "too; names differ by more than case and blanks"),
-        (("A", " "), "heliostat: an empty name; each heliostat needs one"),
-        (("A", ""), "heliostat: an empty name"),
+        (("A1", "A1"), "heliostat A1: the name occurs twice; each name must be unique"),
+        (("A1", "B", "a 1"), "heliostat a 1: there is also A1; names must differ by more"),
+        (("\u00e9", "e\u0301"), "names must differ by more than case and blanks"),
+        (("A", " "), "heliostat: a name is empty; each heliostat needs a name"),
+        (("A", ""), "heliostat: a name is empty"),
     ],
 )
 def test_names_differ_at_a_glance(names: tuple[str, ...], says: str) -> None:
@@ -536,12 +538,12 @@ def test_a_plant_refuses_alike_names_over_groups_and_surfaces() -> None:
     plant = example_plant()
     group = next(iter(plant.groups.values()))
     other = replace(group, names=tuple(name.lower() for name in group.names))
-    with pytest.raises(InputError, match="heliostat p1a: there is P1A too"):
+    with pytest.raises(InputError, match="heliostat p1a: there is also P1A"):
         replace(plant, groups={"a": group, "b": other})
     twin = replace(plant.targets[0], name=plant.targets[0].name.upper())
-    with pytest.raises(InputError, match=r"target or receiver .* too; names differ by more"):
+    with pytest.raises(InputError, match=r"target or receiver .* names must differ by more"):
         replace(plant, targets=(plant.targets[0], twin), cameras=())
-    with pytest.raises(InputError, match="target or receiver: an empty name"):
+    with pytest.raises(InputError, match="target or receiver: a name is empty"):
         replace(plant, targets=(replace(twin, name=""),), cameras=())
 
 
@@ -575,16 +577,18 @@ def test_a_full_disk_is_called_full(tmp_path: Path) -> None:
     def write(_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with pytest.raises(InputError, match=r"No space left on device\); free some space, or give a"):
+    with pytest.raises(
+        InputError, match=r"No space left on device\); free some space, or choose a"
+    ):
         write_file(tmp_path / "a.csv", write)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(InputError, match="give a folder that exists"):
+    with pytest.raises(InputError, match="choose a folder that exists"):
         write_file(tmp_path / "none" / "a.csv", lambda stream: stream.write(b""))
 
 
 def test_a_device_or_a_pipe_is_not_replaced(tmp_path: Path) -> None:
     os.mkfifo(pipe := tmp_path / "pipe")
-    with pytest.raises(InputError, match="this is a device or a pipe, not a file; give a file"):
+    with pytest.raises(InputError, match="this is a device or a pipe, not a file; specify a file"):
         write_file(pipe, lambda stream: stream.write(b"a"))
     assert pipe.is_fifo()
     assert list(tmp_path.iterdir()) == [pipe]
@@ -598,7 +602,7 @@ def test_messages_do_not_begin_with_an_empty_name() -> None:
 
 
 def test_a_site_of_another_type_is_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"site is a tuple, \(36.1, -5.2, 10.0\); give Site\(lat"):
+    with pytest.raises(InputError, match=r"site is a tuple, \(36.1, -5.2, 10.0\); pass Site\(lat"):
         open_plant(tmp_path / "layout.csv", site=(36.1, -5.2, 10.0))  # type: ignore[arg-type]
 
 

@@ -308,7 +308,7 @@ BAD: dict[str, tuple[bytes, str]] = {
     "jpeg header only": (JPEG[: JPEG.index(SCAN)] + b"\xff\xd9", "JPEG is damaged (cannot load"),
     "jpeg middle": (_middle(JPEG), "this JPEG is damaged: part of its scan is missing"),
     "jpeg grey middle": (_middle(_encode(".jpg", GREY)), "part of its scan is missing"),
-    "jpeg cmyk": (_cmyk(JPEG), "its colours are CMYK; convert it to RGB or grey"),
+    "jpeg cmyk": (_cmyk(JPEG), "its colours are CMYK; convert the image to RGB or grey"),
     "jpeg twelve": (
         JPEG.replace(b"\xff\xc0\x00\x11\x08", b"\xff\xc0\x00\x11\x0c"),
         "cannot be read (cannot handle 12-bit layers); convert it to a PNG",
@@ -319,9 +319,9 @@ BAD: dict[str, tuple[bytes, str]] = {
         PAGES + _ifd("<", {254: (4, [0])}, len(TIFF)), "this TIFF has several pages"
     ),
     "tiff cmyk": (_tiff(RAMP * 4, t258=[8] * 4, t262=[5], t277=[4]), "its colours are CMYK"),
-    "tiff float": (_tiff(RAMP * 4, t258=[32], t339=[3]), "its pixels are floats of 32 bits"),
-    "tiff signed": (_tiff(RAMP * 2, t258=[16], t339=[2]), "pixels of 16 bits, form 2; convert"),
-    "tiff lab": (_tiff(RAMP * 3, t258=[8] * 3, t262=[8], t277=[3]), "3 channels of kind 8"),
+    "tiff float": (_tiff(RAMP * 4, t258=[32], t339=[3]), "its pixels are 32-bit floats"),
+    "tiff signed": (_tiff(RAMP * 2, t258=[16], t339=[2]), "pixels of 16 bits, format 2; convert"),
+    "tiff lab": (_tiff(RAMP * 3, t258=[8] * 3, t262=[8], t277=[3]), "3 channels, 8;"),
     "tiff no strips": (_tiff(RAMP, t279=[1, 2]), "its TIFF directory lists no strips"),
     "bigtiff": (b"II+\0" + bytes(40), "this is a BigTIFF file; convert it"),
     "bmp half": (BMP[: len(BMP) // 2], "this BMP is truncated"),

@@ -582,9 +582,9 @@ def test_texts_that_are_no_source(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(InputError, match=wanted):
             open_source(text, folder=tmp_path)
-    with pytest.raises(InputError, match="limit 0 frames must be 1 or more"):
+    with pytest.raises(InputError, match="limit must be 1 frame or more, not 0"):
         iter(open_source(str(tmp_path), limit=0))
-    with pytest.raises(InputError, match="poll 0 s must be above 0"):
+    with pytest.raises(InputError, match="poll must be above 0, not 0 s"):
         FolderSource(tmp_path, poll=0)
     with pytest.raises(InputError, match="cannot be read"), FolderSource(tmp_path / "none"):
         pass

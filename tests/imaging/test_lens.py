@@ -227,8 +227,8 @@ GREY = np.full((60, 80), 128, np.uint8)
     [
         ([GREY] * 2, PATTERN, 0.03, r"^2 pictures of a chessboard; pass three or more$"),
         ([GREY] * 3, (2, 6), 0.03, r"2 × 6 inner corners; use 3 to 200 each"),
-        ([GREY] * 3, PATTERN, 0.0, r"squares of 0.0 m; specify their side in metres, above 0"),
-        ([GREY] * 3, PATTERN, float("nan"), r"squares of nan m"),
+        ([GREY] * 3, PATTERN, 0.0, r"the side of a square must be above 0, not 0.0 m"),
+        ([GREY] * 3, PATTERN, float("nan"), r"must be above 0, not nan m"),
         (
             [GREY, GREY, GREY[:, 1:]],
             PATTERN,

@@ -283,12 +283,15 @@ def test_bad_arguments() -> None:
     with pytest.raises(InputError, match="a frame of 15 × 420 px; motion detection needs 16"):
         detect_motion(frame[:, :15], frame[:, :15])
     wrong: list[tuple[str, Callable[[], object]]] = [
-        ("false alarms 0.5 must be", lambda: MotionSettings(false_alarms=0.5)),
-        ("least area -1 px", lambda: MotionSettings(min_area_px=-1)),
-        ("greatest shift nan px", lambda: MotionSettings(max_shift_px=math.nan)),
-        ("ratio of brightness 1.0 must", lambda: MotionSettings(max_ratio=1.0)),
-        ("memory 0.5 and warm-up 5", lambda: MotionDetector(memory=0.5)),
-        ("memory 20.0 and warm-up 0", lambda: MotionDetector(warm_up=0)),
+        (
+            "false alarms must be above 0 and below 0.5, not 0.5",
+            lambda: MotionSettings(false_alarms=0.5),
+        ),
+        ("0 or more, not -1 px", lambda: MotionSettings(min_area_px=-1)),
+        ("and nan px", lambda: MotionSettings(max_shift_px=math.nan)),
+        ("ratio of brightness must be above 1, not 1.0", lambda: MotionSettings(max_ratio=1.0)),
+        ("not 0.5 and 5 frames", lambda: MotionDetector(memory=0.5)),
+        ("not 20.0 and 0 frames", lambda: MotionDetector(warm_up=0)),
     ]
     for text, make in wrong:
         with pytest.raises(InputError, match=text):

@@ -142,7 +142,7 @@ def test_memory_that_is_none_is_refused(tmp_path: Path) -> None:
         Memory.load(tmp_path / "file")
     (tmp_path / "target.npz").write_bytes(b"PK nothing")
     with pytest.raises(
-        FormatError, match="not a readable archive; it should be a model of an empty target"
+        FormatError, match="not a readable archive; expected a model of an empty target"
     ):
         Memory.load(tmp_path)
     with pytest.raises(InputError, match="specify a writable folder"):

@@ -206,7 +206,7 @@ def auto(on: int) -> Frame:
     [
         (lambda: capped(1), lambda: [(frame(4), 0.2)], "shows 0 sides .* brighter than a capped"),
         (frame, list, "no photograph with beams; pass one with its fraction"),
-        (frame, lambda: [(frame(4), 0.0)], "at a share of 0; give above 0 to 2"),
+        (frame, lambda: [(frame(4), 0.0)], "must be above 0 and at most 2"),
         (frame, lambda: [(auto(4), 0.2)], "with one fixed exposure, within a minute"),
         (frame, lambda: [(frame(4, sensor=LONG), 0.2)], "of the receiver is overexposed; use few"),
         (frame, lambda: [(frame(4), 0.2), (frame(8), 0.7)], "check the fractions and the line"),

@@ -476,7 +476,7 @@ FOUR = list(TURNS)
             r"point dot: 640.0, 10.0 is not in the picture of 640 × 480 px",
         ),
         (changed(lambda g: g.update(dot=(float("nan"), 10.0))), r"point dot: nan, 10.0 is not in"),
-        (changed(lambda g: g.update(dot=g["middle"])), r"points middle and dot are at the same"),
+        (changed(lambda g: g.update(dot=g["middle"])), r"points middle and dot are in the same"),
         (changed(mirror), r"are mirrored in the picture; check whether left and right are swapped"),
         (
             changed(lambda g: exchange(g, "upper_left", "upper_right")),
@@ -508,7 +508,7 @@ def test_other_refusals(frame: Frame) -> None:
     given = clicked(ALL)
     with pytest.raises(UnknownNameError, match="there is no target 'targte'; did you mean target"):
         teach(BARE, "targte", frame, given)
-    with pytest.raises(InputError, match=r"sigma 0.0 px; must be above 0"):
+    with pytest.raises(InputError, match=r"sigma must be above 0, not 0.0 px"):
         teach(BARE, "target", frame, given, sigma=0.0)
     with pytest.raises(UnknownNameError, match="among those given: 'upper_lef'; did you mean"):
         teach(BARE, "target", frame, given, wishes={"upper_lef": Wish("picture")})
@@ -531,9 +531,9 @@ def test_other_refusals(frame: Frame) -> None:
         ("star", 0.1, None, r"kind 'star' cannot be taught; known: corner, tee, square, disc, pic"),
         ("tag", 0.1, None, "kind 'tag' cannot be taught"),
         ("corner", None, None, r"a corner needs its size in metres \(--size\)"),
-        ("disc", 0.0, None, r"size 0.0 m; must be above 0"),
-        (None, float("nan"), None, r"size nan m; must be above 0"),
-        ("corner", 0.4, -0.1, r"stroke -0.1 m; must be above 0"),
+        ("disc", 0.0, None, r"size must be above 0, not 0.0 m"),
+        (None, float("nan"), None, r"size must be above 0, not nan m"),
+        ("corner", 0.4, -0.1, r"stroke must be above 0, not -0.1 m"),
     ],
 )
 def test_wishes_that_cannot_be(kind: Any, size: Any, stroke: Any, text: str) -> None:
@@ -670,8 +670,8 @@ def test_cancelling_ends_it_too(asked: Asked) -> None:
         (b"{", "the reply is not JSON"),
         (b"[]", 'the reply has no "points"'),
         (b'{"points": []}', 'the reply has no "points"'),
-        (b'{"points": {"nose": [1, 2]}}', "point 'nose' was not asked for"),
-        (b'{"points": {"dot": [1, 2]}}', "point 'dot' was not asked for"),
+        (b'{"points": {"nose": [1, 2]}}', "point 'nose' was not requested"),
+        (b'{"points": {"dot": [1, 2]}}', "point 'dot' was not requested"),
         (b'{"points": {"middle": [1]}}', "point middle: enter two numbers"),
         (b'{"points": {"middle": [1, "2"]}}', "point middle: enter two numbers"),
         (b'{"points": {"middle": [true, 2]}}', "point middle: enter two numbers"),

@@ -44,28 +44,28 @@ def test_a_step_out_of_order_is_refused(
     assert keys_bus(monkeypatch, "list", file) != 0
     assert "create it with heliotrope keys bus new" in capsys.readouterr().err
     found = BusKeyFile(file)
-    with pytest.raises(InputError, match="it has no key; say"):
+    with pytest.raises(InputError, match="it has no key; run"):
         found.rotate()
     found.new()
-    with pytest.raises(InputError, match=r"has a key already; .* keys bus rotate"):
+    with pytest.raises(InputError, match=r"already has a key; .* keys bus rotate"):
         found.new()
     with pytest.raises(InputError, match="no old key beside a new one"):
         found.end()
     found.rotate()
-    with pytest.raises(InputError, match="two keys already; say"):
+    with pytest.raises(InputError, match="already has two keys; run"):
         found.rotate()
 
 
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("keys = 3\n", "give keys alone, a list of at most 2"),
+        ("keys = 3\n", "only keys, a list of at most 2"),
         ("", "the file is empty"),
-        ('key = ["00"]\n', "give keys alone"),
-        ('keys = ["abc"]\n', "not a key; give 16 bytes"),
+        ('key = ["00"]\n', "the file must contain only keys"),
+        ('keys = ["abc"]\n', "not a key; a key has 16 bytes"),
         ('keys = ["zz112233445566778899aabbccddeeff"]\n', "not a key"),
         ('keys = ["' + "00" * 16 + '"]\n', "not a key"),
-        ('keys = ["' + '", "'.join(["ab" * 16] * 2) + '"]\n', "the same key twice"),
+        ('keys = ["' + '", "'.join(["ab" * 16] * 2) + '"]\n', "a key occurs twice"),
         ('keys = ["' + '", "'.join(["ab" * 16] * 3) + '"]\n', "a list of at most 2"),
         ("keys = [1]\n", "not a key"),
     ],
@@ -85,7 +85,7 @@ def test_two_commands_at_once_lose_no_key(tmp_path: Path) -> None:
     BusKeyFile(file).new()
     one, two = BusKeyFile(file), BusKeyFile(file)
     one.rotate()
-    with pytest.raises(InputError, match="another command has changed it meanwhile"):
+    with pytest.raises(InputError, match="another command has changed the file in the meantime"):
         two.rotate()
     assert BusKeyFile(file).keys == one.keys
 

@@ -83,11 +83,11 @@ def test_a_request_names_the_hosts_and_proves_the_key(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "days", "text"),
     [
-        ((), 10, "give the name that people type"),
-        (("*.example.org",), 10, "is no host name"),
-        (("a b",), 10, "is no host name"),
-        (("x" * 64 + ".org",), 10, "is no host name"),
-        (NAMES, 826, "826 days; give 1 to 825"),
+        ((), 10, "specify the name that users type"),
+        (("*.example.org",), 10, "is neither a host name"),
+        (("a b",), 10, "is neither a host name"),
+        (("x" * 64 + ".org",), 10, "is neither a host name"),
+        (NAMES, 826, "must be 1 to 825 days"),
     ],
 )
 def test_what_is_refused_writes_nothing(

@@ -66,7 +66,7 @@ def test_new_keys_are_private_and_never_overwritten(tmp_path: Path) -> None:
     assert mode(path) == 0o600
     assert Keys(path, CLUSTERS).members == {name: (key,) for name, key in made.items()}
     assert len(set(made.values())) == 2
-    with pytest.raises(InputError, match="cluster K2 has a key already; to replace it while"):
+    with pytest.raises(InputError, match="cluster K2 already has a key; to replace it while"):
         KeyFile(path).new(["K3", "K2"])
     assert set(Keys(path, CLUSTERS).members) == {"K1", "K2"}
 
@@ -100,7 +100,9 @@ def test_a_rotation_keeps_passwords_and_the_keys_of_others(tmp_path: Path) -> No
     assert found.members == {"A1": (b"*" * 32,)}
     assert KeyFile(path).end([]) == ["plant"]
     assert Keys(path, HELIOSTATS).plant == (OLD,)
-    with pytest.raises(InputError, match="it is a cluster's key file; make keys in the plant's"):
+    with pytest.raises(
+        InputError, match="this is a cluster's key file; create keys in the plant's"
+    ):
         KeyFile(path).new(["K1"])
 
 
@@ -110,7 +112,7 @@ def test_two_commands_at_once_lose_no_key(tmp_path: Path) -> None:
     KeyFile(file).new(["C1", "C2"])
     one, two = KeyFile(file), KeyFile(file)
     one.rotate(["C1"])
-    with pytest.raises(InputError, match="another command has changed it meanwhile"):
+    with pytest.raises(InputError, match="another command has changed the file in the meantime"):
         two.rotate(["C2"])
     assert [len(KeyFile(file).links[name]) for name in ("C1", "C2")] == [2, 1]
     one.end(["C1"])  # it knows what it has written itself
@@ -148,9 +150,9 @@ def test_a_third_key_is_refused_and_so_is_an_end_without_a_new_one(tmp_path: Pat
     with pytest.raises(InputError, match="K1 has an old key beside a new one; nothing to end"):
         file.end(["K1"])
     (new,) = file.rotate(["K1"]).values()
-    with pytest.raises(InputError, match="K1 has two keys already; say heliotrope keys end"):
+    with pytest.raises(InputError, match="K1 already has two keys; run heliotrope keys end"):
         file.rotate(["K1"])
-    with pytest.raises(InputError, match="K2 has no key; say heliotrope keys new"):
+    with pytest.raises(InputError, match="K2 has no key; run heliotrope keys new"):
         file.rotate(["K2"])
     assert file.end(["K1"]) == ["K1"]
     assert Keys(path, CLUSTERS).members == {"K1": (new,)}
@@ -159,9 +161,12 @@ def test_a_third_key_is_refused_and_so_is_an_end_without_a_new_one(tmp_path: Pat
 @pytest.mark.parametrize(
     ("text", "refusal"),
     [
-        (f'[clusters]\nK1 = ["{"aa" * 32}", "{"bb" * 32}", "{"cc" * 32}"]', "3 keys; give 1 to 2"),
-        (f'[clusters]\nK1 = ["{"aa" * 32}", "{"aa" * 32}"]', "the same key twice"),
-        ("[clusters]\nK1 = []", "0 keys; give 1 to 2"),
+        (
+            f'[clusters]\nK1 = ["{"aa" * 32}", "{"bb" * 32}", "{"cc" * 32}"]',
+            "found 3 keys; specify 1 to 2",
+        ),
+        (f'[clusters]\nK1 = ["{"aa" * 32}", "{"aa" * 32}"]', "a key occurs twice"),
+        ("[clusters]\nK1 = []", "found 0 keys; specify 1 to 2"),
     ],
 )
 def test_lists_of_keys_that_make_no_sense_are_refused(
@@ -183,7 +188,10 @@ def test_keys_go_from_plant_to_cluster_by_commands(
                                      str(tmp_path)])  # fmt: skip
     with pytest.raises(SystemExit):
         main()
-    assert "C1.key.toml: it exists, and keys are never overwritten" in capsys.readouterr().err
+    assert (
+        "C1.key.toml: the file already exists, and keys are never overwritten"
+        in capsys.readouterr().err
+    )
     assert len(Keys(plant, CLUSTERS).members["C1"]) == 1
     run(capsys, monkeypatch, "keys", "take", str(cluster), str(carried))
     carried.unlink()

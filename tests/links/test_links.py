@@ -78,7 +78,7 @@ def test_pauses_double_to_their_limit_and_begin_anew() -> None:
     ("values", "text"),
     [
         ({"period": 1.0, "deadline": 1.5}, "must be at least twice the period"),
-        ({"first_pause": 3.0}, "not above the longest"),
+        ({"first_pause": 3.0}, "at most the longest"),
         ({"capacity": 0}, "capacity 0"),
         ({"largest": 0}, "largest message 0 bytes"),
         ({"horizon": 0.0}, "horizon 0.0 s"),
@@ -100,7 +100,7 @@ def test_the_smallest_and_the_largest_settings_are_taken() -> None:
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({"loss": 1.5}, "probability of loss is 1.5"),
+        ({"loss": 1.5}, "probability of loss must be between 0 and 1, not 1.5"),
         ({"delay": (0.2, 0.1)}, "delay of 0.2 to 0.1 s"),
     ],
 )
@@ -1085,7 +1085,7 @@ def test_tls_with_wrong_files_is_refused(certificate: tuple[Path, Path], tmp_pat
         server_tls(pem, nothing)
     with pytest.raises(InputError, match=r"nothing\.pem"):
         client_tls(nothing)
-    with pytest.raises(InputError, match="give both"):
+    with pytest.raises(InputError, match="specify both"):
         client_tls(pem, certificate=pem)
     assert server_tls(pem, key, pem).verify_mode.name == "CERT_REQUIRED"
 
@@ -1100,5 +1100,5 @@ def test_a_key_in_a_file_is_whole_bytes(size: int, odd: bool, tmp_path: Path) ->
     if 16 <= size <= 64 and not odd:
         assert Keys(path, "clusters").plant == (bytes(range(size)),)
     else:
-        with pytest.raises(FormatError, match=f"a key of {len(text)} characters; give 16 to 64"):
+        with pytest.raises(FormatError, match=f"a key of {len(text)} characters; use 16 to 64"):
             Keys(path, "clusters")

@@ -68,7 +68,7 @@ def pair(
 
 
 def test_a_link_without_a_key_is_refused() -> None:
-    with pytest.raises(InputError, match="cluster north: a key of 0 bytes; give at least 16"):
+    with pytest.raises(InputError, match="cluster north: a key of 0 bytes; use at least 16"):
         mqtt_link(Broker("127.0.0.1"), PREFIX, "north", b"", CLOCK, plant=True)
 
 

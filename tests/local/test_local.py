@@ -218,7 +218,7 @@ def test_a_folder_of_another_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="file"):
         make_folder(tmp_path / "file")
     (tmp_path / "link").symlink_to(tmp_path)
-    with pytest.raises(InputError, match="not a folder of this user"):
+    with pytest.raises(InputError, match="not a folder owned by this user"):
         make_folder(tmp_path / "link")
 
 

@@ -92,9 +92,9 @@ def test_the_nodes_of_the_glb_move_the_mirror_as_the_mechanism_does(name: str) -
 
 def test_what_cannot_be_animated() -> None:
     machine = every_kind()["tilt_roll"]
-    with pytest.raises(InputError, match="give one heliostat with two drives"):
+    with pytest.raises(InputError, match="pass one heliostat with two drives"):
         moving(every_kind()["single_axis"], ANGLES, 1.0, 1.0)
-    with pytest.raises(InputError, match=r"angles of shape \(2,\); give finite ones"):
+    with pytest.raises(InputError, match=r"angles have the shape \(2,\); pass finite angles"):
         moving(machine, [0.0, 1.0], 1.0, 1.0)
-    with pytest.raises(InputError, match="one time for each pose, ascending"):
+    with pytest.raises(InputError, match="one time per pose, in ascending order"):
         glb(machine, ANGLES, [0.0, 2.0, 1.0], 1.0, 1.0)

@@ -115,7 +115,7 @@ def test_slope_is_the_derivative(kind: str) -> None:
     ("make", "text"),
     [
         (lambda: drives.rotary(200, 0), "must be above 0"),
-        (lambda: drives.rotary(200, 10, sense=2), r"sense 2 must be \+1 or −1"),
+        (lambda: drives.rotary(200, 10, sense=2), r"sense must be \+1 or −1, not 2"),
         (lambda: drives.rotary(200, 10, min_angle=1, max_angle=0), "angle stop 1 is above"),
         (lambda: drives.rotary(200, 10, min_count=5, max_count=2), "count stop 5 is above"),
         (lambda: drives.rotary(200, 10, speed=0), "speed must be above 0"),

@@ -212,7 +212,7 @@ def test_no_solution() -> None:
         ({"aim": (np.inf, 0.0, 1.0)}, "not a finite number"),
         ({"aim": (1.0, 2.0)}, "must have 3 numbers"),
         ({"sun": np.ones((3, 3)) / 3**0.5, "aim": np.ones((2, 3))}, "do not fit together"),
-        ({"branch": 2}, "give 'both', 0 or 1"),
+        ({"branch": 2}, "must be 'both', 0 or 1"),
         ({"tolerance": 0.0}, "must be above 0"),
         ({"current": [0.0]}, "finite counts of the 2 drives"),
         ({"drives": direct()}, "its last axis must be 2"),

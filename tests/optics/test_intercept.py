@@ -70,11 +70,14 @@ def test_limits_and_quadrature() -> None:
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: beam_sigma(0.0), "slant: 0 m must be above 0"),
-        (lambda: beam_sigma(10.0, tracking=-1e-3), "tracking: -0.001 rad must be 0 or more"),
+        (lambda: beam_sigma(0.0), "slant must be above 0 and finite, not 0 m"),
+        (
+            lambda: beam_sigma(10.0, tracking=-1e-3),
+            "tracking must be 0 or more and finite, not -0.001 rad",
+        ),
         (lambda: intercept_circle(-1.0, 1.0), "radius"),
-        (lambda: intercept_disks(-1e-3), "tracking: -0.001 rad must be 0 or more"),
-        (lambda: intercept_disks(1e-3, sun_angle=0.0), "0 rad must be above 0"),
+        (lambda: intercept_disks(-1e-3), "tracking must be 0 or more and finite, not -0.001 rad"),
+        (lambda: intercept_disks(1e-3, sun_angle=0.0), "must be above 0 and finite, not 0 rad"),
         (lambda: intercept_circle(1.0, 1.0, right=np.inf), "infinite"),
         (lambda: intercept_rectangle(np.ones(2), np.ones(3), 1.0), "do not broadcast"),
     ],

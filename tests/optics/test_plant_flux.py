@@ -195,10 +195,16 @@ def no_receiver() -> Plant:
         (lambda: ht.flux(plant(), "2026-09-02T22:00Z"), r"the sun stands -\d+\.\d° above the hor"),
         (lambda: ht.flux(plant(), ["2026-09-02T10:00Z"]), "pass one time"),
         (lambda: ht.flux(no_receiver(), sun=SUN), "has no receiver; add one to the plant file"),
-        (lambda: ht.flux(plant(), sun=SUN, dni=-1.0), r"DNI -1.0 W/m² must be 0 or more"),
-        (lambda: ht.flux(plant(), sun=SUN, error=np.nan), "an error of nan rad must be from 0"),
+        (
+            lambda: ht.flux(plant(), sun=SUN, dni=-1.0),
+            r"DNI must be 0 or more and finite, not -1.0 W/m²",
+        ),
+        (
+            lambda: ht.flux(plant(), sun=SUN, error=np.nan),
+            "the error must be between 0 and 0.2 rad, not nan",
+        ),
         (lambda: ht.flux(plant(), sun=SUN, shape="disk"), "sun shape 'disk'; known: pillbox"),
-        (lambda: ht.flux(plant(), sun=SUN, air="fog"), "air 'fog': known models"),
+        (lambda: ht.flux(plant(), sun=SUN, air="fog"), "unknown air model 'fog'; known"),
         (
             lambda: ht.flux(plant(), sun=SUN, towers=(Tower(0.0, -24.0, 30.0, -9.0, 9.0),)),
             "stands inside a tower of radius 30.0 m; move it",

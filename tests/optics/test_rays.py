@@ -178,7 +178,7 @@ def test_dark_mirrors_send_no_rays() -> None:
 def test_the_number_of_rays_and_the_extra_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     given = scene([0.0, 90.0, 0.0])
     for rays in (10, 1e10, float("nan")):
-        with pytest.raises(InputError, match="must be from 1,000 to 1,000,000,000"):
+        with pytest.raises(InputError, match="must be between 1,000 and 1,000,000,000"):
             trace(given, rays)
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     with pytest.raises(InputError, match=r"embreex is not installed; run pip install 'helio"):

@@ -225,7 +225,7 @@ def test_new_mirrors_have_codes_of_their_own_and_do_not_dazzle() -> None:
         few = newcomers(plant, target, here.names, JointSettings(first=4), model)
         wrong = few.left_out
         assert len(few.names) == 4
-        assert all("4 heliostats are on left already" in text for text in wrong.values())
+        assert all("4 heliostats are already on left" in text for text in wrong.values())
         # With others they have no place, and alone each may have a calibration as ever.
         assert here.cycle.first(here.names, target)
         believe(here.live, 1e-2)
@@ -307,9 +307,12 @@ def test_automatic_control_begins_with_them() -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"first": 3}, "3 heliostats without a calibration; must be 0, or 4 to 127"),
-        ({"first": 128}, "first 128 .heliostats without a calibration.*; give 0 to 127$"),
-        ({"first_movement": 6e-3}, "first_movement_mrad 6 .*; give above 0 to 5$"),
+        ({"first": 3}, "must be 0, or 4 to 127, not 3"),
+        (
+            {"first": 128},
+            "first .heliostats without a calibration.* must be between 0 and 127, not 128$",
+        ),
+        ({"first_movement": 6e-3}, "first_movement_mrad .* must be above 0 and at most 5, not 6$"),
     ],
 )
 def test_settings_of_first_visits_that_cannot_be_are_refused(

@@ -318,8 +318,8 @@ def test_who_is_not_known_well_enough_or_would_be_too_bright_has_no_place() -> N
     ("wrong", "said"),
     [
         ({"least": 9, "most": 8}, "least 9 is above most 8; least must be the smaller"),
-        ({"movement": 0.0}, "movement_mrad 0 .coded.*; give above 0 to 5$"),
-        ({"brightest": 0.0}, "brightest_suns 0 .*; give above 0$"),
+        ({"movement": 0.0}, "movement_mrad .coded.* must be above 0 and at most 5, not 0$"),
+        ({"brightest": 0.0}, "brightest_suns .* must be above 0, not 0$"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:

@@ -115,7 +115,7 @@ class Full:
     """A disk for which too much waits."""
 
     def do(self, work: object, then: object) -> None:
-        raise DiskBusyError("1000 records wait for the disk; see to it")
+        raise DiskBusyError("1000 records are waiting to be written; check the disk")
 
     def close(self) -> None:
         pass
@@ -176,7 +176,7 @@ def test_a_disk_that_fails_costs_pictures_only(tmp_path: Path) -> None:
     assert "pictures: " in broken.problem
     full = Pictures(tmp_path / "x", disk=Full())
     visit(full, "A", NOW)
-    assert "1000 records wait" in full.problem
+    assert "1000 records are waiting" in full.problem
     found: list[object] = []
     full.find("A", 1, found.append)
     assert isinstance(found[0], DiskBusyError)

@@ -474,7 +474,7 @@ def test_who_is_not_at_standby_stays_where_it_is(tmp_path: Path) -> None:
 
     bench = cycle(tmp_path, scene, state=states.STOWED)
     assert not bench.cluster_of(NAME).commands("IDLE")
-    with pytest.raises(InputError, match="0 shots"):
+    with pytest.raises(InputError, match="shots must be 1 or more"):
         CycleSettings(shots=0)
 
 

@@ -547,13 +547,13 @@ def test_a_beam_too_bright_or_too_dim_for_its_mirror_is_joined_with_other_light(
     ("wrong", "said"),
     [
         ({"least": 9, "most": 8}, "least 9 is above most 8; least must be the smaller"),
-        ({"movement": 0.003}, "movement_mrad 3 .coded.*; give above 0 to 2$"),
-        ({"power": 0.02}, "power 0.02 .*; give above 0 to 0.01$"),
-        ({"known": 0.0}, "known_mrad 0 .*; give above 0 to 20$"),
-        ({"steady": 0.9}, "steady 0.9 .*; give above 0 to 0.5$"),
-        ({"again": 0.5}, "again 0.5 .*; give 1 to 10$"),
-        ({"visit": -1e-3}, "visit_mrad -1 .*; give 0 or more$"),
-        ({"settle": float("nan")}, "settle_s nan .*; give 0 to 60$"),
+        ({"movement": 0.003}, "movement_mrad .coded.* above 0 and at most 2, not 3$"),
+        ({"power": 0.02}, "power .* must be above 0 and at most 0.01, not 0.02$"),
+        ({"known": 0.0}, "known_mrad .* must be above 0 and at most 20, not 0$"),
+        ({"steady": 0.9}, "steady .* must be above 0 and at most 0.5, not 0.9$"),
+        ({"again": 0.5}, "again .* must be between 1 and 10, not 0.5$"),
+        ({"visit": -1e-3}, "visit_mrad .* must be 0 or more, not -1$"),
+        ({"settle": float("nan")}, "settle_s .* must be between 0 and 60, not nan$"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, float], said: str) -> None:
@@ -567,7 +567,7 @@ def test_a_plant_refuses_receiver_visits_without_a_camera_or_a_face() -> None:
     with pytest.raises(InputError, match="its position is unknown"):
         replace(whole, cameras=unplaced)
     around = replace(whole.receivers[0], kind="external_cylinder")
-    with pytest.raises(InputError, match="only a planar one has a face"):
+    with pytest.raises(InputError, match="only planar receivers have one"):
         replace(whole, receivers=(around,))
     face = replace(whole.receivers[0], corners=None).face
     np.testing.assert_allclose(face.corners, whole.receivers[0].face.corners, atol=1e-9)

@@ -487,7 +487,7 @@ def test_each_cluster_gets_its_way(folder: Path) -> None:
         ("links.toml", "mqtt://127.0.0.1:1883", "mqtt://10.0.0.9", "mqtt.url: 10.0.0.9 is not"),
         ("links.keys", "K2 =", "# K2 =", "clusters.K2: a cluster and its plant authenticate"),
         ("links.keys", "K1 =", "K8 =", "clusters.K8: the plant has no such cluster; remove"),
-        ("links.keys", "[clusters]", "[cluster]", "'cluster' is not known; give plant, passw"),
+        ("links.keys", "[clusters]", "[cluster]", "'cluster' is not known; use plant, passw"),
         ("links.keys", "28282828", "2", "links.keys: K1: a key of 57 characters"),
         ("K3.toml", 'name = "K3"', 'name = "K5"', "it is for cluster K5, not for K3"),
     ],
@@ -577,15 +577,15 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
             "--start 1979-12-31: the time must be in the years 1981 to 2099",
         ),
         (("--start", "2012-09-02T10:00"), "has no time zone; append Z for UTC or an offset"),
-        (("--check",), "need a real plant; give --clusters"),
-        (("--configure",), "need a real plant; give --clusters"),
+        (("--check",), "need a real plant; use --clusters"),
+        (("--configure",), "need a real plant; use --clusters"),
         (("--prototype", "--heliostats", 5), "--prototype is a plant of its own; leave out"),
         (("plant.toml", "--heliostats", 5), "--heliostats applies only to the default plant"),
-        (("--speed", 0), "--speed '0': give a number from 0.001 to 1,000"),
-        (("--minutes", 0), "--minutes '0': give a number from 0.001 to"),
-        (("--every", "nan"), "--every 'nan': give a number from 0.1 to 86,400"),
-        (("--host", "0.0.0.0"), "without TLS passwords can be read on the way"),
-        (("--port", 70_000), "--port '70000': give a whole number from 0 to 65,535"),
+        (("--speed", 0), "--speed must be a number from 0.001 to 1,000"),
+        (("--minutes", 0), "--minutes must be a number from 0.001 to"),
+        (("--every", "nan"), "--every must be a number from 0.1 to 86,400"),
+        (("--host", "0.0.0.0"), "without TLS passwords can be read in transit"),
+        (("--port", 70_000), "--port must be a whole number from 0 to 65,535"),
         (("--certificate", "a.pem"), "TLS needs both files, --certificate and --key"),
         (("--certificate", "a.pem", "--key", "b.pem"), "a.pem and key b.pem cannot be used"),
         (("--database", "mysql://x/y"), "--database must be postgresql://user@host/name"),
@@ -809,6 +809,6 @@ def test_a_sensor_that_no_row_needs_is_refused(folder: Path) -> None:
     links = folder / "links.toml"
     links.write_text(links.read_text().replace("[clusters]", "[sensors]\nrain = 'x'\n[clusters]"))
     with pytest.raises(
-        FormatError, match=r"sensors.rain: there is no such reading; give .*wind_gust"
+        FormatError, match=r"sensors.rain: there is no such reading; use .*wind_gust"
     ):
         read_links(links)

@@ -503,13 +503,13 @@ _SHARED = scheduler(worth=0.0)
 
 
 def test_what_cannot_be_used_is_refused() -> None:
-    with pytest.raises(TimeError, match="has no time zone; give UTC"):
+    with pytest.raises(TimeError, match="has no time zone; pass UTC"):
         Scheduler(PLANT, now=datetime(2026, 1, 1))  # noqa: DTZ001 - that is what is tested
     with pytest.raises(InputError, match="0 targets and 24 heliostats"):
         Scheduler(replace(PLANT, targets=(), cameras=()), now=MORNING)
     with pytest.raises(InputError, match="23 names for 24 heliostats"):
         Scheduler(PLANT, now=MORNING, names=PLANT.names[1:])
-    with pytest.raises(InputError, match="states of shape"):
+    with pytest.raises(InputError, match="states have the shape"):
         ask(scheduler(), states=Standing.ready(23))
     with pytest.raises(UnknownNameError, match="there is no target 'up'"):
         ask(scheduler(), free_targets=("up",))
@@ -520,11 +520,11 @@ def test_what_cannot_be_used_is_refused() -> None:
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        ({"shots": 0}, "0 shots"),
-        ({"sigma": 0.0}, "sigma 0.0 must be above 0"),
-        ({"most_age": float("inf")}, "most_age inf"),
-        ({"worth": 1.0}, "worth 1.0 must be 0 to below 1"),
-        ({"look": 0.0}, "look 0.0 s"),
+        ({"shots": 0}, "shots must be 1 or more"),
+        ({"sigma": 0.0}, "sigma must be above 0, not 0.0"),
+        ({"most_age": float("inf")}, "most_age must be above 0, not inf"),
+        ({"worth": 1.0}, "worth must be 0 or more and below 1, not 1.0"),
+        ({"look": 0.0}, "look must be above 0, or None, not 0.0 s"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings: dict[str, float], text: str) -> None:

@@ -309,7 +309,7 @@ def test_the_thread_works_in_order_is_bounded_and_ends_its_work() -> None:
         disk.do(fail, errors.append)
         for i in (1, 2):
             disk.do(lambda i=i: done.append(i), errors.append)  # type: ignore[misc]
-        with pytest.raises(DiskBusyError, match="3 records wait for the disk"):
+        with pytest.raises(DiskBusyError, match="3 records are waiting to be written"):
             disk.do(fail, errors.append)
         await asyncio.sleep(0.6)
         assert [type(error) for error in errors] == [type(None), ValueError, *[type(None)] * 2]

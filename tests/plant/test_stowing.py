@@ -203,5 +203,5 @@ def test_only_what_was_sent_is_repeated_until_it_is_acknowledged(tmp_path: Path)
 
 @pytest.mark.parametrize("rate", [0.5, -1.0, float("inf"), float("nan")])
 def test_a_rate_that_makes_no_sense_is_refused(rate: float) -> None:
-    with pytest.raises(InputError, match="heliostats a second go to stow"):
+    with pytest.raises(InputError, match="the stow rate must be 1 heliostat a second"):
         PlantSettings(stow_rate=rate)

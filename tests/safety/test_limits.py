@@ -45,7 +45,7 @@ def test_a_row_takes_its_own_numbers_and_the_ends_of_its_range(row: Condition) -
     for one in keys.values():
         if one.number == "trips":
             for wrong in (one.low - 1e-3, one.high * 1.001 + 1e-9, math.nan, math.inf):
-                with pytest.raises(InputError, match="is not within"):
+                with pytest.raises(InputError, match="must be between"):
                     safety.limited(CONDITIONS, {row.name: {one.key: wrong}})
 
 
@@ -81,7 +81,7 @@ def test_rows_of_leases_and_of_orders_cannot_be_set() -> None:
     [
         (
             {"wind_gust_stow": {"trips_m_s": 45.0}},
-            "wind_gust_stow.trips_m_s 45 is not within 5 to 30",
+            "wind_gust_stow.trips_m_s must be between 5 and 30, not 45",
         ),
         (
             {"wind_gust_stow": {"trips_m_s": 14.0}},
@@ -93,7 +93,7 @@ def test_rows_of_leases_and_of_orders_cannot_be_set() -> None:
         (
             {"ups_charge_low": {"releases_percent": 40.0}},
             (
-                "ups_charge_low: it releases at 40 %, which must be above its trip at 50 %; set "
+                "ups_charge_low: the release at 40 % must be above the trip at 50 %; set "
                 "trips and releases together"
             ),
         ),
@@ -107,8 +107,8 @@ def test_rows_of_leases_and_of_orders_cannot_be_set() -> None:
         (
             {"wind_gust_defocus": {"delay_s": 6.0}},
             (
-                "wind_gust_defocus: it would be noticed after 11 s, and DEFOCUS needs 10 s at "
-                "most; shorten delay_s or stale_after_s"
+                "wind_gust_defocus: the condition would be noticed after 11 s, and DEFOCUS needs "
+                "10 s at most; shorten delay_s or stale_after_s"
             ),
         ),
         (
@@ -125,7 +125,7 @@ def test_rows_of_leases_and_of_orders_cannot_be_set() -> None:
         ),
         (
             {"keep_out_predicted": {"then_stow_s": 31.0}},
-            "keep_out_predicted.then_stow_s 31 is not within 0 to 30",
+            "keep_out_predicted.then_stow_s must be between 0 and 30, not 31",
         ),
     ],
 )

@@ -421,8 +421,8 @@ def test_every_tier_has_its_rows() -> None:
         ("wind_gust_stow", {"trips": 15.0}, "trips and releases are both 15"),
         ("wind_gust_stow", {"trips": math.nan}, "must be finite numbers"),
         ("wind_gust_stow", {"stale_after": 400.0}, "noticed after 400 s, later than its budget of"),
-        ("wind_gust_stow", {"delay": -1.0}, r"delay -1\.0 s must be 0 or more"),
-        ("operator_emergency", {"then_stow": math.nan}, "then_stow nan s must be 0 or more"),
+        ("wind_gust_stow", {"delay": -1.0}, r"delay must be 0 or more and finite, not -1\.0 s"),
+        ("operator_emergency", {"then_stow": math.nan}, "then_stow must be 0 or more, not nan s"),
         ("sun_stale", {"trips": 1.0, "releases": 2.0}, "an age must trip above its release"),
     ],
 )
@@ -718,11 +718,11 @@ def test_a_new_limiter_starts_empty_and_zero_joins_none() -> None:
     assert limiter.admit(5, 1000.2)[1] == 2
     assert limiter.admit(-3, 2000.0)[1] == 0
     with pytest.raises(
-        InputError, match=r"joining rate is -1\.0 heliostats/s; it must be finite and 0 or more"
+        InputError, match=r"joining rate must be finite and 0 or more, not -1\.0 heliostats/s"
     ):
         JoinLimiter(-1.0, 5)
     with pytest.raises(
-        InputError, match="joining burst is 0; it must be a whole number of at least 1"
+        InputError, match="joining burst must be a whole number of at least 1, not 0"
     ):
         JoinLimiter(1.0, 0)
 

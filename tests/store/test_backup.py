@@ -326,10 +326,10 @@ class TestRefusals:
         return tmp_path / "backup"
 
     def test_nothing_is_overwritten(self, made: Path, tmp_path: Path) -> None:
-        with pytest.raises(StoreError, match=r"backup .*: it exists"):
+        with pytest.raises(StoreError, match=r"backup .*: this folder already exists"):
             backups.backup(Database(tmp_path / "data"), made, NOW)
         backups.restore(made, tmp_path / "new", NOW)
-        with pytest.raises(StoreError, match="it exists already"):
+        with pytest.raises(StoreError, match="it already exists"):
             backups.restore(made, tmp_path / "new", NOW)
 
     def test_not_under_a_plant_that_runs(self, made: Path, tmp_path: Path) -> None:
@@ -377,12 +377,12 @@ class TestRefusals:
             (made / "telemetry").mkdir()
             to = other if what == "folder" else other / "secret.parquet"
             (made / "telemetry" / "2026-06-21").symlink_to(to)
-        with pytest.raises(FormatError, match="it is a link, which no backup has"):
+        with pytest.raises(FormatError, match="this is a link, and backups contain no links"):
             backups.restore(made, tmp_path / "new", NOW, tmp_path / "archive")
         assert not (tmp_path / "archive").exists()
 
     def test_no_backup_and_no_store(self, tmp_path: Path) -> None:
-        with pytest.raises(FormatError, match="give the folder of a backup"):
+        with pytest.raises(FormatError, match="specify the folder of a backup"):
             backups.restore(tmp_path, tmp_path / "new", NOW)
         with pytest.raises(StoreError, match="no store here"):
             backups.backup(Database(tmp_path / "none"), tmp_path / "backup", NOW)

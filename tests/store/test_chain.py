@@ -273,5 +273,5 @@ def test_exported_heads_show_a_chain_that_was_made_anew(tmp_path: Path) -> None:
     assert isinstance(found.exception, StoreError)
     assert "link 6 has another digest" in str(found.exception)
     (out / "empty").touch()
-    with pytest.raises(InputError, match="holds no head"):
+    with pytest.raises(InputError, match="contains no head"):
         chain.read_heads(out / "empty")

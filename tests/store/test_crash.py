@@ -279,7 +279,7 @@ def test_a_read_only_folder_is_refused_in_one_line() -> None:
     finally:
         folder.chmod(stat.S_IRWXU)
         shutil.rmtree(folder)
-    assert "Permission denied; give a folder that can be written" in done.stdout
+    assert "Permission denied; choose a writable folder" in done.stdout
     assert done.stdout.count("\n") == 1
 
 

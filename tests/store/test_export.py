@@ -115,7 +115,7 @@ def test_only_some(keeper: Keeper, exported: Path, tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="no heliostat in the store 'X'; known: A/1, B, C"):
         export(keeper.database, tmp_path / "two", ["X"])
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="give a folder to write to"):
+    with pytest.raises(InputError, match="choose a folder to write to"):
         export(keeper.database, tmp_path / "file")
 
 

@@ -67,9 +67,11 @@ def test_links_in_the_data_folder_lead_nowhere(tmp_path: Path) -> None:
         (data / name).symlink_to(victim)
     for name in ("telemetry", "photographs", "interface"):
         (data / name).symlink_to(other)
-    with pytest.raises(StoreError, match=r"store\.sqlite: .*(symbolic links|give a folder)"):
+    with pytest.raises(
+        StoreError, match=r"store\.sqlite: .*(symbolic links|choose a writable folder)"
+    ):
         Database(data).lock()
-    with pytest.raises(InputError, match="not a folder of this user"):
+    with pytest.raises(InputError, match="not a folder owned by this user"):
         make_folder(data / "interface")
     tighten(data)
     first_password("a password", data)

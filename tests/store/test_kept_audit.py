@@ -88,7 +88,7 @@ class TestAudit:
 
     def test_records_that_contradict_each_other(self, keeper: Keeper, audit: KeptAudit) -> None:
         audit.begin(RECORD)
-        with pytest.raises(InputError, match="record p-1 exists already; identities are unique"):
+        with pytest.raises(InputError, match="record p-1 already exists; each identity"):
             audit.begin(replace(RECORD, who="ben"))
         audit.finish("p-1", "done", START.isoformat())
         with pytest.raises(InputError, match="no record p-1 is waiting for a result"):

@@ -60,7 +60,7 @@ class TestAccounts:
     @pytest.mark.parametrize(
         ("name", "password_hash", "role", "text"),
         [
-            ("anna", HASH, "viewer", "account anna: it exists"),
+            ("anna", HASH, "viewer", "account anna: it already exists"),
             (
                 "Anna",
                 HASH,
@@ -70,10 +70,10 @@ class TestAccounts:
             (" anna ", HASH, "viewer", "looks like that of anna"),
             ("\u0430nna", HASH, "viewer", "looks like that of anna"),  # a Cyrillic a
             ("\uff42en", HASH, "viewer", "looks like that of ben"),  # of full width
-            (" ", HASH, "viewer", "give a name of 1 to 100 printable"),
-            ("x" * 101, HASH, "viewer", "give a name of 1 to 100 printable"),
-            ("a\nb", HASH, "viewer", "give a name of 1 to 100 printable"),
-            ("..", HASH, "viewer", "not of dots alone"),
+            (" ", HASH, "viewer", "the name must have 1 to 100 printable"),
+            ("x" * 101, HASH, "viewer", "the name must have 1 to 100 printable"),
+            ("a\nb", HASH, "viewer", "the name must have 1 to 100 printable"),
+            ("..", HASH, "viewer", "not only dots"),
             ("carl", "", "viewer", "a password hash is needed"),
             ("carl", HASH, "boss", "no role 'boss'; known: viewer, operator, engineer"),
         ],
@@ -179,7 +179,7 @@ class TestSessions:
 class TestTokens:
     def test_of_one_person_are_few(self, people: People) -> None:
         made = [people.add_token("ben", f"t {k}", "viewer", 200.0)[0] for k in range(MOST_TOKENS)]
-        with pytest.raises(InputError, match=f"ben has {MOST_TOKENS} tokens already; revoke one"):
+        with pytest.raises(InputError, match=f"ben already has {MOST_TOKENS} tokens; revoke one"):
             people.add_token("ben", "one more", "viewer", 200.0)
         people.add_token("anna", "report", "viewer", 200.0)
         people.revoke_token(made[0].key)

@@ -117,7 +117,7 @@ class TestSightings:
         assert np.isnan(keeper.sightings().sightings.time).all()
 
     def test_of_nobody_are_refused(self, keeper: Keeper, seen: Sightings) -> None:
-        with pytest.raises(InputError, match="heliostat row 2 of 2 names"):
+        with pytest.raises(InputError, match="heliostat row 2, but there are only 2 names"):
             keeper.record_sightings(NAMES[:2], seen)
 
     def test_are_numbered_on_over_a_restart(
@@ -403,14 +403,14 @@ class TestOpening:
         opened(place)
 
     def test_a_url_of_something_else(self) -> None:
-        with pytest.raises(StoreError, match="a URL of mysql; give a folder"):
+        with pytest.raises(StoreError, match="a URL of mysql cannot be used; specify a folder"):
             Keeper("mysql://plant@/x")
         with pytest.raises(StoreError, match="the URL cannot be read"):
             Keeper("post gres://:::/")
 
     def test_a_place_where_no_folder_can_be(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
-        with pytest.raises(StoreError, match=r"file/data.*can be written"):
+        with pytest.raises(StoreError, match=r"file/data.*choose a writable folder"):
             Keeper(tmp_path / "file" / "data")
 
     def test_a_file_that_is_no_database(self, tmp_path: Path) -> None:

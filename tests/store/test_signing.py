@@ -91,9 +91,9 @@ def rename(made: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (alter, "its signature is not of the key"),
-        (spoil, "its signature is not of the key"),
-        (rename, "its signature is not of the key"),
+        (alter, "its signature was not made with the key"),
+        (spoil, "its signature was not made with the key"),
+        (rename, "its signature was not made with the key"),
         (leave_out, "it is not signed"),
     ],
 )
@@ -108,7 +108,7 @@ def test_what_the_key_has_not_signed_is_refused(
 
 def test_another_key_is_refused(made: Path, tmp_path: Path) -> None:
     other = PublicKey(make_key(tmp_path / "other.key"))
-    with pytest.raises(FormatError, match="its signature is not of the key"):
+    with pytest.raises(FormatError, match="its signature was not made with the key"):
         backups.restore(made, tmp_path / "new", NOW, signed_by=other)
 
 
@@ -119,13 +119,13 @@ def test_a_file_that_was_put_in_is_refused(made: Path, key: Path, tmp_path: Path
 
 
 def test_keys_are_checked(key: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="it exists, and keys are never overwritten"):
+    with pytest.raises(InputError, match="already exists, and keys are never overwritten"):
         make_key(key)
-    with pytest.raises(FormatError, match="no public key"):
+    with pytest.raises(FormatError, match="not a public key"):
         PublicKey(key)
     empty = tmp_path / "x"
     empty.touch(0o600)
-    with pytest.raises(FormatError, match="no private key"):
+    with pytest.raises(FormatError, match="not a private key"):
         SigningKey(empty)
     key.chmod(0o640)
     with pytest.raises(FormatError, match="others may read it"):

@@ -280,7 +280,7 @@ class TestQueries:
         ],
     )
     def test_only_read(self, folder: Path, sql: str) -> None:
-        with pytest.raises(InputError, match="give one SELECT"):
+        with pytest.raises(InputError, match="write a single SELECT"):
             query(folder, sql)
 
     @pytest.mark.parametrize(
@@ -314,8 +314,8 @@ class TestQueries:
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ({"period": 0.0}, r"a period of 0\.0 s"),
-        ({"period": 20.0, "keyframe": 10.0}, "give a period above 0 and not above"),
+        ({"period": 0.0}, r"the period \(0\.0 s\) must be above 0"),
+        ({"period": 20.0, "keyframe": 10.0}, "at most the keyframe interval"),
         ({"deadband": -1}, "deadband -1"),
         ({"rows": 0}, "0 rows"),
     ],

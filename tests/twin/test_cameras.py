@@ -151,7 +151,7 @@ def test_photographs_that_may_not_be_believed() -> None:
 def test_what_a_rendered_camera_refuses() -> None:
     async def main(clock: VirtualClock) -> None:
         beam = Thrown("white", gaussian_beam((0.0, 0.0), 0.5))
-        with pytest.raises(InputError, match="white has 1 targets and 1 beams; give one target"):
+        with pytest.raises(InputError, match="white has 1 targets and 1 beams; use one target"):
             RenderedCamera(sight(clock), [replace(SCENE, beams=(beam,))])
 
     run_virtual(main)

@@ -509,18 +509,22 @@ def test_without_a_supply_nothing_is_heard() -> None:
 
 def test_what_a_field_refuses() -> None:
     made = outfits(1)[0]
-    with pytest.raises(InputError, match=r"field: mechanisms of shape \(\) with 2 drives; give"):
+    with pytest.raises(InputError, match=r"field: mechanisms of shape \(\) with 2 drives; pass"):
         field_of(made.mechanism)
     field = Both().field
     with pytest.raises(InputError, match="field: 70 ms is not a multiple of 50 ms"):
         field.advance(70)
     with pytest.raises(InputError, match="field: 'JUMP' with aim None; see Field"):
         field.order("JUMP")
-    with pytest.raises(InputError, match="field: fault 11; give 1 to 10"):
+    with pytest.raises(
+        InputError, match=r"field: a fault must be 1 to 10, as in lcu.names, not 11"
+    ):
         field.fail(np.array([0]), 11)
-    with pytest.raises(InputError, match=r"drives: play of -1.0 steps, probability 0.0"):
+    with pytest.raises(
+        InputError, match=r"drives: play must be 0 or more.* not -1.0 steps and 0.0"
+    ):
         field_of(field.mechanism, play=-1.0)
-    with pytest.raises(InputError, match=r"probability 1.5 of losing one; give 0 or more"):
+    with pytest.raises(InputError, match=r"0 to 1, not .* steps and 1.5"):
         field_of(field.mechanism, miss=1.5)
 
 

@@ -467,9 +467,9 @@ def test_what_a_live_plant_refuses() -> None:
             LivePlant(replace(design, groups={"a": replace(group, machines=())}), clock, EXACT)
         slow = replace(group.machines[0], stow=(0, 0))
         homeless = replace(group, machines=(replace(slow, standby=None),) * 6)
-        with pytest.raises(InputError, match="R001-001 has no standby point; give standby_m"):
+        with pytest.raises(InputError, match="R001-001 has no standby point; set standby_m"):
             LivePlant(replace(design, groups={"a": homeless}), clock, EXACT)
-        with pytest.raises(InputError, match=r"centroid variance -1\.0 m²"):
+        with pytest.raises(InputError, match=r"centroid variance must be 0 or more, not -1\.0 m²"):
             WorldOptions(centroid=-1.0)
 
     run_virtual(main)

@@ -94,7 +94,9 @@ def test_clocks_drift_wrap_and_jump() -> None:
     assert not told.time().jumped
     told.quality = "none"
     assert told.time().error == float("inf")
-    with pytest.raises(InputError, match=r"drifting clock: a drift of 0.6; give less than 0.5"):
+    with pytest.raises(
+        InputError, match=r"drifting clock: the drift must be below 0.5, such as 50e-6, not 0.6"
+    ):
         DriftingClock(clock.monotonic, clock.utc(), drift=0.6)
 
 
@@ -145,7 +147,7 @@ def test_the_bus_does_to_frames_what_its_faults_say() -> None:
         assert await bus.transmit(b"x\0") is SendOutcome.DISCONNECTED
         bus.plugged = True
         assert await bus.transmit(b"x\0", expires=clock.monotonic()) is SendOutcome.EXPIRED
-        with pytest.raises(InputError, match=r"bus: a timeout of 0.0 s; it must be above 0"):
+        with pytest.raises(InputError, match=r"bus: the timeout must be above 0, not 0.0 s"):
             await bus.transact(b"x\0", 0.0)
         await bus.close()
         with pytest.raises(LinkClosedError, match="bus: it is closed"):
@@ -153,7 +155,7 @@ def test_the_bus_does_to_frames_what_its_faults_say() -> None:
 
     run_virtual(main)
     with pytest.raises(
-        InputError, match=r"bus faults: the probability of loss is 1.5; give 0 to 1"
+        InputError, match=r"bus faults: the probability of loss must be between 0 and 1, not 1.5"
     ):
         BusFaults(loss=1.5)
 
@@ -170,7 +172,7 @@ def test_a_soak_goes_on_where_it_stopped(tmp_path: Path) -> None:
     kept.write_text('{"seed": 1}\n')
     with pytest.raises(FormatError, match=r"soak.jsonl: line 1: not a run of a soak; name another"):
         run_many(plans, progress=kept)
-    with pytest.raises(InputError, match="soak with 0 processes; give 1 or more"):
+    with pytest.raises(InputError, match="a soak needs 1 process or more, not 0"):
         run_many(plans, processes=0)
 
 
@@ -198,7 +200,7 @@ def test_a_run_that_does_not_end_is_told_and_the_soak_goes_on(
 
 
 def test_a_bus_carries_no_more() -> None:
-    with pytest.raises(InputError, match="33 heliostats on a bus; give 1 to 32"):
+    with pytest.raises(InputError, match="a bus must have 1 to 32 heliostats, not 33"):
         outfits(33)
 
 

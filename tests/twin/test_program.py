@@ -70,7 +70,7 @@ def test_a_folder_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert read_links(tmp_path / "f" / "links.toml").document.sensors == {
         name: f"{name}.txt" for name in ("dni", "receiver_flux_nominal", "wind_gust", "wind_mean")
     }
-    with pytest.raises(InputError, match="it exists; give another folder"):
+    with pytest.raises(InputError, match="this file already exists; choose another folder"):
         write_folder(design, tmp_path / "f", ("127.0.0.1", 4840), serves, steps_every=1)
 
 

@@ -315,10 +315,10 @@ def test_the_faults_of_a_failing_run_are_shrunk(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ({"seconds": 0.0}, "simulation of 0 h; give above 0 and at most 8 h"),
+        ({"seconds": 0.0}, "must last more than 0 and at most 8 h"),
         ({"seconds": 1e6}, "as long as the sun is up"),
         ({"heliostats": 33}, "simulation of 33 heliostats; a cluster has 1 to 32"),
-        ({"pause": 0.0}, "a pause of 0.0 s between faults; it must be above 0"),
+        ({"pause": 0.0}, "the pause between faults must be above 0, not 0.0 s"),
         ({"only": ("quake",)}, "fault 'quake' is not known; known: line_cut"),
         ({"worlds": ("flat",)}, "world 'flat' is not known; known: calm"),
     ],

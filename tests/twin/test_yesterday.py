@@ -156,7 +156,7 @@ def test_a_day_without_light_and_a_count_of_none_bring_nothing() -> None:
     assert not measure_yesterday(design, truth, START, count=0).visits
     polar = replace(design, site=replace(design.site, latitude_deg=89.0))
     assert not measure_yesterday(polar, truth, START).visits
-    with pytest.raises(InputError, match="-1 heliostats on 2 targets; give 0 or more"):
+    with pytest.raises(InputError, match="-1 heliostats on 2 targets; specify 0 or more"):
         measure_yesterday(design, truth, START, count=-1)
     with pytest.raises(InputError, match="and a plant with a target"):
         measure_yesterday(replace(design, targets=(), cameras=()), truth, START)

@@ -79,7 +79,9 @@ class MirrorShape:
             raise InputError(f"mirror: facets of shape {shape}; expected centres and edges (F, 3)")
         focal = np.array(np.broadcast_to(as_float(self.focal), shape[:1]))
         if not (focal != 0.0).all():
-            raise InputError("mirror: a focal length is 0 m or not a number; use inf for flat")
+            raise InputError(
+                "mirror: a focal length is 0 m or not a number; use inf for a flat facet"
+            )
         object.__setattr__(self, "focal", focal)
         area = np.linalg.norm(np.cross(self.half_width, self.half_height), axis=-1)
         if not (area > 0.0).all():
@@ -90,7 +92,7 @@ class MirrorShape:
         slope = as_float(self.slope)
         if slope.ndim != 4 or slope.shape[0] != shape[0] or slope.shape[3] != 2 or not slope.size:
             raise InputError(
-                f"mirror: slope map of shape {slope.shape}; it must be ({shape[0]}, H, W, 2)"
+                f"mirror: the slope map has the shape {slope.shape}; expected ({shape[0]}, H, W, 2)"
             )
         if not np.isfinite(slope).all():
             k = int(np.argwhere(~np.isfinite(slope))[0, 0])

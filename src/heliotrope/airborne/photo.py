@@ -110,7 +110,7 @@ class Photo:
         position, turned = checked_pose(f"photo {self.name}", self.position, self.rotation)
         sigma = np.array(np.broadcast_to(as_float(self.sigma_position), (3,)))
         if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
-            raise InputError(f"photo {self.name}: sigma_position {sigma} m must be above 0")
+            raise InputError(f"photo {self.name}: sigma_position must be above 0, not {sigma} m")
         if self.time is not None and self.time.tzinfo is None:
             raise InputError(f"photo {self.name}: time {self.time} has no time zone; use UTC")
         object.__setattr__(self, "position", position)

@@ -139,7 +139,7 @@ def split(
     """
     check_fraction(fraction)
     if kind not in get_args(Split):
-        raise InputError(f"split {kind!r}: use one of {', '.join(get_args(Split))}")
+        raise InputError(f"unknown split {kind!r}; use one of {', '.join(get_args(Split))}")
     if kind in KINDS:
         return paint_split(sightings, kind, seed)[0]
     chosen = np.zeros(len(sightings), dtype=np.bool_)
@@ -177,7 +177,7 @@ def check_fraction(fraction: float) -> None:
         If it does not lie between 0 and 1.
     """
     if not 0.0 < as_numbers(fraction, "fraction") < 1.0:
-        raise InputError(f"fraction {fraction}: it must lie between 0 and 1")
+        raise InputError(f"fraction must be between 0 and 1, not {fraction}")
 
 
 def _by_neighbourhood(

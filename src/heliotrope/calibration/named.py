@@ -76,7 +76,7 @@ class Members:
         count, drives = len(self.mechanism), len(self.mechanism.driven)
         if not isinstance(sightings, Sightings):
             raise InputError(
-                f"sightings: {kind_of(sightings)} is not Sightings; make them with "
+                f"sightings: {kind_of(sightings)} is not Sightings; create them with "
                 "heliotrope.sightings"
             )
         if sightings.counts.shape[-1] != drives:

@@ -284,7 +284,9 @@ def _check_columns(rows: Rows) -> list[str]:
             rows.need(six)
     sigmas = ("sigma_rad", "sigma_mrad")
     if all(name in rows.columns for name in sigmas):
-        raise FormatError(rows.path, "sigma is given in rad and mrad; keep one column", rows.header)
+        raise FormatError(
+            rows.path, ("sigma is specified both in rad and in mrad; keep one column"), rows.header
+        )
     if "sigma_mrad" not in rows.columns:
         rows.need(["sigma_rad"])
     known = ["heliostat", "time", "kind", *drives, *ends, *sigmas, *covariances]
@@ -292,7 +294,7 @@ def _check_columns(rows: Rows) -> list[str]:
     for name in columns:
         if name not in known and name.startswith(("source_", "destination_", "count_", "sigma")):
             close = get_close_matches(name, likely, n=1)
-            hint = f"did you mean {close[0]}?" if close else "give it another name or remove it"
+            hint = f"did you mean {close[0]}?" if close else "rename or remove it"
             raise FormatError(rows.path, f"column {name} is not known; {hint}", rows.header)
     return drives
 
@@ -375,13 +377,14 @@ def _columns(
     rows_of(names)
     if len(s) and int(s.heliostat.max()) >= len(names):
         raise InputError(
-            f"sightings: heliostat row {int(s.heliostat.max())} of {len(names)} names; pass the "
-            "names of all heliostats"
+            f"sightings: heliostat row {int(s.heliostat.max())}, but there are only {len(names)} "
+            "names; pass the names of all heliostats"
         )
     all_kinds = [""] * len(s) if kinds is None else list(kinds)
     if len(all_kinds) != len(s):
         raise InputError(
-            f"sightings: {len(all_kinds)} kinds for {len(s)} sightings; pass one kind per sighting"
+            f"sightings: got {len(all_kinds)} kinds for {len(s)} sightings; pass one kind per "
+            "sighting"
         )
     for kind in all_kinds:
         if kind and kind not in KINDS:

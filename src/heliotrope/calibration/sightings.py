@@ -238,8 +238,9 @@ def sightings(
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
         raise InputError(
-            f"sighting {i}: sigma {spreads[i]} rad must be {SMALLEST_SIGMA} to {LARGEST_SIGMA} "
-            "rad; milliradians need a factor of 1e-3, degrees numpy.radians"
+            f"sighting {i}: sigma must be between {SMALLEST_SIGMA} and {LARGEST_SIGMA} rad, not "
+            f"{spreads[i]} rad; multiply milliradians by 1e-3, and convert degrees with "
+            "numpy.radians"
         )
     index, names = _named(heliostat)
     return Sightings(
@@ -347,7 +348,7 @@ def _finite(values: FloatArray, name: str) -> None:
     bad = ~np.isfinite(values).all(axis=-1)
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
-        raise InputError(f"sighting {i}: {name} {values[i]} is not finite; leave the row out")
+        raise InputError(f"sighting {i}: {name} {values[i]} is not finite; omit this row")
 
 
 def ray_directions(s: Sightings, vertex: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -71,7 +71,7 @@ def precision(
     for p, name in enumerate(names):
         sigma = as_float(sigmas.get(name, mechanism.parameter(name).prior))
         if not (np.isfinite(sigma) & (sigma > 0)).all():
-            raise InputError(f"prior of {name}: {sigma} must be above 0 and finite")
+            raise InputError(f"prior of {name} must be above 0 and finite, not {sigma}")
         information[:, p, p] = 1.0 / sigma**2
     if made is not None and len(made):
         if int(made.heliostat.max()) >= count:
@@ -382,5 +382,7 @@ def year_map(
 
 def _batch(mechanism: Mechanism) -> int:
     if len(mechanism.shape) != 1:
-        raise InputError(f"mechanisms of shape {mechanism.shape}; must have one batch axis (N,)")
+        raise InputError(
+            f"mechanisms must have one batch axis (N,), not the shape {mechanism.shape}"
+        )
     return len(mechanism)

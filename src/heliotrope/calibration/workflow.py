@@ -107,15 +107,15 @@ def read_field_sightings(
     FormatError
         If no measurement can be used.
     """
-    require("plant", plant, Plant, "a plant, as from heliotrope.open")
+    require("plant", plant, Plant, "a plant from heliotrope.open")
     require("place", place, (str, Path), "the file or folder that the plant was read from")
     place = Path(place)
     if centroid not in ("utis", "helios"):
-        raise InputError(f"centroid {shown(centroid)}: use 'utis' or 'helios'")
+        raise InputError(f"centroid must be 'utis' or 'helios', not {shown(centroid)}")
     if now is not None:
         require("now", now, numbers.Real, "Unix seconds")
         if not math.isfinite(now):
-            raise InputError(f"now is {now}; pass Unix seconds")
+            raise InputError(f"now must be in Unix seconds, not {now}")
     if table is not None:
         field = _read_table(plant, place, Path(table), now)
     elif place.is_dir():
@@ -371,11 +371,11 @@ def calibrate(
     fraction
         Training fraction in the test; 1: no test.
     """
-    require("field", field, FieldSightings, "what read_field_sightings returns")
+    require("field", field, FieldSightings, "the result of read_field_sightings")
     require("fraction", fraction, numbers.Real, "a share from 0 to 1")
     require("seed", seed, numbers.Integral, "a whole number, 0 or more")
     if seed < 0:
-        raise InputError(f"seed {seed} is below 0; use a whole number, 0 or more")
+        raise InputError(f"seed must be a whole number, 0 or more, not {seed}")
     if fraction != 1.0:
         evaluation.check_fraction(fraction)
     names, mechanism = field.heliostats.names, field.heliostats.mechanism

@@ -119,7 +119,10 @@ def _focus(text: str) -> Literal["plant", "slant", "flat"] | float:
     words = {"plant": "plant", "slant": "slant", "flat": "flat"}
     if text in words:
         return words[text]
-    refusal = f"--focus {shown(text)}: give plant, slant, flat, or a focal length from 0.1 to 1e5 m"
+    refusal = (
+        "--focus must be plant, slant, flat, or a focal length from 0.1 to 1e5 m, not "
+        f"{shown(text)}"
+    )
     (length,) = parse_numbers(text, refusal, least=0.1, most=1e5)
     return length
 

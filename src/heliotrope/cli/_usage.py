@@ -34,4 +34,4 @@ def _number(error: TyperException) -> str | None:
         f"{end:,}" if isinstance(end, int) else f"{end:,.10g}" for end in (low, high)
     )
     about = getattr(error.param, "help", "").rstrip(".")
-    return f"{name} {shown(value)}: give {kind} from {limits}{comma} ({about})"
+    return f"{name} must be {kind} from {limits}{comma}, not {shown(value)} ({about})"

@@ -198,7 +198,7 @@ def _wanted(text: str) -> "FluxLimit | None":
     if Path(text).suffix.lower() == ".csv":
         return read_limit(text)
     if text not in ("", "uniform"):
-        raise InputError(f"--wanted {shown(text)}: give uniform, or a file .csv in W/m²")
+        raise InputError(f"--wanted must be uniform, or a .csv file in W/m², not {shown(text)}")
     return FluxLimit(1.0) if text else None
 
 

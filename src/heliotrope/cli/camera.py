@@ -310,7 +310,7 @@ def _split(texts: Sequence[str], read: Callable[[str], Value]) -> dict[str, Valu
     for text in texts:
         name, _, value = text.rpartition("=")
         if name in values:
-            raise InputError(f"{text!r}: given twice" + (f" for point {name}" if name else ""))
+            raise InputError(f"{text!r}: specified twice" + (f" for point {name}" if name else ""))
         values[name] = read(value)
     return values
 

@@ -207,7 +207,7 @@ def _sun_of(field: Path) -> "np.ndarray | None":
 def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) -> Any:
     """Return the aim from the options, else the heliostat's own, else the first target, (3,)."""
     if aim is not None and target is not None:
-        raise InputError("give --aim or --target, not both")
+        raise InputError("use --aim or --target, not both")
     if aim is not None:
         return parse_point(aim, "aim")
     if target is not None:
@@ -227,8 +227,8 @@ def _local_aim(plant: "Plant", heliostat: str, aim: str | None) -> Any:
     own = plant[heliostat].aim
     if own is None:
         raise InputError(
-            f"heliostat {heliostat}: it has no aim point of its own; specify --aim x,y,z in "
-            "metres, in its frame at zero angles"
+            f"heliostat {heliostat} has no aim point of its own; specify --aim x,y,z in metres, in "
+            "its frame at zero angles"
         )
     return own
 
@@ -251,8 +251,8 @@ def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray"
         beyond = float((aim - surface.center) @ surface.normal)
         if surface.holds(aim, _ON) and (ahead <= 0.0).any():
             raise InputError(
-                f"heliostat {heliostat}: it is {-ahead.min():.2f} m behind {surface.name}, and its "
-                "beam would come to the back; choose another target or aim"
+                f"heliostat {heliostat} is {-ahead.min():.2f} m behind {surface.name}, so its beam "
+                "would reach the back; choose another target or aim"
             )
         # An aperture may be crossed: the aim is inside a cavity.
         crossed = ahead * beyond < 0.0

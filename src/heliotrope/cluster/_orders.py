@@ -193,7 +193,7 @@ class Orders:
             )
         if not 0.0 < lifetime <= 3600.0:
             raise OrderRefusedError(
-                f"a lifetime of {lifetime:g} s; it must be above 0 and at most 3600 s"
+                f"the lifetime must be above 0 and at most 3600 s, not {lifetime:g} s"
             )
         waiting = len(self._ready) + len(self._later)
         if waiting + jobs > _MOST_JOBS:
@@ -513,7 +513,7 @@ def _steps_of_items(node: ClusterNode, message: Parameters) -> tuple[Step, ...]:
     if not node.member.key:
         raise OrderRefusedError(f"{node.name}: no key is configured; add it to the key file")
     if not items:
-        raise OrderRefusedError("no items; name at least one")
+        raise OrderRefusedError("no items; name at least one item")
     sets, checks = [], []
     for item, data in items.items():
         if item not in SIZE_OF or item in ("key_id", "edition", "address", "bus_keys"):

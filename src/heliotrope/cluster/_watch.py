@@ -123,7 +123,10 @@ class Watch:
     def take(self, lease: Lease, now: float) -> str | None:
         """Accept a new lease; return the reason if it is refused."""
         if not _SHORTEST_LEASE <= lease.lifetime <= _PLANT_LEASE:
-            return f"lease of {lease.lifetime:g} s: give {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s"
+            return (
+                f"the lease must last {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s, not "
+                f"{lease.lifetime:g} s"
+            )
         if not (0 <= lease.token <= 0xFFFFFFFF and lease.autonomy >= 0.0):
             return f"lease with token {lease.token} and autonomy {lease.autonomy:g} s: out of range"
         autonomy = min(lease.autonomy, self._longest)

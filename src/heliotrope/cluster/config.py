@@ -41,7 +41,7 @@ class Member:
 
     def __post_init__(self) -> None:
         if not self.name:
-            raise InputError(f"heliostat at address {self.address}: it has no name; enter one")
+            raise InputError(f"heliostat at address {self.address}: the name is empty; enter one")
         for what, value, low, high in (
             ("address", self.address, 1, wire.BROADCAST - 1),
             ("serial number", self.serial, 0, 0xFFFFFFFF),
@@ -102,7 +102,7 @@ class ClusterConfig:
         at = f"cluster {self.name!r}"
         limited(watched_by(CONDITIONS, Watcher.CLUSTER), self.limits)
         if not self.name:
-            raise InputError(f"{at}: it has no name; enter one")
+            raise InputError(f"{at}: the name is empty; enter one")
         if not 1 <= len(self.heliostats) <= MOST_MEMBERS:
             raise InputError(
                 f"{at}: {len(self.heliostats)} heliostats; one bus supports 1 to {MOST_MEMBERS}"
@@ -112,7 +112,7 @@ class ClusterConfig:
             for value in values:
                 if value is not None and values.count(value) > 1:
                     raise InputError(
-                        f"{at}: two heliostats have the {what} {value}; give each its own"
+                        f"{at}: two heliostats have the {what} {value}; assign each its own"
                     )
         for what, number, low, high in (
             ("answer", self.answer, 0.001, 1.0),
@@ -166,5 +166,5 @@ def spread_phase(index: int, count: int) -> float:
         If the index is out of range.
     """
     if not 0 <= index < count:
-        raise InputError(f"phase: cluster {index} of {count}; give 0 to {count - 1}")
+        raise InputError(f"phase: cluster {index} of {count}; use an index from 0 to {count - 1}")
     return index / count

@@ -23,13 +23,13 @@ _CHRONY = "chronyd now keeps the computer's clock"
 _OLD_TIME = {
     "source": f"{_CHRONY}, also with a receiver: remove the key, or state error_s for a clock that "
     f"you guarantee",
-    "url": f'{_CHRONY}: give the receiver\'s port to gpsd, and write gpsd = "localhost"',
-    "baud_rate": f"{_CHRONY}: give the baud rate to gpsd, and remove the key",
+    "url": f'{_CHRONY}: configure the receiver\'s port in gpsd, and write gpsd = "localhost"',
+    "baud_rate": f"{_CHRONY}: configure the baud rate in gpsd, and remove the key",
     "latency_s": f"{_CHRONY}: state the receiver's latency as the offset of chronyd's refclock, "
     "and remove the key",
     "system_tolerance_s": "the permitted difference between clock and receiver is fixed at 2 s; "
     "remove the key",
-    "ntp": "the kernel is asked unless error_s is stated; remove the key",
+    "ntp": "the kernel is queried unless error_s is set; remove the key",
     "drift_ppm": "the kernel's bound grows by 500 ppm; remove the key",
 }
 

@@ -348,7 +348,7 @@ class SerialBus:
             If the bus is closed.
         """
         if not timeout > 0.0:
-            raise InputError(f"bus {self._url}: a timeout of {timeout} s; it must be above 0")
+            raise InputError(f"bus {self._url}: the timeout must be above 0, not {timeout} s")
         if complete is None:
             complete = ends_in_zero
         async with self._turns.turn(urgent=urgent):

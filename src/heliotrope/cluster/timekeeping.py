@@ -123,7 +123,7 @@ class Steadiness:
     def __init__(self, clock: Clock, tolerance: float, settle: float) -> None:
         for name, value in (("tolerance", tolerance), ("duration of a jump", settle)):
             if not 0.0 < value < math.inf:
-                raise InputError(f"time: a {name} of {value} s; it must be above 0")
+                raise InputError(f"time: a {name} must be above 0, not {value} s")
         self._clock = clock
         self._tolerance = tolerance
         self._settle = settle
@@ -239,7 +239,7 @@ class SystemTime:
         gpsd: Gpsd | None = None,
     ) -> None:
         if not 0.0 < error < math.inf:
-            raise InputError(f"time: an error bound of {error} s; it must be above 0")
+            raise InputError(f"time: an error bound must be above 0, not {error} s")
         self._clock = clock
         self._error = error
         self._bound = None if bound is None else _Bound(bound)

@@ -24,9 +24,13 @@ def check_password(password: str, name: str = "") -> str:
         If it is too short, too long, or easily guessed.
     """
     if not SHORTEST <= len(password) <= LONGEST:
-        raise InputError(f"password: {len(password)} characters; give {SHORTEST} to {LONGEST}")
+        raise InputError(
+            f"the password must have {SHORTEST} to {LONGEST} characters, not {len(password)}"
+        )
     if reason := weakness(password, name):
-        raise InputError(f"password: {reason}; give another one, as three words that do not belong")
+        raise InputError(
+            f"password: {reason}; choose a different one, such as three unrelated words"
+        )
     return password
 
 

@@ -105,7 +105,7 @@ async def own_password(
     if not await _without_password(console, who):
         await confirm(console, who, request, body.old)
     if body.new == body.old:
-        raise HTTPException(422, "this is your password already; give another one")
+        raise HTTPException(422, "this is already your password; choose a different one")
     _secrets.check_password(body.new, who.person.name)
     await _set_password(console, who, request, who.person.name, body.new)
     drop_cookie(console, response)

@@ -50,7 +50,7 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
     404: {"model": models.Problem, "description": "Unknown name"},
     409: {"model": models.Problem, "description": "Not accepted now; nothing was sent"},
     422: {"model": models.Problem, "description": "The request cannot be used"},
-    423: {"model": models.Problem, "description": "Give your password again, see session/presence"},
+    423: {"model": models.Problem, "description": "Send your password again, see session/presence"},
     429: {"model": models.Problem, "description": "Too many requests; nothing was sent"},
     503: {"model": models.Problem, "description": "It cannot be recorded now; nothing was sent"},
 }

@@ -353,8 +353,8 @@ def settle(who: Caller, connection: HTTPConnection) -> None:
     if who.away:
         raise HTTPException(
             423,
-            "nothing was ordered here for a while: give your password again; EMERGENCY, DEFOCUS "
-            "and STOW are accepted all the same",
+            "no order was sent from here for a while, so enter your password again; EMERGENCY, "
+            "DEFOCUS and STOW are accepted all the same",
         )
     if who.owes:
         text, requests = DUES[who.owes]

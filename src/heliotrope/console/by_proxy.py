@@ -86,7 +86,9 @@ class ByProxy:
             raise FormatError(place, "others may read it; run chmod 600 on it")
         if len(word) < _SHORTEST or not (word.isascii() and word.isalnum()):
             raise FormatError(
-                place, f"give at least {_SHORTEST} letters and digits, as of `openssl rand -hex 32`"
+                place,
+                f"the secret must have at least {_SHORTEST} letters and digits, such as the "
+                "output of `openssl rand -hex 32`",
             )
         names = (document.person, document.groups, document.secret)
         return cls(*names, word, document.roles, document.separator)

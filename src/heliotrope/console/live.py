@@ -127,9 +127,9 @@ class Stream:
         """
         most = self._most if who.role >= Role.OPERATOR else round(self._most * (1.0 - RESERVED))
         if self._places[who.name] >= OWN:
-            raise BusyError(f"{OWN} streams of {who.name} are open already; close one")
+            raise BusyError(f"{OWN} streams of {who.name} are already open; close one")
         if self._places.total() >= most:
-            raise BusyError(f"{most} streams are open already; close one")
+            raise BusyError(f"{most} streams are already open; close one")
         self._places[who.name] += 1
         try:
             yield

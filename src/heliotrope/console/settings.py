@@ -78,18 +78,22 @@ class ConsoleSettings:
     def __post_init__(self) -> None:
         for port in (self.port, self.emergency_port or 0):
             if not 0 <= port <= 65_535:
-                raise InputError(f"console: port {port}; give 1 to 65535, or 0 for a free one")
+                raise InputError(
+                    f"console: port must be between 1 and 65535, or 0 for a free port, not {port}"
+                )
         if (self.certificate is None) != (self.key is None):
             raise InputError("console: TLS needs both files, --certificate and --key")
         if not self.period > 0.0:
-            raise InputError(f"console: period of {self.period} s must be above 0")
+            raise InputError(f"console: period must be above 0, not {self.period} s")
         for what, value, (least, most), unit in (
             ("a session", self.session_s / 3600.0, _HOURS, "hours"),
             ("the idle lock", self.idle_s / 60.0, _IDLE, "minutes"),
             ("the limit on sign-ins", self.sign_ins, _SIGN_INS, "an hour"),
         ):
             if not least <= value <= most:
-                raise InputError(f"console: {what} of {value:g} {unit}; give {least:g} to {most:g}")
+                raise InputError(
+                    f"console: {what} must be {least:g} to {most:g} {unit}, not {value:g}"
+                )
         if self.second_factor:
             # The process for the EMERGENCY path does not use the store, and so starts sooner.
             from heliotrope.store.people import ROLES
@@ -98,14 +102,14 @@ class ConsoleSettings:
                 raise UnknownNameError("role", self.second_factor, ROLES)
         if self.people_by_proxy is not None and not self.proxies:
             raise InputError(
-                "console: --people-by-proxy believes the addresses of --proxy only; give them"
+                "console: --people-by-proxy trusts only the addresses of --proxy; specify --proxy"
             )
         for proxy in self.proxies:
             _check_address(proxy)
         if not self.local and not self.tls and not self.plain:
             raise InputError(
                 f"console: {self.host} is reached from other machines, and without TLS passwords "
-                "can be read on the way; give --certificate and --key, or --plain behind a proxy "
+                "can be read in transit; use --certificate and --key, or --plain behind a proxy "
                 "that has TLS"
             )
 
@@ -183,4 +187,7 @@ def _check_address(text: str) -> None:
             return
     except ValueError:
         pass
-    raise InputError(f"console: proxy {text!r}; give the IP address that the console sees")
+    raise InputError(
+        f"console: proxy {text!r} is not an IP address; specify the IP address that the console "
+        "sees"
+    )

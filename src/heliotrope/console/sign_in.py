@@ -82,7 +82,7 @@ async def enter_once(console: Console, secret: str, connection: HTTPConnection) 
     name = await console.ask(lambda: console.people.enter(secret))
     if name is None:
         await console.note(SecurityEvent.SIGN_IN_FAILED, connection, "", f"{_BY_LINK}, not valid")
-        raise HTTPException(410, "this one-time link is not valid any more")
+        raise HTTPException(410, "this one-time link is no longer valid")
     return (await _begin(console, name, connection, _BY_LINK))[0]
 
 
@@ -171,7 +171,7 @@ async def checked(
     if code is not None and account.factor:
         if not code:
             attempts.undo(*keys)  # the password was correct, and no code was guessed
-            raise HTTPException(428, "give the code of your second factor too")
+            raise HTTPException(428, "enter the code of your second factor too")
         await _use_code(console, name, code, request, failure)
     attempts.good(*keys)
     return account

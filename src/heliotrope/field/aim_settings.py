@@ -67,7 +67,7 @@ class AimSettings:
     def __post_init__(self) -> None:
         if self.strategy not in AIM_STRATEGIES:
             raise InputError(
-                f"aims: strategy {self.strategy!r}; use one of {', '.join(AIM_STRATEGIES)}"
+                f"aims: unknown strategy {self.strategy!r}; use one of {', '.join(AIM_STRATEGIES)}"
             )
         if self.strategy == "limit" and self.limit is None:
             raise InputError('aims: strategy "limit" needs limit_kw_m2, limit_map or limit_table')
@@ -88,5 +88,5 @@ class AimSettings:
         for key, (value, low, high, unit) in ranges.items():
             if not low <= value <= high:
                 raise InputError(
-                    f"aims: {key} {value:g}{unit} must be from {low:g} to {high:g}{unit}"
+                    f"aims: {key} must be between {low:g} and {high:g}{unit}, not {value:g}{unit}"
                 )

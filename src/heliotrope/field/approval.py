@@ -32,7 +32,8 @@ class ApprovalSettings:
     def __post_init__(self) -> None:
         if not _SHORTEST <= self.within <= _LONGEST:
             raise InputError(
-                f"approval: within_s {self.within:g}; use {_SHORTEST:g} to {_LONGEST:g} (7 days)"
+                f"approval: within_s must be between {_SHORTEST:g} and {_LONGEST:g} (7 days), not "
+                f"{self.within:g}"
             )
 
     @property

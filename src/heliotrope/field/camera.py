@@ -124,14 +124,17 @@ def checked_pinhole(
     width, height = (int(n) for n in camera.size)
     if not (smallest <= width <= 100_000 and smallest <= height <= 100_000):
         raise InputError(
-            f"{name}: frames of {width} × {height} px; must be {smallest} to 100000 px each way"
+            f"{name}: frames must measure {smallest} to 100000 px each way, not {width} × {height} "
+            "px"
         )
     matrix = as_float(camera.matrix)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        raise InputError(f"{name}: matrix {matrix.shape} must be (3, 3) and finite")
+        raise InputError(
+            f"{name}: matrix must be finite and of shape (3, 3); its shape is {matrix.shape}"
+        )
     fx, fy = matrix[0, 0], matrix[1, 1]
     if min(fx, fy) <= 0.0:
-        raise InputError(f"{name}: focal lengths {fx}, {fy} px must be above 0")
+        raise InputError(f"{name}: focal lengths must be above 0 px, not {fx} and {fy} px")
     distortion = as_float(camera.distortion)
     if distortion.shape != (5,) or not np.isfinite(distortion).all():
         raise InputError(f"{name}: distortion needs k1, k2, p1, p2, k3, each finite")

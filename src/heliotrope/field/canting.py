@@ -115,6 +115,6 @@ def _check_reach(group: Heliostats, reachable: np.ndarray) -> None:
     if not reachable.all():
         k = int(np.flatnonzero(~reachable)[0])
         raise InputError(
-            f"heliostat {group.names[k]}: it cannot reach its aim at the sun of its off-axis "
+            f"heliostat {group.names[k]} cannot reach its aim at the sun position of its off-axis "
             "canting; choose another time"
         )

@@ -46,12 +46,14 @@ class Setting:
         """Raise InputError if a value is not within the limits."""
         given = value / self.scale
         if not self.low <= given <= self.high or (self.above and given == self.low):
-            least = f"{'above ' if self.above else ''}{self.low:g}"
-            most = (
-                f" to {self.high:g}" if self.high < math.inf else "" if self.above else " or more"
-            )
+            if self.high == math.inf:
+                limits = f"above {self.low:g}" if self.above else f"{self.low:g} or more"
+            elif self.above:
+                limits = f"above {self.low:g} and at most {self.high:g}"
+            else:
+                limits = f"between {self.low:g} and {self.high:g}"
             raise InputError(
-                f"{kind}: {self.key(name)} {given:g} ({self.text}); give {least}{most}"
+                f"{kind}: {self.key(name)} ({self.text}) must be {limits}, not {given:g}"
             )
 
 
@@ -141,8 +143,8 @@ class JointSettings(CodedSettings):
         super().__post_init__()
         if 0 < self.first < self.least:
             raise InputError(
-                f"{self.kind}: {self.first} heliostats without a calibration; must be 0, or "
-                f"{self.least} to 127"
+                f"{self.kind}: the number of heliostats without a calibration must be 0, or "
+                f"{self.least} to 127, not {self.first}"
             )
 
 

@@ -42,11 +42,13 @@ class FluxLimit:
         if wrong.any():
             place = "" if flux.ndim == 0 else " in row {}, column {}".format(*np.argwhere(wrong)[0])
             raise InputError(
-                f"flux limit: {flux[wrong].flat[0]:g} W/m²{place} must be above 0 and at most "
-                f"{_MOST:g} W/m²"
+                f"flux limit{place} must be above 0 and at most {_MOST:g} W/m², not "
+                f"{flux[wrong].flat[0]:g} W/m²"
             )
         if not 0.0 <= self.margin <= 0.5:
-            raise InputError(f"flux limit: a margin of {self.margin:g} must be from 0 to 0.5")
+            raise InputError(
+                f"flux limit: the margin must be between 0 and 0.5, not {self.margin:g}"
+            )
 
     @classmethod
     def of(cls, limit: "FluxLimit | npt.ArrayLike") -> "FluxLimit":
@@ -110,7 +112,10 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
             ) from None  # fmt: skip
         if len(rows[-1]) != len(rows[0]):
             raise FormatError(
-                path, f"{len(cells)} numbers, but {len(rows[0])} in earlier rows; make them equal",
+                path, (
+                    f"this row has {len(cells)} numbers, but earlier rows have {len(rows[0])}; "
+                    "make all rows equally long"
+                ),
                 where=f"line {number}",
             )  # fmt: skip
     return FluxLimit(np.array(rows[::-1]), margin)

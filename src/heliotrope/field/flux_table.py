@@ -46,11 +46,13 @@ class FluxTable:
         if self.flux.shape != shape or min(shape) < 1:
             raise InputError(
                 f"flux table: {self.flux.shape} values for {shape[0]} temperatures and {shape[1]} "
-                "velocities; give one for each pair"
+                "velocities; specify one per pair"
             )
         for name, axis in (("temperature", self.temperature), ("velocity", self.velocity)):
             if not (np.isfinite(axis).all() and (np.diff(axis) > 0.0).all()):
-                raise InputError(f"flux table: each {name} must be finite and above the one before")
+                raise InputError(
+                    f"flux table: each {name} must be finite and above the previous one"
+                )
         FluxLimit(self.flux)
 
     def at(self, temperature: FloatArray, velocity: FloatArray) -> FloatArray:
@@ -71,7 +73,7 @@ class FluxTable:
             if outside.any():
                 raise InputError(
                     f"flux table: a {name} of {np.asarray(value)[outside].flat[0]:g} {unit} is "
-                    f"outside its {axis[0]:g} to {axis[-1]:g} {unit}; extend the table"
+                    f"outside the table's {axis[0]:g} to {axis[-1]:g} {unit}; extend the table"
                 )
         between = RegularGridInterpolator((self.temperature, self.velocity), self.flux)
         return as_float(between(np.stack([temperature, velocity], axis=-1)))
@@ -165,8 +167,8 @@ def _check(panels: tuple[Panel, ...]) -> None:
         before = outlets.get(panel.path, panel.inlet)
         if abs(panel.inlet - before) > 1.0:
             raise InputError(
-                f"panels: path {panel.path} enters a panel at {panel.inlet:g} °C and left the one "
-                f"before at {before:g} °C; list its panels in the order of the flow"
+                f"panels: path {panel.path} enters a panel at {panel.inlet:g} °C, but leaves the "
+                f"previous one at {before:g} °C; list its panels in the order of the flow"
             )
         outlets[panel.path] = panel.outlet
 
@@ -193,13 +195,14 @@ def read_flux_table(path: str | Path) -> FluxTable:
     ]
     for i, pair in enumerate(zip(*pairs, strict=True)):
         if np.isfinite(table[pair]):
-            rows.refuse(i, "", "this temperature and velocity are there twice; remove one")
+            rows.refuse(i, "", "this pair of temperature and velocity occurs twice; remove one")
         table[pair] = flux[i]
     rows.refuse_bad()
     if np.isnan(table).any():
         t, v = np.argwhere(np.isnan(table))[0]
         raise FormatError(
-            rows.path, f"no flux for {axes[0][t]:g} °C at {axes[1][v]:g} m/s; add the line"
+            rows.path,
+            (f"no flux for {axes[0][t]:g} °C at {axes[1][v]:g} m/s; add a line for this pair"),
         )
     try:
         return FluxTable(as_float(axes[0]), as_float(axes[1]), table)
@@ -224,7 +227,7 @@ def read_panels(path: str | Path) -> tuple[Panel, ...]:
     flows = rows.texts("flow")
     for i, flow in enumerate(flows):
         if flow not in ("up", "down"):
-            rows.refuse(i, "flow", f"{flow!r} is neither up nor down; give one")
+            rows.refuse(i, "flow", f"flow must be up or down, not {flow!r}")
     rows.refuse_bad()
     panels = []
     for i, (name, flow) in enumerate(zip(rows.texts("path"), flows, strict=True)):
@@ -251,5 +254,5 @@ def _rows(path: str | Path, what: str, columns: tuple[str, ...]) -> Rows:
     rows = read_rows(Path(path), what, columns)
     rows.need(columns)
     if not len(rows):
-        raise FormatError(rows.path, f"no rows; it should be {what}")
+        raise FormatError(rows.path, f"the table has no rows; expected {what}")
     return rows

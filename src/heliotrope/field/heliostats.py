@@ -153,7 +153,9 @@ class Heliostats(Value, Framed):
             invalid = ~(np.isfinite(values) & (values > 0))
             if invalid.any():
                 i = int(np.flatnonzero(invalid)[0])
-                raise InputError(f"heliostat {self.names[i]}: {what} {values[i]} m must be above 0")
+                raise InputError(
+                    f"heliostat {self.names[i]}: {what} must be above 0, not {values[i]} m"
+                )
             object.__setattr__(self, what, values)
         clean = {}
         for name, parameter in self.parameters.items():
@@ -162,18 +164,29 @@ class Heliostats(Value, Framed):
             if not np.isfinite(values).all():
                 i = int(np.flatnonzero(~np.isfinite(values))[0])
                 raise InputError(
-                    f"heliostat {self.names[i]}: parameter {name} is {values[i]}; must be a number"
+                    f"heliostat {self.names[i]}: parameter {name} must be a number, not {values[i]}"
                 )
             clean[name] = values
         object.__setattr__(self, "parameters", clean)
         if self.cluster and len(self.cluster) != count:
-            raise InputError(f"heliostats: {len(self.cluster)} cluster names for {count}")
+            raise InputError(
+                f"heliostats: got {len(self.cluster)} cluster names for {count} heliostats; "
+                "specify one per heliostat"
+            )
         if self.machines and len(self.machines) != count:
-            raise InputError(f"heliostats: {len(self.machines)} machines for {count}")
+            raise InputError(
+                f"heliostats: got {len(self.machines)} machines for {count} heliostats; specify "
+                "one per heliostat"
+            )
         if self.aim is not None and self.aim.shape != (count, 3):
-            raise InputError(f"heliostats: aim of shape {self.aim.shape}; it must be ({count}, 3)")
+            raise InputError(
+                f"heliostats: aim has the shape {self.aim.shape}; expected ({count}, 3)"
+            )
         if self.facets is not None and len(self.facets.center) != count:
-            raise InputError(f"heliostats: {len(self.facets.center)} rows of facets for {count}")
+            raise InputError(
+                f"heliostats: got {len(self.facets.center)} rows of facets for {count} heliostats; "
+                "specify one per heliostat"
+            )
         if self.surface is not None:
             facets = 1 if self.facets is None else self.facets.center.shape[1]
             self.surface.check(self.names, facets)
@@ -303,7 +316,7 @@ class Heliostats(Value, Framed):
         outside = (index < -len(self)) | (index >= len(self))
         if outside.any():
             raise InputError(
-                f"rows: {index[outside][0]} is not there; rows go from 0 to {len(self) - 1}"
+                f"rows: there is no row {index[outside][0]}; rows run from 0 to {len(self) - 1}"
             )
         return replace(
             self,
@@ -369,8 +382,8 @@ def rows_in(calibration: Calibrated, names: tuple[str, ...]) -> npt.NDArray[np.i
         return rows
     if size not in (1, count):
         raise InputError(
-            f"calibration of {size} heliostats without names: there are {count}; fit the plant, "
-            "its group or plant[name], which have names"
+            f"the calibration has {size} heliostats without names, but there are {count}; fit the "
+            "plant, its group or plant[name], which have names"
         )
     return np.arange(count) if size > 1 else np.zeros(count, dtype=np.intp)
 

@@ -80,16 +80,16 @@ class HeliostatSize:
         for name in ("width", "height", "pivot_height"):
             value = getattr(self, name)
             if not 0.0 < value < 50.0:
-                raise InputError(f"mirror: {name} {value} m must be above 0 and below 50 m")
+                raise InputError(f"mirror: {name} must be above 0 and below 50 m, not {value} m")
         for name in ("pivot_offset", "clearance"):
             value = getattr(self, name)
             if not 0.0 <= value < 10.0:
-                raise InputError(f"mirror: {name} {value} m must be 0 or more and below 10 m")
+                raise InputError(f"mirror: {name} must be 0 or more and below 10 m, not {value} m")
         if self.pivot_height < 0.5 * self.height:
             raise InputError(
-                f"mirror: pivot {self.pivot_height} m above ground, and the mirror is "
-                f"{self.height} m high, so it would touch the ground when upright; raise the "
-                "pivot to half the height"
+                f"mirror: the pivot is {self.pivot_height} m above ground and the mirror "
+                f"{self.height} m high, so it would touch the ground when upright; raise the pivot "
+                "to half the height"
             )
 
     @property
@@ -126,10 +126,11 @@ class Ground:
         for name in ("tower_height", "nearest"):
             value = getattr(self, name)
             if not 0.0 < value < 1000.0:
-                raise InputError(f"layout: {name} {value} m must be above 0 and below 1000 m")
+                raise InputError(f"layout: {name} must be above 0 and below 1000 m, not {value} m")
         if not 0.05 <= self.half_angle <= np.pi + 1e-9:
             raise InputError(
-                f"layout: half angle {np.degrees(self.half_angle):.0f}° must be 3° to 180°"
+                "layout: half angle must be between 3° and 180°, not "
+                f"{np.degrees(self.half_angle):.0f}°"
             )
 
     def elevation(self, radius: float) -> float:
@@ -354,7 +355,9 @@ def _central(along: FloatArray, room: int) -> FloatArray:
 
 def _check_count(count: int) -> None:
     if not 1 <= count <= MOST:
-        raise InputError(f"layout: {count} heliostats; must be 1 to {MOST}")
+        raise InputError(
+            f"layout: the number of heliostats must be between 1 and {MOST}, not {count}"
+        )
 
 
 def _places(names: Sequence[str], parts: Sequence[FloatArray]) -> Places:
@@ -563,7 +566,7 @@ def lay_out(
     size = mirror or HeliostatSize()
     tall = _tower_height(heliostats, size) if tower_height is None else tower_height
     if not 20.0 <= tall <= 500.0:
-        raise InputError(f"layout: tower height {tall} m; must be 20 to 500 m")
+        raise InputError(f"layout: tower height must be between 20 and 500 m, not {tall} m")
     facing = np.pi if site.latitude_deg < 0.0 else 0.0
     targets, cameras, receiver = _middle(tall, size.pivot_height, facing, kind in TWO_SIDED)
     masts = [t.center for t in targets] + [c.position for c in cameras if c.position is not None]

@@ -51,20 +51,22 @@ class Mark:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise InputError(f"mark {self.name}: kind {self.kind!r}; known: {', '.join(KINDS)}")
+            raise InputError(
+                f"mark {self.name}: unknown kind {self.kind!r}; known: {', '.join(KINDS)}"
+            )
         point = as_vectors(self.point, f"mark {self.name}: point")
         if point.shape != (3,):
-            raise InputError(f"mark {self.name}: point {point.shape} must have the shape (3,)")
+            raise InputError(f"mark {self.name}: point must have the shape (3,), not {point.shape}")
         object.__setattr__(self, "point", point)
         if not (np.isfinite(self.size) and self.size > 0.0):
-            raise InputError(f"mark {self.name}: size {self.size} m must be above 0")
+            raise InputError(f"mark {self.name}: size must be above 0, not {self.size} m")
         if not np.isfinite(self.turn):
-            raise InputError(f"mark {self.name}: turn {self.turn} rad must be finite")
+            raise InputError(f"mark {self.name}: turn must be finite, not {self.turn} rad")
         if self.kind in ("corner", "tee") and not 0.0 < self.stroke < self.size:
             raise InputError(
-                f"mark {self.name}: stroke {self.stroke} m must be above 0 and below its size "
-                f"of {self.size} m"
+                f"mark {self.name}: stroke must be above 0 and below its size of {self.size} m, "
+                f"not {self.stroke} m"
             )
         if self.kind in ("tag", "picture") and not self.code:
-            what = 'a dictionary and number as "4X4_50:7"' if self.kind == "tag" else "a file"
+            what = 'a dictionary and number, such as "4X4_50:7"' if self.kind == "tag" else "a file"
             raise InputError(f"mark {self.name}: a {self.kind} needs its code, {what}")

@@ -33,11 +33,12 @@ class TriangleMesh:
         vertices, faces = as_vectors(self.vertices, "mesh: vertices"), np.asarray(self.faces)
         if vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
             raise InputError(
-                f"mesh: vertices {vertices.shape} and faces {faces.shape}; give (V, 3) and (C, 3)"
+                f"mesh: vertices {vertices.shape} and faces {faces.shape}; expected (V, 3) and (C, "
+                "3)"
             )
         if len(faces) > MOST_FACES:
             raise InputError(
-                f"mesh: {len(faces):,} triangles; give {MOST_FACES:,} at most, about as large as "
+                f"mesh: {len(faces):,} triangles; use at most {MOST_FACES:,}, about as large as "
                 "the beam of a mirror is wide"
             )
         if faces.min() < 0 or faces.max() >= len(vertices):

@@ -50,7 +50,9 @@ class Canting:
         if self.sun is not None:
             object.__setattr__(self, "sun", normalize(self.sun, "canting: sun"))
             if self.sun[2] <= 0.0:
-                raise InputError("canting: the sun is below the horizon then; choose a time by day")
+                raise InputError(
+                    "canting: the sun is below the horizon at that time; choose a time in daylight"
+                )
 
     def take(self, index: npt.NDArray[np.intp]) -> "Canting":
         """Return the canting of some of the mirrors."""
@@ -86,14 +88,16 @@ class FacetGrid:
         """
         counts = np.array([self.columns, self.rows])
         if not ((counts >= 1) & (counts <= 50)).all():
-            raise InputError(f"{self.columns} × {self.rows} facets; give 1 to 50 each way")
+            raise InputError(
+                f"mirrors must have 1 to 50 facets each way, not {self.columns} × {self.rows}"
+            )
         size = np.stack([width, height], axis=-1)
         whole = (size - self.gap * (counts - 1)) / counts
         if self.gap < 0.0 or not (whole > 0.0).all():
             raise InputError(
                 f"gaps of {self.gap:g} m between {self.columns} × {self.rows} facets leave no room "
-                f"on a mirror of {size.min(axis=0)[0]:g} × {size.min(axis=0)[1]:g} m; make them "
-                "smaller"
+                f"on a mirror of {size.min(axis=0)[0]:g} × {size.min(axis=0)[1]:g} m; make the "
+                "gaps smaller"
             )
         step = whole + self.gap
         x, y = (np.arange(n) - 0.5 * (n - 1) for n in counts)
@@ -138,9 +142,9 @@ class MirrorSurface(Value):
         """
         count = len(names)
         limits = {
-            "focal": (0.0, np.inf, "focal length", "m", "above 0"),
-            "slope": (-1e-300, LARGEST_ERROR, "slope error", "rad", f"from 0 to {LARGEST_ERROR:g}"),
-            "reflectivity": (-1e-300, 1.0, "reflectivity", "", "from 0 to 1"),
+            "focal": (0.0, np.inf, "focal length", " m", "above 0"),
+            "slope": (-1e-300, LARGEST_ERROR, "slope error", " rad", f"0 to {LARGEST_ERROR:g}"),
+            "reflectivity": (-1e-300, 1.0, "reflectivity", "", "0 to 1"),
         }
         for key, (low, high, what, unit, text) in limits.items():
             value = getattr(self, key)
@@ -155,16 +159,16 @@ class MirrorSurface(Value):
                 place = tuple(np.argwhere(outside)[0])
                 facet = f", facet {place[1]}" if len(place) > 1 else ""
                 raise InputError(
-                    f"heliostat {names[place[0]]}{facet}: {what} {value[place]:g} {unit} must be "
-                    f"{text} {unit}".rstrip()
+                    f"heliostat {names[place[0]]}{facet}: {what} must be {text}{unit}, not "
+                    f"{value[place]:g}{unit}"
                 )
         if self.maps and len(self.maps) != count:
             raise InputError(f"mirrors: {len(self.maps)} slope maps for {count} mirrors")
         for name, slopes in zip(names, self.maps, strict=bool(self.maps)):
             if slopes is not None and (slopes.ndim != 4 or slopes.shape[::3] != (facets, 2)):
                 raise InputError(
-                    f"heliostat {name}: a slope map of shape {slopes.shape}, but the mirror has "
-                    f"{facets} facets; give ({facets}, rows, columns, 2)"
+                    f"heliostat {name}: the slope map has shape {slopes.shape}, but the mirror has "
+                    f"{facets} facets; expected ({facets}, rows, columns, 2)"
                 )
 
     def take(self, index: npt.NDArray[np.intp]) -> "MirrorSurface":

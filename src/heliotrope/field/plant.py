@@ -336,8 +336,8 @@ class Plant(Value, Framed):
         tables = [g.calibrated.drives.table for g in self.groups.values()]
         if len({table.shape[-2] for table in tables}) > 1:
             raise InputError(
-                "a plant of heliostats with one drive and with two: use its groups one at a time "
-                "(plant.groups)"
+                "the plant has heliostats with one drive and with two drives; use its groups one "
+                "at a time (plant.groups)"
             )
         return Drive(np.concatenate(tables or [np.empty((0, 2, 19))]))
 

@@ -49,8 +49,8 @@ class Target(Value):
         center = as_vectors(self.center, f"target {self.name}: center")
         if corners.shape != (4, 3) or center.shape != (3,):
             raise InputError(
-                f"target {self.name}: corners {corners.shape} and center {center.shape} must "
-                "have shapes (4, 3) and (3,)"
+                f"target {self.name}: corners and center must have the shapes (4, 3) and (3,), not "
+                f"{corners.shape} and {center.shape}"
             )
         object.__setattr__(self, "corners", corners)
         object.__setattr__(self, "center", center)
@@ -60,7 +60,8 @@ class Target(Value):
                 raise InputError(f"target {self.name}: mark {name}: the name occurs twice")
         if np.linalg.norm(np.cross(self._across, self._up)) < 1e-6:
             raise InputError(
-                f"target {self.name}: its corners span no area; give four corners of a rectangle"
+                f"target {self.name}: its corners span no area; specify the four corners of a "
+                "rectangle"
             )
         away = center - corners.mean(axis=0)
         across, up = np.abs(self.axes @ away)
@@ -201,15 +202,21 @@ class Receiver(Value):
     def __post_init__(self) -> None:
         kinds = ("planar", "convex_cylinder", "external_cylinder", "cavity", "mesh")
         if self.kind not in kinds:
-            raise InputError(f"receiver {self.name}: kind {self.kind!r}; known: {', '.join(kinds)}")
+            raise InputError(
+                f"receiver {self.name}: unknown kind {self.kind!r}; known: {', '.join(kinds)}"
+            )
         for name in ("width", "height"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
-                raise InputError(f"receiver {self.name}: {name} {value} m must be above 0")
+                raise InputError(
+                    f"receiver {self.name}: {name} must be above 0 and finite, not {value} m"
+                )
         for name in ("radius", "opening_angle", "nominal_power"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"receiver {self.name}: {name} {value} must be 0 or more")
+                raise InputError(
+                    f"receiver {self.name}: {name} must be 0 or more and finite, not {value}"
+                )
         center = as_vectors(self.center, f"receiver {self.name}: center")
         object.__setattr__(self, "center", center)
         normal = normalize(self.normal, f"receiver {self.name}: normal")
@@ -288,8 +295,8 @@ class Receiver(Value):
         """
         if self.kind != "planar":
             raise InputError(
-                f"receiver {self.name}: it is {self.kind.replace('_', ' ')}, and only a planar one "
-                "has a face"
+                f"receiver {self.name} has no face: its kind is {self.kind.replace('_', ' ')}, and "
+                "only planar receivers have one"
             )
         return self.aperture
 

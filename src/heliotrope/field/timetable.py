@@ -69,7 +69,7 @@ class TimetableEntry:
             raise InputError(f"{who}: heliostat {twice} is listed twice; list it once")
         if self.rule:
             if self.rule not in RULES:
-                raise InputError(f"{who}: rule {self.rule!r}; use {' or '.join(RULES)}")
+                raise InputError(f"{who}: unknown rule {self.rule!r}; use {' or '.join(RULES)}")
             if self.at or self.every is not None or self.target:
                 raise InputError(
                     f"{who}: {self.rule!r} applies at all times; remove times and target"
@@ -85,7 +85,8 @@ class TimetableEntry:
             )
         if self.every is not None and not LEAST_INTERVAL <= self.every <= DAY:
             raise InputError(
-                f"{who}: interval is {self.every:g} s; must be {LEAST_INTERVAL:g} to {DAY:g} s"
+                f"{who}: the interval must be between {LEAST_INTERVAL:g} and {DAY:g} s, not "
+                f"{self.every:g} s"
             )
         for text in self.at:
             _second_of_day(who, text)

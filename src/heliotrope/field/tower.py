@@ -31,6 +31,6 @@ class Tower:
         places = (self.east, self.north, self.bottom, self.top)
         if not (np.isfinite(places).all() and self.radius > 0.0 and self.top > self.bottom):
             raise InputError(
-                f"tower: radius {self.radius} m must be above 0, and its top {self.top} m above "
-                f"its bottom {self.bottom} m"
+                f"tower: radius must be above 0, and top above bottom; radius is {self.radius} m, "
+                f"top {self.top} m and bottom {self.bottom} m"
             )

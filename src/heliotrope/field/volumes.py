@@ -103,14 +103,14 @@ class Prism:
         corners = as_float(self.corners)
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
             raise InputError(
-                f"volume {self.name}: corners of shape {corners.shape}; must be at least 3 "
+                f"volume {self.name}: corners have the shape {corners.shape}; specify at least 3 "
                 "points, (K, 2)"
             )
         if not (np.isfinite(corners).all() and np.isfinite([self.bottom, self.top]).all()):
             raise InputError(f"volume {self.name}: a corner or height is not finite")
         if not self.top > self.bottom:
             raise InputError(
-                f"volume {self.name}: top {self.top:g} m must be above bottom {self.bottom:g} m"
+                f"volume {self.name}: top ({self.top:g} m) must be above bottom ({self.bottom:g} m)"
             )
         if (np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) == 0.0).any():
             raise InputError(f"volume {self.name}: two neighbouring corners coincide")
@@ -182,10 +182,12 @@ def _shadow(start: FloatArray, end: FloatArray, circle: FloatArray) -> FloatArra
 def _point(name: str, what: str, value: npt.ArrayLike) -> FloatArray:
     point = as_vectors(value, f"volume {name}: {what}")
     if point.shape != (3,):
-        raise InputError(f"volume {name}: {what} of shape {point.shape}; must be 3 numbers")
+        raise InputError(
+            f"volume {name}: {what} must be 3 numbers, but has the shape {point.shape}"
+        )
     return point
 
 
 def _positive(name: str, what: str, value: float) -> None:
     if not (np.isfinite(value) and value > 0.0):
-        raise InputError(f"volume {name}: {what} {value} m must be above 0 and finite")
+        raise InputError(f"volume {name}: {what} must be above 0 and finite, not {value} m")

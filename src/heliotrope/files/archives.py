@@ -62,13 +62,13 @@ def read_members(
                 raise FormatError(
                     file,
                     f"{file.stat().st_size / MIB:.3g} MiB expand to {size / MIB:,.0f} MiB, above "
-                    f"the limit of {most / MIB:.0f} MiB; it should be {what}",
+                    f"the limit of {most / MIB:.0f} MiB; expected {what}",
                 )
             return {name: _expanded(archive, entries[name]) for name in required}
     except FormatError:
         raise
     except _DAMAGED as error:
-        raise FormatError(file, f"not a readable archive ({error}); it should be {what}") from None
+        raise FormatError(file, f"not a readable archive ({error}); expected {what}") from None
 
 
 def _expanded(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
@@ -88,13 +88,12 @@ def _check_contents(file: Path, what: str) -> None:
         tail = stream.read()
     place = tail.rfind(_END)
     if place < 0 or len(tail) < place + 22:
-        raise FormatError(file, f"not a readable archive; it should be {what}")
+        raise FormatError(file, f"not a readable archive; expected {what}")
     size = int.from_bytes(tail[place + 12 : place + 16], "little")
     if size > _CONTENTS or _END_64 in tail[max(0, place - 20) : place]:
         raise FormatError(
             file,
-            f"its table of contents exceeds the limit of {_CONTENTS // 1024} KiB; "
-            f"it should be {what}",
+            f"its table of contents exceeds the limit of {_CONTENTS // 1024} KiB; expected {what}",
         )
 
 
@@ -124,7 +123,7 @@ def read_arrays(
             arrays[member.removesuffix(".npy")] = _array(content)
         except (ValueError, SyntaxError, TypeError, EOFError) as error:
             raise FormatError(
-                path, f"no array written by NumPy ({str(error)[:80]}); it should be {what}", member
+                path, f"not an array written by NumPy ({str(error)[:80]}); expected {what}", member
             ) from None
     return arrays
 

@@ -173,10 +173,10 @@ class Rows:
         values = _numbers(cells)
         for i in np.flatnonzero(~np.isfinite(values)):
             if not _empty(cells[i]):
-                hint = _hint(str(cells[i])) or f"give {what}"
+                hint = _hint(str(cells[i])) or f"enter {what}"
                 self.refuse(i, column, f"{_shown(cells[i])} is not a finite number; {hint}")
             elif empty is None:
-                self.refuse(i, column, f"the cell is empty; give {what}")
+                self.refuse(i, column, f"the cell is empty; enter {what}")
             else:
                 values[i] = empty
         return values
@@ -197,11 +197,13 @@ class Rows:
         for i, name in enumerate(names):
             other = first.setdefault(alike(name), i)
             if not name.strip():
-                self.refuse(i, column, f"a {what} without a name; give it one")
+                self.refuse(i, column, f"the {what} has no name; enter one")
             elif other != i:
-                close = "" if names[other] == name else f" but for case or blanks ({names[other]})"
+                close = (
+                    "" if names[other] == name else f" apart from case or blanks ({names[other]})"
+                )
                 place = self.places[other]
-                text = f"{name} is the name of {place} too{close}; names are unique"
+                text = f"{name} is already the name of {place}{close}; each name must be unique"
                 self.refuse(i, column, text)
         return tuple(names)
 
@@ -210,7 +212,7 @@ class Rows:
         for i in np.flatnonzero(wrong):
             self.refuse(i, column, f"{values[i]:.10g}{reason}")
 
-    def flags(self, column: str, advice: str = "give one") -> npt.NDArray[np.bool_]:
+    def flags(self, column: str, advice: str = "enter one of them") -> npt.NDArray[np.bool_]:
         """Return booleans; rows with cells that are neither true nor false are left out."""
         flags = np.zeros(len(self), dtype=np.bool_)
         for i, cell in enumerate(self.columns[column]):
@@ -227,7 +229,7 @@ class Rows:
         for i, cell in enumerate(self.columns[column]):
             if _empty(cell):
                 if not optional:
-                    self.refuse(i, column, "the cell is empty; give a time in ISO 8601 with Z")
+                    self.refuse(i, column, "the cell is empty; enter a time in ISO 8601 with Z")
                 continue
             try:
                 text = cell.isoformat() if isinstance(cell, datetime) else str(cell)
@@ -298,7 +300,7 @@ def read_cells(
     except csv.Error as error:
         raise FormatError(path, f"not a CSV table ({error})", f"line {reader.line_num}") from None
     if not table:
-        raise FormatError(path, f"the file has no rows; it should be {what}")
+        raise FormatError(path, f"the file has no rows; expected {what}")
     return places, table
 
 
@@ -393,7 +395,7 @@ def read_parquet(path: Path, what: str) -> Rows:
         cells = [_cells_of(column) for column in table.columns]
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = str(error).split("\n", maxsplit=1)[0]
-        raise FormatError(path, f"not a Parquet table ({reason}); it should be {what}") from None
+        raise FormatError(path, f"not a Parquet table ({reason}); expected {what}") from None
     if len(set(names)) != len(names):
         raise FormatError(path, "two columns have the same name; name each column once")
     columns = dict(zip(names, cells, strict=True))
@@ -409,7 +411,9 @@ def _check_parquet(path: Path, about: "pq.FileMetaData") -> None:
     for i in range(about.num_columns):
         if about.schema.column(i).max_repetition_level:
             raise FormatError(
-                path, "a column of lists; give single values", about.schema.column(i).path
+                path,
+                ("this column contains lists; each cell must contain a single value"),
+                about.schema.column(i).path,
             )
 
 
@@ -438,7 +442,7 @@ def rows_of(names: Sequence[str]) -> dict[str, int]:
     index = {name: i for i, name in enumerate(names)}
     if len(index) != len(names):
         twice = next(name for i, name in enumerate(names) if index[name] != i)
-        raise InputError(f"heliostat {twice}: the name occurs twice; names are unique")
+        raise InputError(f"heliostat {twice}: the name occurs twice; each name must be unique")
     return index
 
 
@@ -501,10 +505,10 @@ def check_names(what: str, names: Iterable[str]) -> None:
     taken: dict[str, str] = {}
     for name in listed:
         if not name.strip():
-            raise InputError(f"{what}: an empty name; each {what} needs one")
+            raise InputError(f"{what}: a name is empty; each {what} needs a name")
         if other := taken.get(alike(name), ""):
-            twice = "the name occurs twice; names are unique"
-            close = f"there is {other} too; names differ by more than case and blanks"
+            twice = "the name occurs twice; each name must be unique"
+            close = f"there is also {other}; names must differ by more than case and blanks"
             raise InputError(f"{what} {name}: {twice if other == name else close}")
         taken[alike(name)] = name
 
@@ -536,7 +540,7 @@ def _hint(text: str) -> str:
     if _DECIMAL_COMMA.fullmatch(text):
         return "write a point, not a comma"
     if _THOUSANDS.fullmatch(text):
-        return "leave out the separators of thousands, and write a point for the decimals"
+        return "omit the thousands separators, and use a decimal point"
     if text.startswith("\u2212"):
         return "write the minus sign as -"
     return ""

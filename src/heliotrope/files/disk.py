@@ -72,7 +72,7 @@ class DiskThread:
     def do(self, work: Work, then: Then) -> None:
         """Do work in the thread; see `Disk.do`."""
         if (count := self._waiting.qsize()) >= self._most:
-            raise DiskBusyError(f"{count} records wait for the disk; see to it")
+            raise DiskBusyError(f"{count} records are waiting to be written; check the disk")
         loop = asyncio.get_running_loop()
 
         def run() -> None:

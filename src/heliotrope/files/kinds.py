@@ -8,7 +8,7 @@ _FOREIGN: tuple[tuple[str, bytes, str, str], ...] = (
     (
         "",
         rb"version https://git-lfs",
-        "a pointer of Git LFS instead of the file",
+        "a Git LFS pointer instead of the file",
         "fetch the file with `git lfs pull`",
     ),
     (
@@ -58,7 +58,7 @@ _OWN: tuple[tuple[bytes, str, str, str], ...] = (
         rb"\x89HDF",
         "HDF5",
         "an HDF5 file",
-        "of ARTIST's scenarios, give the PAINT folder that they were made of",
+        "for an ARTIST scenario, specify the PAINT folder from which it was made",
     ),
     (
         rb"\x89PNG|\xff\xd8\xff|II\*\x00|MM\x00\*",

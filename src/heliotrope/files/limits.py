@@ -85,16 +85,16 @@ def check_file(
             if stat.S_ISDIR(state.st_mode):
                 raise IsADirectoryError
             if not stat.S_ISREG(state.st_mode):
-                raise FormatError(file, f"this is a device or a pipe; give a file: {what}")
+                raise FormatError(file, f"this is a device or a pipe; specify a file: {what}")
             start = stream.read(4096)
     except FileNotFoundError:
-        raise FormatError(file, f"no such file; give the path of {what}") from None
+        raise FormatError(file, f"no such file; specify the path of {what}") from None
     except IsADirectoryError:
-        raise FormatError(file, f"this is a folder; give the path of {what}") from None
+        raise FormatError(file, f"this is a folder; specify the path of {what}") from None
     except OSError as error:
-        raise FormatError(file, f"cannot be read ({error.strerror}); it should be {what}") from None
+        raise FormatError(file, f"cannot be read ({error.strerror}); expected {what}") from None
     if not start:
-        raise FormatError(file, f"the file is empty; it should be {what}")
+        raise FormatError(file, f"the file is empty; expected {what}")
     if text := foreign(file, start):
         raise FormatError(file, text)
     if state.st_size > limit:
@@ -103,7 +103,7 @@ def check_file(
             f"{_mib(state.st_size)} MiB exceed the limit of {_mib(limit)} MiB; this is not {what}",
         )
     if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise FormatError(file, instead(start, what) or f"the file is binary; it should be {what}")
+        raise FormatError(file, instead(start, what) or f"the file is binary; expected {what}")
     return file
 
 
@@ -174,7 +174,9 @@ def _check_depth(path: str | Path, text: str, tokens: Iterable["re.Match[str]"])
             if depth > DEPTH:
                 where = _line(text, token.start())
                 raise FormatError(
-                    path, f"nested too deeply: more than {DEPTH} levels; write it flatter", where
+                    path,
+                    (f"nested too deeply: more than {DEPTH} levels; flatten the structure"),
+                    where,
                 )
 
 

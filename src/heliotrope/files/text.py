@@ -71,7 +71,7 @@ def read_bytes(path: str | Path, limit: int = SIZE_LIMIT) -> bytes:
     """
     with Path(path).open("rb") as stream:
         content = stream.read(limit + 1)
-    check_count(path, len(content), limit, "bytes", "it is no file of this kind")
+    check_count(path, len(content), limit, "bytes", "this is not a file of this kind")
     return content
 
 
@@ -93,7 +93,7 @@ def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
     file = Path(path)
     if file.exists() and not (file.is_file() or file.is_dir()):
         # Replacing a device would remove it for every program, and as root even /dev/null.
-        raise InputError(f"{file}: this is a device or a pipe, not a file; give a file")
+        raise InputError(f"{file}: this is a device or a pipe, not a file; specify a file")
     beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         with beside.open("wb") as stream:
@@ -102,9 +102,9 @@ def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
             os.fsync(stream.fileno())
         beside.replace(file)
     except OSError as error:
-        advice = "give a folder that exists and may be written to"
+        advice = "choose a folder that exists and is writable"
         if error.errno in _FULL:
-            advice = "free some space, or give a folder on another disk"
+            advice = "free some space, or choose a folder on another disk"
         raise InputError(f"{file}: cannot be written ({error.strerror}); {advice}") from None
     finally:
         beside.unlink(missing_ok=True)

@@ -79,20 +79,20 @@ def read_xml(path: str | Path, what: str) -> Document:
     file = check_file(path, what)
     content = read_bytes(file)
     tags = content.count(b"<")
-    check_count(file, tags, 2 * XML_PARTS, "tags", f"divide it; it should be {what}")
+    check_count(file, tags, 2 * XML_PARTS, "tags", f"divide it; expected {what}")
     # All attributes of a tag are in memory before they can be counted.
     if (tag := _LONG_TAG.search(content)) is not None:
         line = content.count(b"\n", 0, tag.start()) + 1
         raise FormatError(
             file,
-            f"a tag or a text exceeds the limit of {XML_TAG // 1024:,} KiB; it should be {what}",
+            f"a tag or a text exceeds the limit of {XML_TAG // 1024:,} KiB; expected {what}",
             f"line {line}",
         )
     builder = _Builder(file)
     try:
         builder.parser.Parse(content, True)
     except expat.ExpatError as error:
-        problem = f"not well-formed XML ({expat.ErrorString(error.code)}); it should be {what}"
+        problem = f"not well-formed XML ({expat.ErrorString(error.code)}); expected {what}"
         other = instead(content[:4096], what, "XML")
         raise FormatError(file, other or problem, "" if other else f"line {error.lineno}") from None
     return Document(builder.root, str(file))
@@ -115,7 +115,8 @@ class _Builder:
     def _refuse_type(self, *_about: object) -> None:
         raise FormatError(
             self._file,
-            "it has a document type (<!DOCTYPE), which could define entities; remove it",
+            "the file has a document type (<!DOCTYPE), which could define entities; remove the "
+            "document type",
             f"line {self.parser.CurrentLineNumber}",
         )
 
@@ -127,7 +128,7 @@ class _Builder:
         if len(self._open) >= DEPTH:
             raise FormatError(
                 self._file,
-                f"nested too deeply: more than {DEPTH} levels; write it flatter",
+                f"nested too deeply: more than {DEPTH} levels; flatten the structure",
                 f"line {line}",
             )
         pairs = zip(map(_qualified, attributes[::2]), attributes[1::2], strict=True)

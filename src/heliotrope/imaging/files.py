@@ -250,7 +250,7 @@ def _open(file: Path, data: bytes, limit: int) -> _Container:
         elif kind == "WebP" and cast("WebPImagePlugin.WebPImageFile", image).is_animated:
             raise FormatError(file, "this WebP is animated; save one of its frames")
         if image.mode == "CMYK":
-            raise FormatError(file, "its colours are CMYK; convert it to RGB or grey")
+            raise FormatError(file, "its colours are CMYK; convert the image to RGB or grey")
         return _Container(kind, image, data, _exif(image.getexif))
     except _FAULTS as error:
         raise _damaged(file, kind, len(data), error) from None
@@ -334,20 +334,29 @@ def _check_tiff(file: Path, image: TiffImagePlugin.TiffImageFile, data: bytes) -
     bits, form = tags.get(258, (1,)), tags.get(339, (1,))[0]
     photometric, channels = tags.get(262, 1), tags.get(277, 1)
     if photometric == 5:
-        raise FormatError(file, "its colours are CMYK; convert it to RGB or grey")
+        raise FormatError(file, "its colours are CMYK; convert the image to RGB or grey")
     if form == 3:
-        raise FormatError(file, f"its pixels are floats of {bits[0]} bits; convert it to 16 bits")
+        raise FormatError(
+            file, (f"its pixels are {bits[0]}-bit floats; convert the image to 16 bits")
+        )
     if form not in (1, 4) or set(bits) not in ({1}, {8}, {16}):
-        raise FormatError(file, f"pixels of {bits[0]} bits, form {form}; convert it to 16 bits")
+        raise FormatError(
+            file,
+            (f"unsupported pixels of {bits[0]} bits, format {form}; convert the image to 16 bits"),
+        )
     if photometric not in (0, 1, 2, 3, 6) or channels > 4:
-        raise FormatError(file, f"{channels} channels of kind {photometric}; convert it to RGB")
+        raise FormatError(
+            file,
+            f"unsupported colour format: {channels} channels, {photometric}; convert the image "
+            "to RGB",
+        )
     starts, lengths = (tags.get(a, tags.get(b, ())) for a, b in ((273, 324), (279, 325)))
     if len(starts) != len(lengths):
         raise FormatError(
             file, "its TIFF directory lists no strips, so the file is damaged; copy it again"
         )
     if any(not kind & 1 for kind in _further_pages(data)):
-        raise FormatError(file, "this TIFF has several pages; save each as a file of its own")
+        raise FormatError(file, "this TIFF has several pages; save each as a separate file")
 
 
 def _further_pages(data: bytes) -> Iterator[int]:
@@ -635,7 +644,7 @@ def encode_image(
     if jpeg and frame.pixels.dtype != np.uint8:
         raise InputError(f"{name}: a JPEG holds 8 bits, the frame has 16; write a PNG or a TIFF")
     if not 1 <= quality <= 100:
-        raise InputError(f"{name}: quality {quality}; must be 1 to 100")
+        raise InputError(f"{name}: quality must be between 1 and 100, not {quality}")
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if jpeg else []
     done, encoded = cv2.imencode(suffix, frame.pixels, options)
     if not done:

@@ -113,7 +113,9 @@ class Frame:
         if gamma == 1.0:
             return self
         if not 0.2 <= gamma <= 5.0:
-            raise InputError(f"gamma {gamma} must be from 0.2 to 5; 1 is linear, 2.2 is usual")
+            raise InputError(
+                f"gamma must be between 0.2 and 5 (1 is linear, 2.2 is usual), not {gamma}"
+            )
         top = int(self.full_scale)
         table = np.round(65535.0 * (np.arange(top + 1) / top) ** gamma).astype(np.uint16)
         return replace(self, pixels=table[self.pixels])

@@ -180,7 +180,7 @@ def calibrate_corners(
     model is the one with the least Bayesian information criterion.
     """
     if not (np.isfinite(square) and square > 0.0):
-        raise InputError(f"squares of {square} m; specify their side in metres, above 0")
+        raise InputError(f"the side of a square must be above 0, not {square} m")
     columns, rows = pattern
     plane = np.indices((rows, columns))[::-1].reshape(2, -1).T * square
     points = np.pad(plane, ((0, 0), (0, 1)))

@@ -124,12 +124,12 @@ class MotionSettings:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.false_alarms < 0.5:
-            raise InputError(f"false alarms {self.false_alarms} must be above 0 and below 0.5")
+            raise InputError(f"false alarms must be above 0 and below 0.5, not {self.false_alarms}")
         if not (self.min_area_px >= 0.0 and 0.0 <= self.max_shift_px < math.inf):
-            text = f"least area {self.min_area_px} px and greatest shift {self.max_shift_px} px"
-            raise InputError(f"{text} must be 0 or more")
+            text = f"not {self.min_area_px} px and {self.max_shift_px} px"
+            raise InputError(f"least area and greatest shift must be 0 or more, {text}")
         if not 1.0 < self.max_ratio < math.inf:
-            raise InputError(f"greatest ratio of brightness {self.max_ratio} must be above 1")
+            raise InputError(f"greatest ratio of brightness must be above 1, not {self.max_ratio}")
 
 
 DEFAULT = MotionSettings()
@@ -616,7 +616,9 @@ class MotionDetector:
         warm_up: int = 5,
     ) -> None:
         if not 1.0 <= memory < math.inf or warm_up < 1:
-            raise InputError(f"memory {memory} and warm-up {warm_up} frames must be 1 or more")
+            raise InputError(
+                f"memory and warm-up must be 1 frame or more, not {memory} and {warm_up} frames"
+            )
         self._mask, self._settings = mask, settings
         self._memory, self._warm_up = memory, warm_up
         self._background: _View | None = None

@@ -341,13 +341,14 @@ def _check_photographs(
     for frame in (capped, dark, *(frame for frame, _ in with_beams)):
         if frame.size != sight.size:
             raise InputError(
-                f"{who}: {frame.name} has {frame.size[0]} × {frame.size[1]} px, the camera "
-                f"{sight.size[0]} × {sight.size[1]}"
+                f"{who}: {frame.name} has {frame.size[0]} × {frame.size[1]} px, but the camera has "
+                f"{sight.size[0]} × {sight.size[1]} px"
             )
     for frame, share in with_beams:
         if not 0.0 < share <= 2.0:
             raise InputError(
-                f"{who}: {frame.name} at a share of {share:g}; give above 0 to 2, 1 is nominal"
+                f"{who}: the share of {frame.name} must be above 0 and at most 2 (1 is nominal), "
+                f"not {share:g}"
             )
     if not with_beams:
         raise InputError(

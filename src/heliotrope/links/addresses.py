@@ -37,11 +37,11 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
         parts = urlsplit(url)
         port = parts.port
     except ValueError:
-        raise FormatError(path, f"{url!r} is not a URL; give tcp://host:port", where) from None
+        raise FormatError(path, f"{url!r} is not a URL; use tcp://host:port", where) from None
     if parts.scheme not in _PORTS or not parts.hostname:
         raise FormatError(
             path,
-            f"{url!r}: give tcp://host:port, mqtt://host/prefix or mqtts://host/prefix",
+            f"{url!r}: use tcp://host:port, mqtt://host/prefix or mqtts://host/prefix",
             where,
         )
     port = port or _PORTS[parts.scheme]

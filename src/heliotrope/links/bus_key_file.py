@@ -30,10 +30,10 @@ def read_bus_keys(path: Path) -> LinkKeys:
     refuse_others(path)
     values = raw.get("keys")
     if set(raw) != {"keys"} or not isinstance(values, list) or len(values) > _MOST:
-        raise FormatError(path, f"give keys alone, a list of at most {_MOST}")
+        raise FormatError(path, f"the file must contain only keys, a list of at most {_MOST}")
     keys = tuple(_key(path, value) for value in values)
     if len(set(keys)) < len(keys):
-        raise FormatError(path, "the same key twice; give each once", "keys")
+        raise FormatError(path, "a key occurs twice; list each key once", "keys")
     return keys
 
 
@@ -46,7 +46,8 @@ def _key(path: Path, value: object) -> bytes:
         # The value is not shown, because it would end up in a log.
         raise FormatError(
             path,
-            f"not a key; give {KEY_SIZE} bytes in hexadecimal, as heliotrope keys bus new makes",
+            f"not a key; a key has {KEY_SIZE} bytes in hexadecimal, as created by heliotrope keys "
+            "bus new",
             "keys",
         )
     return key
@@ -86,7 +87,7 @@ class BusKeyFile:
         """
         if self.keys:
             raise InputError(
-                f"{self.path}: it has a key already; to replace it while the cluster runs, say "
+                f"{self.path}: it already has a key; to replace it while the cluster runs, run "
                 "heliotrope keys bus rotate"
             )
         self._write(secrets.token_bytes(KEY_SIZE))
@@ -100,10 +101,10 @@ class BusKeyFile:
             If there is no key, or there are two.
         """
         if not self.keys:
-            raise InputError(f"{self.path}: it has no key; say heliotrope keys bus new")
+            raise InputError(f"{self.path}: it has no key; run heliotrope keys bus new")
         if len(self.keys) == _MOST:
             raise InputError(
-                f"{self.path}: it has two keys already; say heliotrope keys bus end when all local "
+                f"{self.path}: it already has two keys; run heliotrope keys bus end when all local "
                 "controllers have the new one"
             )
         self._write(secrets.token_bytes(KEY_SIZE), *self.keys)
@@ -117,7 +118,9 @@ class BusKeyFile:
             If there is no old key.
         """
         if len(self.keys) < _MOST:
-            raise InputError(f"{self.path}: it has no old key beside a new one; nothing to end")
+            raise InputError(
+                f"{self.path}: it has no old key beside a new one; there is nothing to end"
+            )
         self._write(self.keys[0])
 
     def off(self) -> None:

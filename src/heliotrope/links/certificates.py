@@ -68,7 +68,10 @@ def certify(
         If a key cannot be used.
     """
     if not 1 <= days <= LONGEST:
-        raise InputError(f"keys tls: {days} days; give 1 to {LONGEST}, which browsers take")
+        raise InputError(
+            f"keys tls: the validity must be 1 to {LONGEST} days, the most that browsers accept, "
+            f"not {days} days"
+        )
     subject, alternative = _subject(names)
     ours, signing = _authority(folder, now)
     place, key = _key(folder, server)
@@ -112,7 +115,9 @@ def request(folder: Path, names: Sequence[str], *, server: str = SERVER) -> Cert
 def _subject(names: Sequence[str]) -> tuple[x509.Name, x509.SubjectAlternativeName]:
     """Return the subject, and the names that a client compares with the address it uses."""
     if not names:
-        raise InputError("keys tls: give the name that people type, as --name plant.example.org")
+        raise InputError(
+            "keys tls: specify the name that users type, such as --name plant.example.org"
+        )
     general = [_general(name) for name in names]
     common = x509.NameAttribute(NameOID.COMMON_NAME, names[0][:64])
     return x509.Name([common]), x509.SubjectAlternativeName(general)
@@ -128,7 +133,8 @@ def _general(name: str) -> x509.GeneralName:
         plain = part.isascii() and part.replace("-", "a").isalnum() and part.strip("-") == part
         if not plain or len(part) > 63 or len(name) > 253:
             raise InputError(
-                f"keys tls: {name!r} is no host name and no address; give one as plant.example.org"
+                f"keys tls: {name!r} is neither a host name nor an address; use one such as "
+                "plant.example.org"
             )
     return x509.DNSName(name.lower())
 
@@ -141,9 +147,12 @@ def _authority(folder: Path, now: datetime) -> tuple[x509.Certificate, ec.Ellipt
         try:
             found = x509.load_pem_x509_certificate(file.read_bytes())
         except (OSError, ValueError):
-            raise FormatError(file, "it is no certificate; move it away") from None
+            raise FormatError(file, "this is not a certificate; move it away") from None
         if found.public_key() != key.public_key():
-            raise FormatError(file, f"it does not belong to {AUTHORITY}.key; put that one back")
+            raise FormatError(
+                file,
+                (f"this certificate does not belong to {AUTHORITY}.key; restore the right one"),
+            )
         return found, key
     _, key = _key(folder, AUTHORITY)
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Heliotrope plant authority")])
@@ -183,12 +192,12 @@ def _read(file: Path) -> ec.EllipticCurvePrivateKey:
     try:
         data = file.read_bytes()
     except OSError as error:
-        raise FormatError(file, f"cannot be read ({error.strerror}); put it back") from None
+        raise FormatError(file, f"cannot be read ({error.strerror}); restore it") from None
     refuse_others(file)
     try:
         found = load_pem_private_key(data, None)
     except (ValueError, TypeError):
-        raise FormatError(file, "it is no private key without a password; move it away") from None
+        raise FormatError(file, "not a private key without a password; move it away") from None
     if not isinstance(found, ec.EllipticCurvePrivateKey):
-        raise FormatError(file, "it is no elliptic-curve key; move it away")
+        raise FormatError(file, "not an elliptic-curve key; move it away")
     return found

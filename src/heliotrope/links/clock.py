@@ -154,7 +154,7 @@ def leap_seconds(utc: datetime) -> int:
         If the time has no time zone, or is before the start of the GPS time scale.
     """
     if utc.tzinfo is None:
-        raise TimeError(f"{utc} has no time zone; give UTC")
+        raise TimeError(f"{utc} has no time zone; pass UTC")
     for since, count in reversed(LEAP_SECONDS):
         if utc >= since:
             return count

@@ -57,7 +57,7 @@ def gpsd_at(path: Path, text: str, key: str) -> tuple[str, int]:
     except ValueError:
         host = None
     if not host or parts.path:
-        raise FormatError(path, f"{text!r}: give host or host:port of gpsd", key)
+        raise FormatError(path, f"{text!r}: specify host or host:port of gpsd", key)
     return host, port
 
 

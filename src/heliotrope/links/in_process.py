@@ -46,11 +46,13 @@ class Faults:
         for name in ("loss", "duplication", "reordering", "corruption"):
             value = getattr(self, name)
             if not 0.0 <= value <= 1.0:
-                raise InputError(f"faults: the probability of {name} is {value}; give 0 to 1")
+                raise InputError(
+                    f"faults: the probability of {name} must be between 0 and 1, not {value}"
+                )
         low, high = self.delay
         if not 0.0 <= low <= high < float("inf"):
             raise InputError(
-                f"faults: a delay of {low} to {high} s; give the shortest and the longest time, "
+                f"faults: a delay of {low} to {high} s; pass the shortest and the longest delay, "
                 "neither negative"
             )
 

@@ -71,8 +71,8 @@ def ring_of(name: str, key: bytes | KeyRing) -> KeyRing:
     for secret in ring.keys or (b"",):
         if len(secret) < _SHORTEST_KEY:
             raise InputError(
-                f"cluster {name}: a key of {len(secret)} bytes; give at least {_SHORTEST_KEY} "
-                "random ones"
+                f"cluster {name}: a key of {len(secret)} bytes; use at least {_SHORTEST_KEY} "
+                "random bytes"
             )
     if not 0 < len(name.encode()) <= _LONGEST_NAME:
         raise InputError(f"cluster {name!r}: a name has 1 to {_LONGEST_NAME} bytes")
@@ -122,12 +122,12 @@ class Keys:
         refuse_others(path)
         for key in raw:
             if key not in ("plant", "password", table):
-                raise FormatError(path, f"{key!r} is not known; give plant, password, {table}")
+                raise FormatError(path, f"{key!r} is not known; use plant, password, {table}")
         if "plant" in raw:
             self.plant = self._keys("plant", raw["plant"], _MOST)
         password, keys = raw.get("password", ""), raw.get(table, {})
         if not isinstance(password, str) or not isinstance(keys, dict):
-            raise FormatError(path, f"password must be a text, and {table} a table of keys")
+            raise FormatError(path, f"password must be text, and {table} a table of keys")
         self.password = password
         most = _MOST if table == CLUSTERS else 1
         self.members = {name: self._keys(name, value, most) for name, value in keys.items()}
@@ -135,10 +135,10 @@ class Keys:
     def _keys(self, name: str, value: object, most: int) -> LinkKeys:
         values = value if isinstance(value, list) else [value]
         if not 1 <= len(values) <= most:
-            raise FormatError(self._path, f"{len(values)} keys; give 1 to {most}", name)
+            raise FormatError(self._path, f"found {len(values)} keys; specify 1 to {most}", name)
         keys = tuple(self._key(name, entry) for entry in values)
         if len(set(keys)) < len(keys):
-            raise FormatError(self._path, "the same key twice; give each once", name)
+            raise FormatError(self._path, "a key occurs twice; list each key once", name)
         return keys
 
     def _key(self, name: str, value: object) -> bytes:
@@ -148,8 +148,8 @@ class Keys:
             # The value is not shown, because it would end up in a log.
             raise FormatError(
                 self._path,
-                f"a key of {len(text)} characters; give {_SHORTEST_KEY} to {_LONGEST_KEY} bytes "
-                "in hexadecimal, as heliotrope keys new makes it",
+                f"a key of {len(text)} characters; use {_SHORTEST_KEY} to {_LONGEST_KEY} bytes in "
+                "hexadecimal, as created by heliotrope keys new",
                 name,
             )
         return bytes.fromhex(text)
@@ -229,8 +229,8 @@ class KeyFile:
         for name in clusters:
             if name in self.links:
                 raise InputError(
-                    f"{self.path}: cluster {name} has a key already; to replace it while plant and "
-                    "cluster run, say heliotrope keys rotate"
+                    f"{self.path}: cluster {name} already has a key; to replace it while plant and "
+                    "cluster run, run heliotrope keys rotate"
                 )
         made = {name: secrets.token_bytes(_SIZE) for name in clusters}
         self._write({name: (key,) for name, key in made.items()})
@@ -258,9 +258,11 @@ class KeyFile:
             If the file has that key, or two others, or is a plant's file.
         """
         if any(name != "plant" for name in self.links):
-            raise InputError(f"{self.path}: it is a plant's key file; take belongs to a cluster's")
+            raise InputError(
+                f"{self.path}: this is a plant's key file; take works only on a cluster's key file"
+            )
         if key in self.links.get("plant", ()):
-            raise InputError(f"{self.path}: it has the key {fingerprint(key)} already")
+            raise InputError(f"{self.path}: it already has the key {fingerprint(key)}")
         self._write({"plant": self._beside("plant", key) if self.links else (key,)})
 
     def end(self, names: Sequence[str]) -> list[str]:
@@ -276,17 +278,19 @@ class KeyFile:
         for name in chosen or [""]:
             if len(links.get(name, ())) < _MOST:
                 who = f"{name} has" if name else "nobody has"
-                raise InputError(f"{self.path}: {who} an old key beside a new one; nothing to end")
+                raise InputError(
+                    f"{self.path}: {who} an old key beside a new one; there is nothing to end"
+                )
         self._write({name: links[name][:1] for name in chosen})
         return chosen
 
     def _beside(self, name: str, key: bytes) -> LinkKeys:
         known = self.links.get(name, ())
         if not known:
-            raise InputError(f"{self.path}: {name} has no key; say heliotrope keys new")
+            raise InputError(f"{self.path}: {name} has no key; run heliotrope keys new")
         if len(known) == _MOST:
             raise InputError(
-                f"{self.path}: {name} has two keys already; say heliotrope keys end when its other "
+                f"{self.path}: {name} already has two keys; run heliotrope keys end when its other "
                 "end uses the new one"
             )
         return (key, *known)
@@ -294,8 +298,8 @@ class KeyFile:
     def _check_plant(self, clusters: Iterable[str]) -> None:
         if self._table:
             raise InputError(
-                f"{self.path}: it is a cluster's key file; make keys in the plant's, and take them "
-                "here with heliotrope keys take"
+                f"{self.path}: this is a cluster's key file; create keys in the plant's key file, "
+                "and import them here with heliotrope keys take"
             )
         for name in clusters:
             ring_of(name, bytes(_SIZE))
@@ -344,7 +348,10 @@ def carried_files(folder: Path, clusters: Sequence[str]) -> list[Path]:
             raise InputError(f"cluster {name!r}: no file can have that name")
         files.append(folder / f"{name}.key.toml")
         if files[-1].exists():
-            raise InputError(f"{files[-1]}: it exists, and keys are never overwritten; move it")
+            raise InputError(
+                f"{files[-1]}: the file already exists, and keys are never overwritten; move it "
+                "away"
+            )
     return files
 
 
@@ -379,7 +386,10 @@ def replace_private(path: Path, before: bytes, text: str) -> bytes:
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
         if content_of(path) != before:
-            raise InputError(f"{path}: another command has changed it meanwhile; give yours again")
+            raise InputError(
+                f"{path}: another command has changed the file in the meantime; run your command "
+                "again"
+            )
         write_private(path, text)
     finally:
         os.close(folder)

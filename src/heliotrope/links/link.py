@@ -139,18 +139,19 @@ class LinkSettings:
     def __post_init__(self) -> None:
         if not 0.0 < 2.0 * self.period <= self.deadline < math.inf:
             raise InputError(
-                f"link: a deadline of {self.deadline} s with heartbeats every {self.period} s; it "
-                "must be at least twice the period, so that one may be lost"
+                f"link: the deadline ({self.deadline} s) must be at least twice the period of "
+                f"heartbeats ({self.period} s), so that one heartbeat may be lost"
             )
         if not 0.0 < self.first_pause <= self.longest_pause < math.inf:
             raise InputError(
-                f"link: pauses of {self.first_pause} s to {self.longest_pause} s between attempts; "
-                "the first must be above 0 and not above the longest"
+                f"link: the first pause between attempts ({self.first_pause} s) must be above 0 "
+                f"and at most the longest ({self.longest_pause} s)"
             )
         if self.capacity < 1 or self.largest < 1 or not 0.0 < self.horizon <= 4000.0:
             raise InputError(
-                f"link: capacity {self.capacity}, largest message {self.largest} bytes, horizon "
-                f"{self.horizon} s: give at least 1, 1, and 0 to 4000 s"
+                "link: capacity must be at least 1, the largest message at least 1 byte and the "
+                f"horizon 0 to 4000 s, not {self.capacity}, {self.largest} bytes and "
+                f"{self.horizon} s"
             )
 
 

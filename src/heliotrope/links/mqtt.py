@@ -101,8 +101,8 @@ def _ends(prefix: str, cluster: str, *, plant: bool) -> _Ends:
     for name, value in (("prefix", prefix), ("cluster", cluster)):
         if not value or any(sign in value for sign in "+#\0") or value != value.strip("/"):
             raise InputError(
-                f"MQTT {name} {value!r}: it must not be empty, begin or end with a slash, or hold "
-                "+ or #, which stand for any topic"
+                f"MQTT {name} {value!r} must not be empty, begin or end with a slash, or contain + "
+                "or #, which stand for any topic"
             )
     if "/" in cluster:
         raise InputError(f"MQTT cluster {cluster!r}: a name of one level, without a slash")

@@ -92,7 +92,7 @@ class _Pipe(asyncio.Protocol):
             transport, self, tls, server_side=True, ssl_handshake_timeout=limit
         )
         if made is None or self._lost:
-            raise LinkLostError(self._lost or "the connection ended in the handshake of TLS")
+            raise LinkLostError(self._lost or "the connection ended in the TLS handshake")
         made.set_write_buffer_limits(high=0)
         self._transport = made
 

@@ -20,8 +20,8 @@ def _load(context: ssl.SSLContext, certificate: str | Path, key: str | Path) -> 
         context.load_cert_chain(certificate, key)
     except (OSError, ssl.SSLError) as error:
         raise InputError(
-            f"TLS: certificate {certificate} and key {key} cannot be used ({error}); give two PEM "
-            "files that belong together"
+            f"TLS: certificate {certificate} and key {key} cannot be used ({error}); specify two "
+            "PEM files that belong together"
         ) from None
 
 
@@ -30,7 +30,7 @@ def _trust(context: ssl.SSLContext, authority: str | Path) -> None:
         context.load_verify_locations(authority)
     except (OSError, ssl.SSLError) as error:
         raise InputError(
-            f"TLS: authority {authority} cannot be used ({error}); give a PEM file"
+            f"TLS: authority {authority} cannot be used ({error}); specify a PEM file"
         ) from None
 
 
@@ -84,7 +84,7 @@ def client_tls(
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     _trust(context, authority)
     if (certificate is None) != (key is None):
-        raise InputError("TLS: a certificate needs its key, and a key its certificate; give both")
+        raise InputError("TLS: a certificate and its key belong together; specify both")
     if certificate is not None and key is not None:
         _load(context, certificate, key)
     return context

@@ -50,10 +50,12 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         known = folder.lstat()
         if not stat.S_ISDIR(known.st_mode) or known.st_uid != os.getuid():
-            raise InputError(f"{folder}: it is not a folder of this user; remove it")
+            raise InputError(f"{folder}: not a folder owned by this user; remove it")
         folder.chmod(0o700)
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; give --data a folder of this user") from None
+        raise InputError(
+            f"{folder}: {error.strerror}; set --data to a folder owned by this user"
+        ) from None
 
 
 @contextlib.contextmanager

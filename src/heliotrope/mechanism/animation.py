@@ -98,10 +98,12 @@ def _angles(mechanism: Mechanism, angles: npt.ArrayLike) -> FloatArray:
     if mechanism.shape or len(mechanism.driven) != 2:
         raise InputError(
             f"animation: {mechanism.kind} of shape {mechanism.shape}, driven joints: "
-            f"{len(mechanism.driven)}; give one heliostat with two drives"
+            f"{len(mechanism.driven)}; pass one heliostat with two drives"
         )
     if theta.ndim != 2 or theta.shape[1] != 2 or not len(theta) or not np.isfinite(theta).all():
-        raise InputError(f"animation: angles of shape {theta.shape}; give finite ones, (T, 2)")
+        raise InputError(
+            f"animation: angles have the shape {theta.shape}; pass finite angles, (T, 2)"
+        )
     return theta
 
 
@@ -142,7 +144,7 @@ def glb(
     theta = _angles(mechanism, angles)
     times = np.asarray(seconds, dtype=np.float64)
     if times.shape != (len(theta),) or not (np.diff(times) > 0.0).all():
-        raise InputError("animation: give one time for each pose, ascending")
+        raise InputError("animation: pass one time per pose, in ascending order")
     arm = mechanism.armature
     file = _Gltf()
     radius = _THIN * 0.5 * float(np.hypot(width, height))

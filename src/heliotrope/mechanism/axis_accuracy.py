@@ -75,7 +75,7 @@ def axis_accuracy(
         raise InputError(f"axis accuracy: shape {shape}; the last axis must hold 2 or more")
     alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in arrays.values())
     if (weight < 0.0).any() or (weight.sum(axis=-1) == 0.0).any():
-        raise InputError("azimuth_weight: weights must not be negative nor all 0; give cos² α")
+        raise InputError("azimuth_weight: weights must not be negative or all 0; pass cos² α")
     gamma_0, gamma_rest = _circular(gamma - gamma_i, weight, "gamma")
     alpha_0, alpha_rest = _circular(alpha - alpha_i, np.ones(shape), "alpha")
     n = shape[-1]

@@ -57,7 +57,7 @@ def drive_numbers(drive: Drive) -> tuple[int, tuple[float, ...], float]:
         An array of drives.
     """
     if drive.shape:
-        raise InputError(f"drive_numbers: drives of shape {drive.shape}; give one")
+        raise InputError(f"drive_numbers: drives have the shape {drive.shape}; pass one drive")
     table = drive.table
     kind = drives.ROTARY
     if table[slot.KIND] == slot.LINEAR:
@@ -85,7 +85,7 @@ def items_of(mechanism: Mechanism, machine: Machine | None = None) -> dict[str, 
     if mechanism.shape or len(mechanism.driven) != 2:
         raise InputError(
             f"items_of: mechanisms of shape {mechanism.shape} with {len(mechanism.driven)} drives; "
-            "give one heliostat with two"
+            "pass one heliostat with two drives"
         )
     made = [drive_numbers(mechanism.drives[i]) for i in (0, 1)]
     numbers: dict[str, tuple[object, ...]] = {
@@ -210,12 +210,12 @@ class Wanted:
             No items, an item that the plant does not set, or one of the wrong length.
         """
         if not items:
-            raise InputError(f"{heliostat}: no items; give at least one, as items_of makes them")
+            raise InputError(f"{heliostat}: no items; pass at least one, as returned by items_of")
         for name, data in items.items():
             if name in OWN or len(data) != SIZE_OF.get(name, -1):
                 raise InputError(
-                    f"{heliostat}: item {name!r} of {len(data)} bytes cannot be pushed; give items "
-                    "as items_of makes them"
+                    f"{heliostat}: item {name!r} of {len(data)} bytes cannot be pushed; pass items "
+                    "as returned by items_of"
                 )
 
     def set(self, heliostat: str, items: Mapping[str, bytes]) -> None:

@@ -131,8 +131,8 @@ def check_calibration(calibration: object) -> None:
     """
     if not isinstance(calibration, Calibrated):
         raise InputError(
-            f"calibration: {kind_of(calibration)}; give what fit returns, a HeliostatCalibration, "
-            "or with_parameters the values by name"
+            f"calibration: {kind_of(calibration)}; pass the result of fit or a "
+            "HeliostatCalibration, or pass values by name to with_parameters"
         )
 
 
@@ -359,7 +359,7 @@ class Mechanism(Value, Framed):
             if value.size != 1 and value.shape != self.shape:
                 raise InputError(
                     f"calibration of {value.size} heliostats: the mechanisms have shape "
-                    f"{self.shape}; take one of it (fitted[name]), or apply it by name "
+                    f"{self.shape}; select one heliostat (fitted[name]), or apply it by name "
                     "(plant[name].with_calibration)"
                 )
             moved[name] = value.reshape(()) if value.size == 1 else value
@@ -386,8 +386,8 @@ class Mechanism(Value, Framed):
             return np.broadcast_to(delta, self.shape)
         except ValueError:
             raise InputError(
-                f"{label}: shape {delta.shape} does not fit mechanisms of shape {self.shape}; "
-                "give a number, or one for each mechanism"
+                f"{label}: shape {delta.shape} does not fit mechanisms of shape {self.shape}; pass "
+                "one number, or one per mechanism"
             ) from None
 
     def pose(self, counts: npt.ArrayLike) -> Pose:
@@ -500,7 +500,7 @@ class Mechanism(Value, Framed):
                 f"counts: shape {array.shape}; the last axis must hold the {drives} drives"
             )
         if not np.isfinite(array).all():
-            raise InputError("counts: a value is not finite; give the motor positions")
+            raise InputError("counts: a value is not finite; pass the motor positions")
         try:
             shape = np.broadcast_shapes(self.shape, array.shape[:-1])
         except ValueError:
@@ -540,8 +540,8 @@ def join_mechanisms(parts: Sequence[Mechanism]) -> Mechanism:
     kinds = sorted({part.kind for part in parts})
     if len({(part.kind, part.joints, part.driven) for part in parts}) != 1:
         raise InputError(
-            f"mechanisms of {', '.join(kinds) or 'no kind'}: join those of one kind; take a group "
-            "of the plant (plant.groups) where kinds differ"
+            f"mechanisms of {', '.join(kinds) or 'no kind'} cannot be joined; join mechanisms of "
+            "one kind, such as a group of the plant (plant.groups)"
         )
 
     carried = dict.fromkeys(name for part in parts for name in part.deviations)

@@ -248,7 +248,9 @@ def _checked(drive: Drive) -> Drive:
     t = drive.table
     rate = t[..., slot.RATE]
     if (rate == 0.0).any() or not np.isfinite(rate).all():
-        raise InputError("drive: the angle (or stroke) per count is 0 or infinite; give counts")
+        raise InputError(
+            "drive: the angle (or stroke) per count is 0 or infinite; specify the counts"
+        )
     for low, high, what in (
         (slot.MIN_ANGLE, slot.MAX_ANGLE, "angle"),
         (slot.MIN_COUNT, slot.MAX_COUNT, "count"),
@@ -257,13 +259,13 @@ def _checked(drive: Drive) -> Drive:
         if reversed_.any():
             i = tuple(np.argwhere(reversed_)[0])
             raise InputError(
-                f"drive: lower {what} stop {t[i][low]:g} is above the upper stop "
-                f"{t[i][high]:g}; exchange them"
+                f"drive: lower {what} stop {t[i][low]:g} is above the upper stop {t[i][high]:g}; "
+                "swap them"
             )
     if (t[..., slot.SPEED] <= 0.0).any():
         raise InputError("drive: speed must be above 0 counts per second")
     if (np.abs(1.0 + t[..., slot.SCALE]) < 1e-3).any():
-        raise InputError("drive: scale −1 makes the drive stand still; give a scale near 0")
+        raise InputError("drive: scale −1 makes the drive stand still; use a scale near 0")
     _check_triangles(t[t[..., slot.KIND] == slot.LINEAR])
     _check_monotone(t)
     return drive
@@ -336,8 +338,8 @@ def rotary(
     per_turn = steps * micro * as_numbers(gear_ratio, "gear_ratio")
     if not (np.isfinite(per_turn) & (per_turn > 0)).all():
         raise InputError(
-            f"rotary drive: steps {shown(steps_per_turn)} × microsteps {shown(microsteps)} × "
-            f"gear ratio {shown(gear_ratio)} must be above 0 and finite"
+            "rotary drive: steps, microsteps and gear ratio must be above 0 and finite, not "
+            f"{shown(steps_per_turn)} × {shown(microsteps)} × {shown(gear_ratio)}"
         )
     _check_sense(sense)
     rate = as_float(sense) * TAU / per_turn
@@ -374,7 +376,7 @@ def linear_paint(
     counts_per_metre = as_numbers(increment, "increment")
     if not (np.isfinite(counts_per_metre) & (counts_per_metre != 0)).all():
         raise InputError(
-            f"linear drive: increment {shown(increment)} counts per metre must not be 0"
+            f"linear drive: increment must not be 0, but is {shown(increment)} counts per metre"
         )
     sense = np.where(as_float(clockwise) == 1, 1.0, -1.0)
     return _build(
@@ -480,4 +482,4 @@ def linear_guo(
 
 def _check_sense(sense: npt.ArrayLike) -> None:
     if not np.isin(as_numbers(sense, "drive: sense"), (-1.0, 1.0)).all():
-        raise InputError(f"drive: sense {shown(sense)} must be +1 or −1")
+        raise InputError(f"drive: sense must be +1 or −1, not {shown(sense)}")

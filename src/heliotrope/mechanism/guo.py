@@ -192,7 +192,7 @@ def mirror_normal(
     """
     target = as_vectors(to_target, "to_target")
     distance = as_float(np.linalg.norm(target, axis=-1))
-    at_pivot = "the target is at the pivot (0 m); give the vector from pivot to target"
+    at_pivot = "the target is at the pivot (0 m); pass the vector from the pivot to the target"
     refuse(distance == 0.0, "to_target", lambda _: at_pivot)
     s, t = normalize(sun, "sun"), normalize(target, "to_target")
     height = numbers(offset, "offset")
@@ -201,7 +201,7 @@ def mirror_normal(
     refuse(
         np.abs(height) >= distance,
         "offset",
-        lambda i: f"{height[i]:g} m reaches the target, {distance[i]:g} m away; give metres",
+        lambda i: f"{height[i]:g} m reaches the target, {distance[i]:g} m away; use metres",
     )
     b = bisector(s, t)
     cos_theta = 0.5 * np.linalg.norm(s + t, axis=-1)
@@ -530,7 +530,7 @@ def numbers(value: npt.ArrayLike, name: str) -> FloatArray:
         array = as_float(value)
     except (TypeError, ValueError):
         raise InputError(f"{name}: {value!r} is not an array of numbers") from None
-    refuse(~np.isfinite(array), name, lambda i: f"{array[i]} is not finite; give a number")
+    refuse(~np.isfinite(array), name, lambda i: f"{array[i]} is not finite; pass a number")
     return array
 
 

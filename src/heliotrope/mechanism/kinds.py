@@ -97,7 +97,10 @@ def two_axis(
     n = normalize(normal, "normal")
     check_axes(a1, a2)
     if (np.linalg.norm(np.cross(n, a2), axis=-1) < 1e-6).any():
-        raise InputError("normal: it lies along the secondary axis, which then cannot turn it")
+        raise InputError(
+            "normal: it is parallel to the secondary axis, so rotation about this axis would not "
+            "change it"
+        )
     end = a1 if pole is None else normalize(pole, "pole")
     lean_names = _lean_names(end) if leans is None else leans
     for name in lean_names:
@@ -166,12 +169,12 @@ def with_joint(
         raise UnknownNameError(f"joint of a {mechanism.kind} mechanism", after, mechanism.joints)
     if not name.isidentifier() or name in (*mechanism.joints, *mechanism.parameters):
         raise InputError(
-            f"own joint {name!r}: give a new name of letters, digits and underscores; the joints "
+            f"own joint {name!r}: choose a new name of letters, digits and underscores; the joints "
             f"are {', '.join(mechanism.joints)}"
         )
     sigma = as_numbers(prior, f"prior of {name}", 0.0, 0.5 * np.pi, "rad", "give radians")
     if sigma.shape or not sigma > 0.0:
-        raise InputError(f"prior of {name}: {prior} rad; give one number above 0")
+        raise InputError(f"prior of {name} must be one number above 0, not {prior} rad")
     direction, point = normalize(axis, f"axis of {name}"), as_vectors(origin, f"origin of {name}")
     shapes = {
         "mechanism": mechanism.shape,
@@ -181,7 +184,7 @@ def with_joint(
     if common_batch(shapes) != mechanism.shape:
         raise InputError(
             f"own joint {name}: axis {direction.shape} and origin {point.shape} do not fit "
-            f"mechanisms of shape {mechanism.shape}; give one vector, or one for each"
+            f"mechanisms of shape {mechanism.shape}; pass one vector, or one per mechanism"
         )
     place = 0 if after is None else mechanism.joints.index(after) + 1
     origins = np.insert(mechanism.origins, place, point, axis=-2)
@@ -271,12 +274,12 @@ def _tables(drives: object, driven: tuple[int, ...]) -> list[FloatArray]:
         return [direct().table for _ in driven]
     drive_list = tuple(drives) if isinstance(drives, tuple | list) else (drives,)
     if len(drive_list) != len(driven):
-        raise InputError(f"drives: {len(drive_list)} given; this kind has {len(driven)}")
+        raise InputError(f"drives: got {len(drive_list)}, but this kind has {len(driven)}")
     tables = []
     for drive in drive_list:
         if not isinstance(drive, Drive):
             raise InputError(
-                f"drives: {kind_of(drive)} is not a Drive; give {len(driven)} drives made by "
+                f"drives: {kind_of(drive)} is not a Drive; pass {len(driven)} drives made by "
                 "rotary, direct or linear_paint"
             )
         tables.append(drive.table)
@@ -290,7 +293,7 @@ def _lengths(value: npt.ArrayLike, name: str) -> FloatArray:
 def _check_rotation(matrix: FloatArray) -> None:
     if matrix.shape[-2:] != (3, 3) or not np.isfinite(matrix).all():
         raise InputError(
-            f"orientation: shape {matrix.shape}; give finite rotation matrices, (..., 3, 3)"
+            f"orientation: shape {matrix.shape}; pass finite rotation matrices, (..., 3, 3)"
         )
     deviation = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max()
     if deviation > 1e-9 or (np.linalg.det(matrix) < 0).any():
@@ -613,7 +616,9 @@ def single_axis(
     """
     p, a, n = as_vectors(position, "position"), normalize(axis, "axis"), normalize(normal, "normal")
     if (np.linalg.norm(np.cross(a, n), axis=-1) < 1e-6).any():
-        raise InputError("normal: it lies along the axis, which then cannot turn it")
+        raise InputError(
+            "normal: it is parallel to the axis, so rotation about this axis would not change it"
+        )
     height = _lengths(pivot_height, "pivot_height")
     lean_names = _lean_names(a) if leans is None else leans
     steps: list[tuple[str, FloatArray, npt.ArrayLike]] = [

@@ -66,17 +66,23 @@ class AxisLimits:
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
-            raise InputError(f"axis: from {self.low} to {self.high} steps; the low end comes first")
+            raise InputError(
+                f"axis: the low end ({self.low} steps) must be below the high end ({self.high} "
+                "steps)"
+            )
         for name, unit in (("rate", "steps/s"), ("acceleration", "steps/s²")):
             value = getattr(self, name)
             if not value > 0:
-                raise InputError(f"axis: {name} {value} {unit} must be above 0")
+                raise InputError(f"axis: {name} must be above 0, not {value} {unit}")
         if self.rate > MOST_RATE:
             raise InputError(
-                f"axis: rate {self.rate} steps/s; a local controller emits {MOST_RATE} at most"
+                f"axis: rate {self.rate} steps/s is too high; a local controller emits at most "
+                f"{MOST_RATE}"
             )
         if not 0 <= self.backlash < 1 << 16:
-            raise InputError(f"axis: backlash {self.backlash} steps; give 0 to 65535")
+            raise InputError(
+                f"axis: backlash must be between 0 and 65535 steps, not {self.backlash}"
+            )
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,7 @@ class Stepping:
     def __post_init__(self) -> None:
         if not 1 <= min(self.microsteps) <= max(self.microsteps) <= MOST_MICROSTEPS:
             raise InputError(
-                f"stepping: {self.microsteps} microsteps of a full step; give 1 to "
+                f"stepping: {self.microsteps} microsteps of a full step; use 1 to "
                 f"{MOST_MICROSTEPS} for each axis"
             )
 
@@ -181,7 +187,7 @@ class Machine:
             )
         if len(self.way) > WAY_POINTS:
             raise InputError(
-                f"way: {len(self.way)} points; a local controller stores {WAY_POINTS} at most"
+                f"way: {len(self.way)} points; a local controller stores at most {WAY_POINTS}"
             )
 
 

@@ -242,7 +242,7 @@ def track(
     if (np.abs(np.sum(s * s, axis=-1) - 1.0) > 1e-6).any():
         raise InputError("sun: a vector's length differs from 1 by more than 5e-7; normalise it")
     if branch not in ("both", 0, 1):
-        raise InputError(f"branch {shown(branch)}: give 'both', 0 or 1")
+        raise InputError(f"branch must be 'both', 0 or 1, not {shown(branch)}")
     _check_settings(tolerance, max_iterations)
     for name, value in (("local", local), ("newton", newton)):
         require(name, value, (bool, np.bool_), "True or False")
@@ -342,7 +342,7 @@ def trace(
     """
     armature, table = _tables(mechanism, drives)
     if armature.shape or np.ndim(sun) != 1 or np.ndim(aim) != 1:
-        raise InputError("trace: give one heliostat, one sun and one aim")
+        raise InputError("trace: pass one heliostat, one sun and one aim")
     s, p = as_vectors(sun, "sun"), as_vectors(aim, "aim")
     free = direct().table
     free_drives = Drive(table).replace(
@@ -374,12 +374,12 @@ def _tables(mechanism: Steered | Armature, drives: Drive | None) -> tuple[Armatu
     steered = isinstance(getattr(mechanism, "drives", None), Drive)
     if not isinstance(mechanism, Armature) and not steered:
         raise InputError(
-            f"mechanism: {kind_of(mechanism)} cannot be tracked; give a Mechanism, plant[name], a "
+            f"mechanism: {kind_of(mechanism)} cannot be tracked; pass a Mechanism, plant[name], a "
             "group, a plant, or an Armature with drives"
         )
     if drives is not None and not isinstance(drives, Drive):
         raise InputError(
-            f"drives: {kind_of(drives)} is not a Drive; give one of batch shape (..., D)"
+            f"drives: {kind_of(drives)} is not a Drive; pass one of batch shape (..., D)"
         )
     if isinstance(mechanism, Armature):
         armature = mechanism
@@ -401,7 +401,7 @@ def _check_settings(tolerance: float, max_iterations: int) -> None:
     numbers = as_numbers([tolerance, max_iterations], "tolerance and max_iterations")
     if not (np.isfinite(numbers[0]) and numbers[0] > 0 and numbers[1] >= 1):
         raise InputError(
-            f"tolerance {tolerance} m and max_iterations {max_iterations} must be above 0"
+            f"tolerance and max_iterations must be above 0, not {tolerance} m and {max_iterations}"
         )
 
 
@@ -409,7 +409,7 @@ def _current(current: npt.ArrayLike, axes: int) -> FloatArray:
     counts = as_numbers(current, "current")
     if counts.ndim == 0 or counts.shape[-1] != axes or not np.isfinite(counts).all():
         raise InputError(
-            f"current: shape {counts.shape}; give finite counts of the {axes} drives, (..., {axes})"
+            f"current: shape {counts.shape}; pass finite counts of the {axes} drives, (..., {axes})"
         )
     return counts
 

@@ -78,8 +78,8 @@ def air_model(model: str | float) -> Callable[[FloatArray], FloatArray]:
     low, high = _VISIBILITY
     if not low <= visibility <= high:
         raise InputError(
-            f"air {model!r}: known models: {', '.join(AIR_MODELS)}; or specify the visibility, "
-            f"{low:g} to {high:g} km"
+            f"unknown air model {model!r}; known: {', '.join(AIR_MODELS)}; or specify the "
+            f"visibility, {low:g} to {high:g} km"
         )
     return lambda distance: as_float(-np.expm1(-_CONTRAST * 1e-3 * distance / visibility))
 

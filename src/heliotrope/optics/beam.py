@@ -80,7 +80,9 @@ def checked(name: str, value: npt.ArrayLike, unit: str, *, positive: bool = Fals
     invalid = ~(np.isfinite(array) & ((array > 0.0) if positive else (array >= 0.0)))
     if invalid.any():
         limit = "above 0" if positive else "0 or more"
-        raise InputError(f"{name}: {array[invalid].flat[0]:g} {unit} must be {limit} and finite")
+        raise InputError(
+            f"{name} must be {limit} and finite, not {array[invalid].flat[0]:g} {unit}"
+        )
     return array
 
 
@@ -134,24 +136,22 @@ class MirrorOptics:
         arrays = np.broadcast_arrays(*(np.atleast_1d(as_float(v)) for v in arguments.values()))
         values = dict(zip(arguments, (np.ascontiguousarray(a) for a in arrays), strict=True))
         if values["width"].ndim != 1:
-            raise InputError(f"mirrors: shape {values['width'].shape}; give numbers or (N,)")
+            raise InputError(f"mirrors: shape {values['width'].shape}; expected numbers or (N,)")
         limits = {
-            "width": (0.0, np.inf, "m"),
-            "height": (0.0, np.inf, "m"),
+            "width": (0.0, np.inf, " m"),
+            "height": (0.0, np.inf, " m"),
             "reflectivity": (0.0, 1.0 + 1e-12, ""),
         }
         for name, (low, high, unit) in limits.items():
             invalid = ~((values[name] > low) & (values[name] < high))
             if invalid.any():
                 value = values[name][invalid][0]
-                raise InputError(
-                    f"mirrors: {name} {value} {unit} must be above 0"
-                    f"{' and at most 1' if name == 'reflectivity' else ' and finite'}"
-                )
+                limit = "at most 1" if name == "reflectivity" else "finite"
+                raise InputError(f"mirrors: {name} must be above 0 and {limit}, not {value}{unit}")
         if not (values["focus"] > 0.0).all():
-            raise InputError("mirrors: a focus must be above 0 m; infinite if the mirror is flat")
+            raise InputError("mirrors: a focus must be above 0 m; use inf for a flat mirror")
         if not ((values["error"] >= 0.0) & (values["error"] < 0.5)).all():
-            raise InputError("mirrors: an error must be from 0 to 0.5 rad (500 mrad)")
+            raise InputError("mirrors: an error must be between 0 and 0.5 rad (500 mrad)")
         return cls(**values)
 
     def __len__(self) -> int:

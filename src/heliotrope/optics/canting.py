@@ -64,7 +64,9 @@ def canted(
 def _focal(canting: npt.ArrayLike, count: int) -> FloatArray:
     focal = float(as_float(canting))
     if not focal > 0.0:
-        raise InputError(f"canting: a focal length of {focal} m must be above 0; flat is inf")
+        raise InputError(
+            f"canting: the focal length must be above 0, not {focal} m; use inf for flat"
+        )
     return np.full(count, focal)
 
 
@@ -85,6 +87,6 @@ def _off_axis(
         name = plant.names[int(np.flatnonzero(scene.dark)[0])]
         raise InputError(
             f"canting: heliostat {name} cannot reach its aim at the sun position chosen for "
-            "canting; choose another"
+            "canting; choose another sun position"
         )
     return off_axis(center, then.center, then.normal, light, then.aim)

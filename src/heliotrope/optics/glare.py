@@ -48,9 +48,11 @@ class Eye:
         for name in ("pupil", "focal_length"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"eye: {name} {value} m must be above 0 and finite")
+                raise InputError(f"eye: {name} must be above 0 and finite, not {value} m")
         if not 0.0 < self.transmission <= 1.0:
-            raise InputError(f"eye: transmission {self.transmission} must be above 0, at most 1")
+            raise InputError(
+                f"eye: transmission must be above 0 and at most 1, not {self.transmission}"
+            )
 
 
 #: The eye assumed in the paper.
@@ -397,4 +399,4 @@ def _checked(corneal: npt.ArrayLike, subtended: npt.ArrayLike) -> tuple[FloatArr
 
 def _irradiance(dni: float) -> None:
     if not (math.isfinite(dni) and dni >= 0.0):
-        raise InputError(f"direct normal irradiance {dni} W/m² must be 0 or more and finite")
+        raise InputError(f"direct normal irradiance must be 0 or more and finite, not {dni} W/m²")

@@ -203,7 +203,7 @@ def sweep(
     if {len(rows), len(joints)} - {1, count}:
         raise InputError(f"path: got {len(joints)} paths for {len(rows)} heliostats")
     if not (np.isfinite(resolution) and resolution > 0.0):
-        raise InputError(f"resolution {resolution} rad must be above 0")
+        raise InputError(f"resolution must be above 0, not {resolution} rad")
     s = np.broadcast_to(normalize(sun, "sun"), (count, 3))
     table, corners = _packed(volumes)
     every = mirrors.broadcast(count)
@@ -351,7 +351,7 @@ def safe_way(
     if begin.shape != (2,) or not np.isfinite(begin).all():
         raise InputError(f"stow: {stow!r}; pass the 2 joint angles in rad")
     if not (np.isfinite(first_distance) and first_distance > 0.0):
-        raise InputError(f"first_distance {first_distance} m must be above 0")
+        raise InputError(f"first_distance must be above 0, not {first_distance} m")
     vertex = armature.pose(begin)[1]
     away = foot_ - vertex
     towards = float(np.arctan2(away[0], away[1]))

@@ -28,10 +28,10 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
     """
     for name, side in (("width", width), ("height", height)):
         if not (np.isfinite(side) and side > 0.0):
-            raise InputError(f"mirror: {name} {side} m must be above 0 and finite")
+            raise InputError(f"mirror: {name} must be above 0 and finite, not {side} m")
     columns, rows = count
     if min(columns, rows) < 1:
-        raise InputError(f"mirror: {columns} × {rows} facets; must be 1 or more each way")
+        raise InputError(f"mirror: facets must number 1 or more each way, not {columns} × {rows}")
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * width
     y = ((np.arange(rows) + 0.5) / rows - 0.5) * height
     x, y = (a.ravel() for a in np.meshgrid(x, y))

@@ -113,7 +113,9 @@ class FieldOptics:
         """Return the scene of a plant under these conditions."""
         error = as_float(self.error)
         if not (np.isfinite(error) & (error >= 0.0) & (error < 0.2)).all():
-            raise InputError(f"flux: an error of {error.max():g} rad must be from 0 to 0.2 rad")
+            raise InputError(
+                f"flux: the error must be between 0 and 0.2 rad, not {error.max():g} rad"
+            )
         # The variance of the normal is split between two axes, and the beam turns by twice the
         # angle.
         spread = np.broadcast_to(2.0 * error**2, (len(plant),))[:, None, None] * np.eye(2)
@@ -568,7 +570,7 @@ def flux_day(
     suns = np.atleast_2d(vector(times, plant.site))
     up = suns[:, 2] > np.sin(LOWEST)
     if not up.any():
-        raise InputError("flux: the sun is above 2° at none of the times; choose others")
+        raise InputError("flux: the sun is above 2° at none of the times; choose other times")
     seconds = np.atleast_1d(unix_seconds(times))[up]
     unknown = np.full(len(seconds), np.nan)
     weight = np.full(len(seconds), 1.0 / len(seconds))
@@ -616,8 +618,8 @@ def flux_year(
     """
     if not (2 <= declinations <= 100 and 0.1 <= hours <= 4.0):
         raise InputError(
-            f"flux: {declinations} declinations and steps of {hours} h; must be 2 to 100 "
-            "declinations and 0.1 to 4 h"
+            f"flux: use 2 to 100 declinations and steps of 0.1 to 4 h, not {declinations} and "
+            f"{hours} h"
         )
     optics = (light or FieldOptics()).changed(changes)
     longitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, declinations)

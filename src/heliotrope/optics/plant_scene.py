@@ -79,7 +79,7 @@ def scene_of(
     """
     light = as_vectors(sun, "sun")
     if light.shape != (3,):
-        raise InputError(f"scene: a sun of shape {light.shape}; give one, (3,)")
+        raise InputError(f"scene: the sun has the shape {light.shape}; pass one sun vector, (3,)")
     chosen = tuple(receivers) or plant.receivers
     if not chosen:
         raise InputError(f"scene: plant {plant.name} has no receiver; add one to the plant file")
@@ -110,7 +110,9 @@ def _aims(plant: Plant, middle: FloatArray, aim: npt.ArrayLike | None) -> FloatA
     if aim is not None:
         ends = as_vectors(aim, "aim")
         if ends.shape not in ((3,), (1, 3), (count, 3)):
-            raise InputError(f"mirrors: aim of shape {ends.shape}; give (3,) or ({count}, 3)")
+            raise InputError(
+                f"mirrors: aim has the shape {ends.shape}; expected (3,) or ({count}, 3)"
+            )
         return np.ascontiguousarray(np.broadcast_to(ends, (count, 3)))
     own = [np.full((len(g), 3), np.nan) if g.aim is None else g.aim for g in plant.groups.values()]
     ends = np.concatenate(own)

@@ -93,7 +93,7 @@ def trace(
         If the number of rays is out of range, a name is unknown, or `embreex` is not installed.
     """
     if not RAYS[0] <= rays <= RAYS[1]:
-        raise InputError(f"rays: {rays:g} must be from {RAYS[0]:,} to {RAYS[1]:,}")
+        raise InputError(f"rays must be between {RAYS[0]:,} and {RAYS[1]:,}, not {rays:g}")
     shape = SunShape.of(sun)
     tracer = _Tracer(scene, shape, np.random.default_rng(seed))
     power, total = tracer.power(air), int(rays)

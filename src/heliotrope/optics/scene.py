@@ -268,7 +268,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.dni) and self.dni >= 0.0):
-            raise InputError(f"scene: DNI {self.dni} W/m² must be 0 or more and finite")
+            raise InputError(f"scene: DNI must be 0 or more and finite, not {self.dni} W/m²")
         object.__setattr__(self, "sun", normalize(self.sun, "scene: sun"))
         for tower in self.towers:
             center = self.mirrors.center
@@ -317,6 +317,7 @@ def _numbers(name: str, value: npt.ArrayLike, count: int) -> FloatArray:
     low, excluded, high, unit = _LIMITS[name]
     wrong = ~((numbers > low if excluded else numbers >= low) & (numbers <= high))
     if wrong.any():
-        limit = f"above {low:g}" if excluded else f"from {low:g} to {high:g}"
-        raise InputError(f"mirrors: {name} {numbers[wrong].flat[0]:g} {unit} must be {limit}")
+        limit = f"above {low:g}" if excluded else f"between {low:g} and {high:g}"
+        value = f"{numbers[wrong].flat[0]:g} {unit}".rstrip()
+        raise InputError(f"mirrors: {name} must be {limit}, not {value}")
     return np.ascontiguousarray(np.broadcast_to(numbers, (count,)))

@@ -81,14 +81,14 @@ class SunShape:
 
     def __post_init__(self) -> None:
         if self.name not in SUN_SHAPES:
-            raise InputError(f"sun shape {self.name!r}; known: {', '.join(SUN_SHAPES)}")
+            raise InputError(f"unknown sun shape {self.name!r}; known: {', '.join(SUN_SHAPES)}")
         low, high = CIRCUMSOLAR
         if not low <= self.csr <= high:
             raise InputError(
-                f"sun shape: circumsolar ratio {self.csr} must be from {low} to {high}"
+                f"sun shape: circumsolar ratio must be between {low} and {high}, not {self.csr}"
             )
         if not 0.0 < self.sigma < 0.05:
-            raise InputError(f"sun shape: σ {self.sigma} rad must be above 0 and below 0.05")
+            raise InputError(f"sun shape: σ must be above 0 and below 0.05, not {self.sigma} rad")
 
     @classmethod
     def of(cls, shape: "str | SunShape") -> Self:
@@ -193,7 +193,9 @@ class SunShape:
         remaining difference.
         """
         if not 1 <= count <= 4:
-            raise InputError(f"sun shape: {count} Gaussians; must be 1 to 4")
+            raise InputError(
+                f"sun shape: the number of Gaussians must be between 1 and 4, not {count}"
+            )
         if self.name == "gaussian" or count == 1:
             return Gaussians(np.ones(1), np.array([self.variance]))
         return _fitted(self, count, round(float(np.clip(blur, *_BLURS)), 4))
@@ -253,7 +255,7 @@ def sun_profile(theta: npt.ArrayLike, shape: str, circumsolar: float = 0.05) -> 
     if shape == "quartic":
         return as_float(np.where(disk, 1.0 - 0.5138 * (angle / SUN_RADIUS) ** 4, 0.0))
     if shape != "buie":
-        raise InputError(f"sun shape {shape!r}; known: {', '.join(PROFILES)}")
+        raise InputError(f"unknown sun shape {shape!r}; known: {', '.join(PROFILES)}")
     mrad, chi = angle * 1e3, circumsolar
     kappa = 0.9 * np.log(13.5 * chi) * chi**-0.3
     gamma = 2.2 * np.log(0.52 * chi) * chi**0.43 - 0.1

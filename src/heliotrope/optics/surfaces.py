@@ -284,6 +284,8 @@ def _plate(face: Target, shape: tuple[int, int]) -> Plate:
 def _check(name: str, shape: tuple[int, int], **sizes: float) -> None:
     for what, size in sizes.items():
         if not (np.isfinite(size) and size > 0.0):
-            raise InputError(f"receiver {name}: {what} {size} m must be above 0 and finite")
+            raise InputError(f"receiver {name}: {what} must be above 0 and finite, not {size} m")
     if min(shape) < 1:
-        raise InputError(f"receiver {name}: {shape} cells; must have at least 1 row and 1 column")
+        raise InputError(
+            f"receiver {name}: cells must have at least 1 row and 1 column, not {shape}"
+        )

@@ -88,8 +88,8 @@ class PlantSettings:
             )
         if not (self.stow_rate == 0.0 or 1.0 <= self.stow_rate < math.inf):
             raise InputError(
-                f"plant: {self.stow_rate:g} heliostats a second go to stow; give 1 or more, or 0 "
-                "for all at once"
+                "plant: the stow rate must be 1 heliostat a second or more, or 0 for all at once, "
+                f"not {self.stow_rate:g}"
             )
         if not 0.0 < self.beat <= 1.0 or not 0.0 < self.repeat < math.inf:
             raise InputError(
@@ -122,7 +122,7 @@ def clusters_of(design: Plant) -> dict[str, tuple[str, ...]]:
             cluster = group.cluster[i] if group.cluster else ""
             if not cluster:
                 raise InputError(
-                    f"heliostat {name}: it belongs to no cluster; name one in the plant file"
+                    f"heliostat {name} belongs to no cluster; name one in the plant file"
                 )
             found.setdefault(cluster, []).append(name)
     return {cluster: tuple(names) for cluster, names in found.items()}

@@ -55,8 +55,8 @@ def _groups(groups: Sequence[Group], count: int) -> Sequence[Group]:
     for group in groups:
         if np.shape(group.mask) != (count,):
             raise InputError(
-                f"groups: the mask of {group.label!r} has shape {np.shape(group.mask)}; there are "
-                f"{count} points: give ({count},)"
+                f"groups: the mask of {group.label!r} has shape {np.shape(group.mask)}; expected "
+                f"({count},), one entry per point"
             )
     return groups or [Group(np.ones(count, np.bool_), COLOURS[0], "")]
 
@@ -118,12 +118,12 @@ def day(
     """
     if isinstance(times, TrackedDay):
         if tracked is not None:
-            raise InputError("tracked: the day has its own path; give the day alone")
+            raise InputError("tracked: the day has its own path; pass the day alone")
         tracked, times = times.path, times.time
     if not isinstance(tracked, Tracking | TrackedPath):
         raise InputError(
-            f"tracked: {kind_of(tracked)} is not a Tracking; give a day of track_day alone, or "
-            "times and what track returns"
+            f"tracked: {kind_of(tracked)} is not a Tracking; pass a day from track_day alone, or "
+            "times and the result of track"
         )
     dates = _dates(times)
     angles = np.degrees(tracked.angles if isinstance(tracked, TrackedPath) else tracked.best_angles)
@@ -178,7 +178,9 @@ def residuals(
     """
     errors, place = 1e3 * _points(beam, "beam"), np.asarray(x)
     if place.shape != (len(errors),):
-        raise InputError(f"x: shape {place.shape} for {len(errors)} errors; give ({len(errors)},)")
+        raise InputError(
+            f"x: shape {place.shape} for {len(errors)} errors; expected ({len(errors)},)"
+        )
     ax = _axes(ax)
     good = np.zeros(len(errors), dtype=np.bool_)
     for mask, colour, _, odd in _groups(groups, len(errors)):
@@ -257,8 +259,8 @@ def _draw_ellipses(ax: "Axes", points: FloatArray, covariance: npt.ArrayLike) ->
     array = np.asarray(covariance, dtype=np.float64)
     if array.shape not in ((2, 2), (len(points), 2, 2)):
         raise InputError(
-            f"covariance: shape {array.shape}; give (2, 2), or ({len(points)}, 2, 2), one for "
-            "each point"
+            f"covariance: shape {array.shape}; expected (2, 2), or ({len(points)}, 2, 2), one per "
+            "point"
         )
     matrices = np.broadcast_to(array, (len(points), 2, 2))
     known = np.isfinite(matrices).all(axis=(1, 2)) & np.isfinite(points).all(axis=1)
@@ -323,7 +325,7 @@ def field_map(
     shown = np.asarray(values, dtype=np.float64)
     if places.ndim != 2 or places.shape[1] not in (2, 3) or shown.shape != (len(places),):
         raise InputError(
-            f"values: shape {shown.shape} for positions of shape {places.shape}; give (N,) for "
+            f"values: shape {shown.shape} for positions of shape {places.shape}; expected (N,) for "
             "(N, 3)"
         )
     ax = _axes(ax)
@@ -436,7 +438,7 @@ def drift(
     if table.shape != (len(dates), size) or spread.shape != (len(dates), size, size):
         raise InputError(
             f"values {table.shape} and covariance {spread.shape} for {len(dates)} times and {size} "
-            f"names; give ({len(dates)}, {size}) and ({len(dates)}, {size}, {size})"
+            f"names; expected ({len(dates)}, {size}) and ({len(dates)}, {size}, {size})"
         )
     selected = [n for n in names if shown_in(n) == shown_in(names[0])] if shown is None else shown
     for name in selected:
@@ -445,7 +447,7 @@ def drift(
     units = list(dict.fromkeys(shown_in(name) for name in selected))
     if len(units) != 1:
         listed = " and ".join(unit or "no unit" for _, unit in units) or "none"
-        raise InputError(f"shown: parameters in {listed}; give some of one unit")
+        raise InputError(f"shown: parameters in {listed}; choose parameters with the same unit")
     ((scale, unit),) = units
     ax = _axes(ax)
     for k, name in enumerate(selected):

@@ -68,7 +68,7 @@ def mechanism_3d(
     light = None if sun is None else np.broadcast_to(as_vectors(sun, "sun"), (count, 3))
     goal = None if aim is None else as_vectors(aim, "aim")
     if len(names) != count:
-        raise InputError(f"labels: {len(names)} for {count} poses; give one for each")
+        raise InputError(f"labels: {len(names)} for {count} poses; specify one per pose")
     reach = _RAY * float(np.ptp(scene.mirror[0], axis=0).max())
     frames = [
         go.Frame(data=_traces(go, scene, k, light, goal, reach), name=name)

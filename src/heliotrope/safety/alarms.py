@@ -304,7 +304,7 @@ AIMS = AlarmKind(
     "No aims were found that hold the flux limit, or none came within deadline_s.",
     "aims under the flux limit: {problem}",
     "The last good aims stay; after five times deadline_s the field goes to the safe spread.",
-    "If beams stay where a person has aimed them, give them back with Automatic; else defocus some "
+    "Return beams that an operator has aimed to automatic control (Automatic); else defocus some "
     "heliostats, and correct [aims] in the plant file.",
     over="aims hold the flux limit again",
 )

@@ -173,7 +173,8 @@ class Condition:
         at = f"condition {self.name}"
         if not (math.isfinite(self.trips) and math.isfinite(self.releases)):
             raise InputError(
-                f"{at}: trips {self.trips} and releases {self.releases} must be finite numbers"
+                f"{at}: trips and releases must be finite numbers, not {self.trips} and "
+                f"{self.releases}"
             )
         if self.trips == self.releases:
             raise InputError(
@@ -187,13 +188,13 @@ class Condition:
         for name in ("delay", "clear_for", "stale_after", "budget"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise InputError(f"{at}: {name} {value} s must be 0 or more and finite")
+                raise InputError(f"{at}: {name} must be 0 or more and finite, not {value} s")
         if not self.then_stow >= 0.0:
-            raise InputError(f"{at}: then_stow {self.then_stow} s must be 0 or more")
+            raise InputError(f"{at}: then_stow must be 0 or more, not {self.then_stow} s")
         if self.detection > self.budget:
             raise InputError(
-                f"{at}: it is noticed after {self.detection:g} s, later than its budget of "
-                f"{self.budget:g} s; shorten delay or stale_after"
+                f"{at}: the condition is noticed after {self.detection:g} s, later than its budget "
+                f"of {self.budget:g} s; shorten delay or stale_after"
             )
 
     @property

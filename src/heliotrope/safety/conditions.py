@@ -40,7 +40,7 @@ def conditions(autonomy: float = 0.0) -> tuple[Condition, ...]:
         If ``autonomy`` is negative or not finite.
     """
     if not (math.isfinite(autonomy) and autonomy >= 0.0):
-        raise InputError(f"autonomy is {autonomy} s; it must be finite and 0 or more")
+        raise InputError(f"autonomy must be finite and 0 or more, not {autonomy} s")
     return (
         *_orders(),
         *_receiver(),
@@ -323,8 +323,8 @@ def _mirrors() -> tuple[Condition, ...]:
             "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
             _SERIOUS, 30.0, then_stow=_PATIENCE, or_stow=True,
             release="the beam and its path are clear",
-            remedy="Keep people out of the volume until the alarm is over; then give it another aim"
-            " point.", site=(0.5, 0.5),
+            remedy="Keep people out of the volume until the alarm is over; then choose another aim"
+            " point for the heliostat.", site=(0.5, 0.5),
         ),
         Condition(
             "beam_unsent", _PLANT, "beam_unsent", "yes/no",

@@ -30,11 +30,11 @@ class JoinLimiter:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate >= 0.0):
             raise InputError(
-                f"joining rate is {self.rate} heliostats/s; it must be finite and 0 or more"
+                f"joining rate must be finite and 0 or more, not {self.rate} heliostats/s"
             )
         if self.burst < 1:
             raise InputError(
-                f"joining burst is {self.burst}; it must be a whole number of at least 1"
+                f"joining burst must be a whole number of at least 1, not {self.burst}"
             )
 
     def admit(self, wanted: int, now: float) -> tuple["JoinLimiter", int]:

@@ -181,16 +181,17 @@ def _changed(row: Condition, row_limits: Mapping[str, float]) -> Condition:
             raise InputError(f"{row.name}.{key} is not known{_near(key, settings) or known}")
         if not setting.low <= value <= setting.high or math.isinf(value):
             raise InputError(
-                f"{row.name}.{key} {value:g} is not within {setting.low:g} to {setting.high:g}"
+                f"{row.name}.{key} must be between {setting.low:g} and {setting.high:g}, not "
+                f"{value:g}"
             )
         if setting.number in changes:
-            raise InputError(f"{row.name}.{key}: {setting.number} is given twice")
+            raise InputError(f"{row.name}.{key}: {setting.number} is specified twice")
         changes[setting.number] = value * setting.size
     trips, releases = changes.get("trips", row.trips), changes.get("releases", row.releases)
     if not (releases < trips if row.above else releases > trips):
         side = "below" if row.above else "above"
         raise InputError(
-            f"{row.name}: it releases at {row.shown(releases)}, which must be {side} its trip at "
+            f"{row.name}: the release at {row.shown(releases)} must be {side} the trip at "
             f"{row.shown(trips)}; set trips and releases together"
         )
     try:
@@ -201,8 +202,8 @@ def _changed(row: Condition, row_limits: Mapping[str, float]) -> Condition:
     latest = NOTICED.get(row.act, row.budget)
     if changed.detection > latest:
         raise InputError(
-            f"{row.name}: it would be noticed after {changed.detection:g} s, and {row.act.name} "
-            f"needs {latest:g} s at most; shorten delay_s or stale_after_s"
+            f"{row.name}: the condition would be noticed after {changed.detection:g} s, and "
+            f"{row.act.name} needs {latest:g} s at most; shorten delay_s or stale_after_s"
         )
     return changed
 

@@ -26,7 +26,7 @@ def begin(connection: Connection, entry: AuditEntry) -> None:
     if known is not None:
         if (known.who, known.what, known.at) != (entry.who, entry.what, entry.at):
             raise InputError(
-                f"audit: record {entry.identity} exists already; identities are unique"
+                f"audit: record {entry.identity} already exists; each identity must be unique"
             )
         return
     number = (connection.scalar(select(func.max(_AUDIT.c.number))) or 0) + 1

@@ -89,7 +89,7 @@ def backup(
     final = Path(folder)
     database.require()
     if final.exists():
-        raise StoreError(f"backup {final}: it exists already; give a new folder")
+        raise StoreError(f"backup {final}: this folder already exists; choose a new one")
     beside = final.with_name(f".{final.name}.{os.getpid()}.part")
     try:
         make_private(beside.parent)
@@ -149,7 +149,7 @@ def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise FormatError(path, f"{error.strerror}; give the folder of a backup") from None
+        raise FormatError(path, f"{error.strerror}; specify the folder of a backup") from None
     if signed_by is not None:
         _check_signature(place, data, signed_by)
     try:
@@ -173,7 +173,7 @@ def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
     for link in place.rglob("*"):
         if link.is_symlink():
             # Its content is stored elsewhere, so no checksum vouches for it.
-            raise FormatError(link, "it is a link, which no backup has; remove it")
+            raise FormatError(link, "this is a link, and backups contain no links; remove it")
     for file in _files(place):
         if str(file.relative_to(place)) not in {*checksums, MANIFEST, SIGNATURE}:
             raise FormatError(
@@ -188,7 +188,7 @@ def _check_signature(place: Path, manifest: bytes, key: PublicKey) -> None:
         raise FormatError(path, "it is not signed; use a signed backup")
     if not key.signed(manifest, path.read_bytes()):
         raise FormatError(
-            path, f"its signature is not of the key {key.path}, or the manifest was altered"
+            path, f"its signature was not made with the key {key.path}, or the manifest was altered"
         )
 
 
@@ -241,7 +241,7 @@ def restore(
         database.lock()
         if database.revision():
             raise StoreError(
-                f"store {database.name}: it exists already; give an empty place, or move it away"
+                f"store {database.name}: it already exists; choose an empty place, or move it away"
             )
         if telemetry is not None and (restored.folder / TELEMETRY).is_dir():
             if Path(telemetry).exists() and any(Path(telemetry).iterdir()):

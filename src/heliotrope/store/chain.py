@@ -237,7 +237,7 @@ def read_heads(path: Path) -> list[Head]:
         for match in re.findall(rf"\b(?:{'|'.join(CHAINS)}):\d+:[0-9a-f]{{64}}\b", text)
     ]
     if not listed:
-        raise InputError(f"{path}: holds no head; give a file that --heads or syslog wrote")
+        raise InputError(f"{path}: contains no head; specify a file that --heads or syslog wrote")
     return list(dict.fromkeys(listed))
 
 
@@ -289,7 +289,7 @@ def verify(connection: Connection, known: Iterable[Head] = ()) -> Verified:
     since = connection.scalar(select(func.min(_EVENT.c.at)))
     if old and not fitting:
         raise StoreError(
-            f"none of the {len(old)} heads could be checked: {kept_since(since)}; give a newer head"
+            f"none of the {len(old)} heads could be checked: {kept_since(since)}; use a newer head"
         )
     return Verified(heads(connection), tuple(fitting), tuple(old), since)
 

@@ -147,7 +147,7 @@ class Database:
             ) from None
         except OSError as error:
             raise StoreError(
-                f"store {self.file}: {error.strerror}; give a folder that can be written"
+                f"store {self.file}: {error.strerror}; choose a writable folder"
             ) from None
         self.locked = True
 
@@ -192,7 +192,9 @@ class Database:
         """
         revision = self.revision()
         if not revision:
-            raise StoreError(f"store {self.name}: no store here; `heliotrope run` makes one")
+            raise StoreError(
+                f"store {self.name}: there is no store here; `heliotrope run` creates one"
+            )
         if revision != HEAD:
             raise StoreError(
                 f"store {self.name}: its tables have revision {revision}, this program needs "
@@ -304,8 +306,8 @@ def _place(place: str | Path) -> tuple[URL, Path | None]:
             ) from None
         if url.get_backend_name() != "postgresql":
             raise StoreError(
-                f"store: a URL of {url.get_backend_name()}; give a folder for SQLite, or a URL "
-                "postgresql://user@host/name"
+                f"store: a URL of {url.get_backend_name()} cannot be used; specify a folder for "
+                "SQLite, or a URL postgresql://user@host/name"
             )
         return url.set(drivername="postgresql+psycopg"), None
     file = Path(place)

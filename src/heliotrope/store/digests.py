@@ -36,7 +36,9 @@ class Head:
         chain, _, rest = text.partition(":")
         number, _, digest = rest.partition(":")
         if chain not in CHAINS or not number.isdigit() or len(digest) != len(GENESIS):
-            raise InputError(f"head {text!r}: give one as `heliotrope store head` prints it")
+            raise InputError(
+                f"{text!r} is not a head; specify one as `heliotrope store head` prints it"
+            )
         return cls(chain, int(number), digest)
 
 

@@ -101,7 +101,7 @@ def _write_heliostat(
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{place}: {error.strerror}; give a folder to write to") from None
+        raise InputError(f"{place}: {error.strerror}; choose a folder to write to") from None
     kinds = [kind if kind in KINDS else "" for kind in kept.kinds]
     write_sightings(place / "sightings.csv", kept.sightings, kept.names or (name,), kinds)
     _write(place / "residuals.csv", _RESIDUALS, _residuals(kept, history))

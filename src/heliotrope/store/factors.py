@@ -81,7 +81,9 @@ class Factors:
         def work(connection: Connection) -> None:
             factor = _find(connection, name)
             if factor is not None and factor.confirmed:
-                raise InputError(f"account {name}: it has a second factor; remove that one first")
+                raise InputError(
+                    f"account {name}: it already has a second factor; remove that one first"
+                )
             connection.execute(_FACTOR.delete().where(_FACTOR.c.name == name))
             row = {"name": name, "word": word, "since": now, "confirmed": False, "used": 0}
             connection.execute(_FACTOR.insert().values(row))
@@ -208,7 +210,10 @@ class Factors:
         except (OSError, ValueError) as error:
             raise InputError(f"key file {self._file}: it cannot be read ({error})") from None
         if len(key) != _BYTES:
-            raise InputError(f"key file {self._file}: {len(key)} bytes; give {_BYTES}, as hex")
+            raise InputError(
+                f"key file {self._file}: the key must have {_BYTES} bytes, in hexadecimal, not "
+                f"{len(key)}"
+            )
         return key
 
     def _make_key(self) -> bytes:

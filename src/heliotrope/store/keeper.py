@@ -192,7 +192,8 @@ class Keeper:
         """
         if len(sightings) and int(sightings.heliostat.max()) >= len(names):
             raise InputError(
-                f"sightings: heliostat row {int(sightings.heliostat.max())} of {len(names)} names"
+                f"sightings: heliostat row {int(sightings.heliostat.max())}, but there are only "
+                f"{len(names)} names"
             )
         first = self._take_numbers(tables.sighting, len(sightings))
         numbers = np.arange(first, first + len(sightings), dtype=np.int64)
@@ -222,7 +223,7 @@ class Keeper:
                 if record.version <= last:
                     raise InputError(
                         f"calibration of {record.heliostat}: version {record.version} is not above "
-                        f"{last}, the last one recorded; give it a higher version"
+                        f"{last}, the last one recorded; use a higher version"
                     )
                 versions[record.heliostat] = record.version
             made = [rows.row_of(tables.parameter_version, record) for record in records]
@@ -567,9 +568,7 @@ def _make_folder(folder: Path) -> None:
     try:
         make_private(folder)
     except OSError as error:
-        raise StoreError(
-            f"store {folder}: {error.strerror}; give a folder that can be written"
-        ) from None
+        raise StoreError(f"store {folder}: {error.strerror}; choose a writable folder") from None
 
 
 def _last_number(connection: Connection, table: Table) -> int:

@@ -237,8 +237,8 @@ class People:
         _check_role(role)
         if not name.strip(" .") or len(name) > LONGEST_NAME or not name.isprintable():
             raise InputError(
-                f"account {name[:LONGEST_NAME]!r}: give a name of 1 to {LONGEST_NAME} printable "
-                "characters, not of dots alone"
+                f"account {name[:LONGEST_NAME]!r}: the name must have 1 to {LONGEST_NAME} "
+                "printable characters, and not only dots"
             )
         if not password_hash:
             raise InputError(f"account {name}: a password hash is needed to sign in")
@@ -247,12 +247,13 @@ class People:
         def work(connection: Connection) -> None:
             if _find(connection, name) is not None:
                 raise InputError(
-                    f"account {name}: it exists already; change it, or give another name"
+                    f"account {name}: it already exists; change it, or choose another name"
                 )
             for other in connection.scalars(select(_ACCOUNT.c.name)):
                 if _likeness(other) == _likeness(name):
                     raise InputError(
-                        f"account {name}: the name looks like that of {other}; give another one"
+                        f"account {name}: the name looks like that of {other}; choose a different "
+                        "one"
                     )
             connection.execute(_ACCOUNT.insert().values(rows.row_of(_ACCOUNT, made)))
             _set_due(connection, name, due=due)
@@ -428,7 +429,7 @@ class People:
             own = select(func.count()).where(_TOKEN.c.name == name)
             if (connection.scalar(own) or 0) >= MOST_TOKENS:
                 raise InputError(
-                    f"token {label!r}: {name} has {MOST_TOKENS} tokens already; revoke one first"
+                    f"token {label!r}: {name} already has {MOST_TOKENS} tokens; revoke one first"
                 )
             connection.execute(_TOKEN.insert().values(asdict(made)))
 

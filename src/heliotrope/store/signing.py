@@ -38,7 +38,9 @@ def make_key(path: Path) -> Path:
     public = path.with_name(path.name + PUBLIC)
     for file in (path, public):
         if file.exists():
-            raise InputError(f"{file}: it exists, and keys are never overwritten; move it away")
+            raise InputError(
+                f"{file}: the file already exists, and keys are never overwritten; move it away"
+            )
     key = ed25519.Ed25519PrivateKey.generate()
     private = key.private_bytes(form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption())
     known = key.public_key().public_bytes(form.Encoding.PEM, form.PublicFormat.SubjectPublicKeyInfo)
@@ -81,7 +83,7 @@ class SigningKey:
         except (ValueError, TypeError):
             key = None
         if not isinstance(key, ed25519.Ed25519PrivateKey):
-            raise FormatError(path, "it is no private key that heliotrope store key has made")
+            raise FormatError(path, "not a private key created by heliotrope store key")
         self._key: Ed25519PrivateKey = key
 
     def sign(self, data: bytes) -> bytes:
@@ -115,7 +117,9 @@ class PublicKey:
             key = None
         if not isinstance(key, ed25519.Ed25519PublicKey):
             raise FormatError(
-                path, f"it is no public key of backups; give the file {PUBLIC} of store key"
+                path,
+                f"not a public key of backups; specify the file {PUBLIC} created by heliotrope "
+                "store key",
             )
         self._key: Ed25519PublicKey = key
 

@@ -77,13 +77,13 @@ class TelemetrySettings:
     def __post_init__(self) -> None:
         if not 0.0 < self.period <= self.keyframe:
             raise InputError(
-                f"telemetry: a period of {self.period} s with a keyframe every "
-                f"{self.keyframe} s; give a period above 0 and not above the keyframe's"
+                f"telemetry: the period ({self.period} s) must be above 0 and at most the keyframe "
+                f"interval ({self.keyframe} s)"
             )
         if self.deadband < 0 or self.days < 0 or self.rows < 1:
             raise InputError(
-                f"telemetry: deadband {self.deadband}, {self.days} days, {self.rows} rows; give "
-                "0 or more, 0 or more, 1 or more"
+                "telemetry: deadband and days must be 0 or more and rows 1 or more, not "
+                f"{self.deadband}, {self.days} and {self.rows}"
             )
 
 

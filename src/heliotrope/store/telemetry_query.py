@@ -88,7 +88,7 @@ def _show(connection: duckdb.DuckDBPyConnection, files: Sequence[str], parts: pa
 def _check(statements: Sequence[Any]) -> None:
     kinds = [statement.type for statement in statements]
     if kinds not in ([duckdb.StatementType.SELECT], [duckdb.StatementType.EXPLAIN]):
-        raise InputError("query: give one SELECT; nothing else is allowed")
+        raise InputError("query: write a single SELECT; nothing else is allowed")
 
 
 def _line(error: Exception) -> str:

@@ -142,10 +142,10 @@ ALGORITHMS = ("spa", "grena2008")
 _SITE_LIMITS = (
     ("latitude_deg", -90.0, 90.0, "°", "north is positive"),
     ("longitude_deg", -180.0, 180.0, "°", "east is positive"),
-    ("height", -500.0, 9000.0, "m", "give metres above the ellipsoid"),
-    ("pressure", 3e4, 1.2e5, "Pa", "give pascal (1 hPa is 100 Pa)"),
-    ("temperature_c", -90.0, 60.0, "°C", "give degrees Celsius (0 °C is 273.15 K)"),
-    ("delta_t", -8000.0, 8000.0, "s", "give TT − UT1 in seconds, about 69 in 2025"),
+    ("height", -500.0, 9000.0, "m", "use metres above the ellipsoid"),
+    ("pressure", 3e4, 1.2e5, "Pa", "use pascals (1 hPa is 100 Pa)"),
+    ("temperature_c", -90.0, 60.0, "°C", "use degrees Celsius (0 °C is 273.15 K)"),
+    ("delta_t", -8000.0, 8000.0, "s", "use TT − UT1 in seconds, about 69 in 2025"),
 )
 
 
@@ -415,7 +415,7 @@ def daylight(
 
     limit = _checked(min_elevation, "min_elevation")
     if not timedelta(seconds=0.1) <= every <= timedelta(days=1):
-        raise InputError(f"every: {every} is not within 0.1 s to 1 day")
+        raise InputError(f"every must be between 0.1 s and 1 day, not {every}")
     step = every.total_seconds()
     noon = _mean_noon(day, site)
     first, last = np.ceil((noon + np.array([-0.5, 0.5]) * _DAY) / step)
@@ -491,7 +491,7 @@ def check_site(site: object) -> None:
     """
     if not isinstance(site, Site):
         raise InputError(
-            f"site: {kind_of(site)} is not a Site; give Site(latitude_deg, longitude_deg, height), "
+            f"site: {kind_of(site)} is not a Site; pass Site(latitude_deg, longitude_deg, height), "
             "in degrees and metres, or Site.from_pvlib(location)"
         )
 
@@ -503,8 +503,8 @@ def _true_level(apparent: float, site: Site) -> float:
 
     if _checked(apparent) < 0.0:
         raise InputError(
-            f"elevation: {apparent:g} rad is below the horizon, where the apparent "
-            "elevation jumps; give at least 0, or the true elevation with apparent=False"
+            f"elevation: {apparent:g} rad is below the horizon, where the apparent elevation "
+            "jumps; pass at least 0, or the true elevation with apparent=False"
         )
     target = float(np.degrees(apparent))
 
@@ -531,7 +531,7 @@ def _number(value: object) -> float:
 def _checked(elevation: float, name: str = "elevation") -> float:
     if not -np.pi / 2 <= _number(elevation) <= np.pi / 2:
         raise InputError(
-            f"{name}: {elevation} rad is not within −π/2 to π/2; degrees need numpy.radians"
+            f"{name}: {elevation} rad is not within −π/2 to π/2; convert degrees with numpy.radians"
         )
     return float(elevation)
 
@@ -544,9 +544,9 @@ def _mean_noon(day: Any, site: Site) -> float:
         except ValueError:
             raise TimeError(f"day: {day!r} is not an ISO 8601 date like 2024-06-21") from None
     if isinstance(day, datetime) or not isinstance(day, date):
-        raise TimeError(f"day: {day!r} is not a date; give a datetime.date or an ISO date")
+        raise TimeError(f"day: {day!r} is not a date; pass a datetime.date or an ISO date")
     if day == date.min:
-        raise TimeError(f"day: {day} begins before the calendar of datetime; give a later day")
+        raise TimeError(f"day: {day} begins before the range of datetime; choose a later day")
     check_site(site)
     midnight = (day - _EPOCH.date()).days * _DAY
     return midnight + _DAY * (0.5 - site.longitude_deg / 360.0)
@@ -588,8 +588,8 @@ def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
 
 def _no_time(value: Any, index: Sequence[int]) -> TimeError:
     return TimeError(
-        f"{_label(index)}: {value} is not a time; give an aware datetime, an ISO 8601 "
-        "text with an offset, or unix seconds"
+        f"{_label(index)}: {value} is not a time; pass an aware datetime, an ISO 8601 text with an "
+        "offset, or unix seconds"
     )
 
 
@@ -604,10 +604,10 @@ def _seconds_of(times: Times) -> FloatArray:
     try:
         array = np.asarray(times)
     except ValueError:
-        raise TimeError("times: the lists in it differ in length") from None
+        raise TimeError("times: its lists differ in length") from None
     if array.dtype.kind == "M":
         raise TimeError(
-            f"times: {array.dtype} has no time zone; say which one, for example "
+            f"times: {array.dtype} has no time zone; specify one, for example "
             "pandas.DatetimeIndex(times).tz_localize('UTC')"
         )
     if array.dtype.kind in "iuf":
@@ -652,7 +652,7 @@ def _check_years(seconds: FloatArray, site: Site) -> None:
     """Refuse times outside the validity of ΔT; those outside that of SPA are no times."""
     if site.delta_t is None:
         _refuse_outside(
-            seconds, _FIRST_DELTA_T, _LAST_DELTA_T, "the known ΔT; give Site(delta_t=...) in s"
+            seconds, _FIRST_DELTA_T, _LAST_DELTA_T, "the known ΔT; pass Site(delta_t=...) in s"
         )
 
 

@@ -247,7 +247,8 @@ class RenderedCamera:
             if len(scene.targets) > 1 or scene.beams:
                 raise InputError(
                     f"rendered camera: the scene of {names} has {len(scene.targets)} targets and "
-                    f"{len(scene.beams)} beams; give one target and no beam: mirrors add beams"
+                    f"{len(scene.beams)} beams; use one target and no beam, because mirrors add "
+                    "beams"
                 )
         self._sight, self._scenes = sight, {s.targets[0].name: s for s in scenes}
         self._optics, self._settings = optics or Optics(), settings or PhotographSettings()

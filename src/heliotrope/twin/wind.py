@@ -68,10 +68,11 @@ class Wind:
         for name, most in limits.items():
             value = getattr(self, name)
             if not 0.0 <= value <= most:
-                raise InputError(f"wind: {name} {value} must be from 0 to {most:g}")
+                raise InputError(f"wind: {name} must be between 0 and {most:g}, not {value}")
         if not (self.length > 0.0 and np.isfinite([self.length, self.towards]).all()):
             raise InputError(
-                f"wind: length {self.length} m must be above 0, and towards {self.towards} finite"
+                f"wind: length must be above 0 and towards finite, not {self.length} m and "
+                f"{self.towards}"
             )
 
     @property

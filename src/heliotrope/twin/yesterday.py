@@ -203,7 +203,7 @@ def measure_yesterday(
     """
     if count < 0 or not design.targets:
         raise InputError(
-            f"yesterday: {count} heliostats on {len(design.targets)} targets; give 0 or more "
+            f"yesterday: {count} heliostats on {len(design.targets)} targets; specify 0 or more "
             "heliostats, and a plant with a target"
         )
     rows, begun = _timetable(design, start, count)

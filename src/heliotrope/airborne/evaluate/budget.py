@@ -55,7 +55,7 @@ class Budget:
         for f in fields(self):
             value = float(getattr(self, f.name))
             if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"budget: {f.name} {value} m must be 0 or more")
+                raise InputError(f"budget: {f.name} must be 0 or more, not {value} m")
 
     def parts(self, distance: npt.ArrayLike) -> dict[str, FloatArray]:
         """Return the rotation caused by each error at distances (...), rad per axis, (...)."""

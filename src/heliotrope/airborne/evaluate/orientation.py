@@ -392,7 +392,10 @@ def _checked(reflections: Reflections, shape: MirrorShape) -> Reflections:
     if not len(reflections):
         raise InputError("orientation: no reflections; at least one is needed")
     if (reflections.heliostat != reflections.heliostat[0]).any():
-        raise InputError("orientation: got reflections of several heliostats; pass those of one")
+        raise InputError(
+            "orientation: got reflections of several heliostats; pass the reflections of one "
+            "heliostat"
+        )
     highest = int(reflections.facet.max())
     if highest >= len(shape):
         raise InputError(

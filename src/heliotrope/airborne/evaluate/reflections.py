@@ -103,11 +103,13 @@ def reflections(
         invalid = ~np.isfinite(values).all(axis=-1)
         if invalid.any():
             i = int(np.flatnonzero(invalid)[0])
-            raise InputError(f"reflection {i}: {name} {values[i]} is not finite; leave it out")
+            raise InputError(
+                f"reflection {i}: {name} {values[i]} is not finite; omit this reflection"
+            )
     invalid = ~(np.isfinite(spread) & (spread > 0.0))
     if invalid.any():
         i = int(np.flatnonzero(invalid)[0])
-        raise InputError(f"reflection {i}: sigma {spread[i]} m must be above 0")
+        raise InputError(f"reflection {i}: sigma must be above 0, not {spread[i]} m")
     return Reflections(
         index(photo, "photo"),
         index(heliostat, "heliostat"),
@@ -144,7 +146,8 @@ def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]
     file = _checked(path)
     if len(found) and int(found.heliostat.max()) >= len(names):
         raise InputError(
-            f"reflections: heliostat row {int(found.heliostat.max())} of {len(names)} names"
+            f"reflections: heliostat row {int(found.heliostat.max())}, but there are only "
+            f"{len(names)} names"
         )
     columns: dict[str, object] = {
         "photo": found.photo,
@@ -186,7 +189,7 @@ def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflection
             " is not a whole number from 0",
         )
     sigma = numbers["sigma_m"]
-    rows.check("sigma_m", ~(sigma > 0.0) & np.isfinite(sigma), sigma, " m must be above 0")
+    rows.check("sigma_m", ~(sigma > 0.0) & np.isfinite(sigma), sigma, " m is not above 0")
     good = rows.good
     ends = [
         np.stack([numbers[f"{end}_{axis}_m"][good] for axis in _AXES], axis=-1) for end in _VECTORS

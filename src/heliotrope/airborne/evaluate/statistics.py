@@ -70,7 +70,7 @@ def rosner(values: npt.ArrayLike, *, alpha: float = ALPHA) -> npt.NDArray[np.boo
     covariance.
     """
     if not 0.0 < alpha < 1.0:
-        raise InputError(f"alpha {alpha}: it must lie between 0 and 1")
+        raise InputError(f"alpha must be between 0 and 1, not {alpha}")
     data = as_float(values)
     mask = np.zeros(len(data), dtype=np.bool_)
     # Rosner's critical values are accurate from n = 15, and need two values that remain.

@@ -62,16 +62,18 @@ class KeepOut:
         corners = as_float(self.corners)
         what = f"keep-out {self.name}"
         if corners.ndim != 2 or corners.shape[1] != 2 or not np.isfinite(corners).all():
-            raise InputError(f"{what}: corners of shape {corners.shape}; give finite (V, 2)")
+            raise InputError(
+                f"{what}: corners have the shape {corners.shape}; specify finite corners, (V, 2)"
+            )
         if len(corners) < 3 and not (len(corners) == 1 and self.radius > 0.0):
             raise InputError(
                 f"{what}: {len(corners)} corners; specify three or more, or one position and a "
                 "radius"
             )
         if not self.radius >= 0.0:
-            raise InputError(f"{what}: radius {self.radius} m must not be below 0")
+            raise InputError(f"{what}: radius must be 0 or more, not {self.radius} m")
         if not self.top > self.bottom:
-            raise InputError(f"{what}: top {self.top} m must be above bottom {self.bottom} m")
+            raise InputError(f"{what}: top ({self.top} m) must be above bottom ({self.bottom} m)")
         if len(corners) > 1:
             _polygon(corners, what)
         object.__setattr__(self, "corners", corners)
@@ -169,7 +171,7 @@ class Airspace:
                 "or more and below the upper one"
             )
         if not self.margin >= 0.0:
-            raise InputError(f"margin {self.margin} m must not be below 0")
+            raise InputError(f"margin must be 0 or more, not {self.margin} m")
         if self.fence is not None:
             fence = as_float(self.fence)
             if fence.ndim != 2 or fence.shape[-1] != 2 or len(fence) < 3:

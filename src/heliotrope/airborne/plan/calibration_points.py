@@ -75,18 +75,20 @@ class PointSelection:
 
     def __post_init__(self) -> None:
         if self.points < 1:
-            raise InputError(f"{self.points} calibration points: must be 1 or more")
+            raise InputError(
+                f"the number of calibration points must be 1 or more, not {self.points}"
+            )
         if not (np.isfinite(self.sigma) and self.sigma > 0.0):
-            raise InputError(f"sigma {self.sigma} rad of a normal must be above 0")
+            raise InputError(f"sigma of a normal must be above 0, not {self.sigma} rad")
         if not (np.isfinite(self.scatter) and self.scatter >= 0.0):
-            raise InputError(f"scatter {self.scatter} rad of a reflection must be 0 or more")
+            raise InputError(f"scatter of a reflection must be 0 or more, not {self.scatter} rad")
         if not 0.0 <= self.min_elevation < self.max_elevation <= 0.5 * np.pi:
             raise InputError(
-                f"elevations {np.degrees(self.min_elevation):g}° to "
-                f"{np.degrees(self.max_elevation):g}°: must be 0° to 90°, the lower first"
+                "elevations must be between 0° and 90°, the lower first, not "
+                f"{np.degrees(self.min_elevation):g}° to {np.degrees(self.max_elevation):g}°"
             )
         if not 0.0 < self.share <= 1.0:
-            raise InputError(f"share {self.share}: must be above 0, up to 1")
+            raise InputError(f"share must be above 0 and at most 1, not {self.share}")
 
     def check(self, names: tuple[str, ...], model: str) -> None:
         """Raise an error unless the points outnumber the unknowns of a model."""

@@ -120,7 +120,7 @@ def clusters(
         raise InputError("clusters: there is no heliostat")
     for name, value in (("size", size), ("largest radius", max_radius)):
         if not value > 0.0:
-            raise InputError(f"cluster {name} {value:g} m: must be a length above 0")
+            raise InputError(f"cluster {name} must be a length above 0, not {value:g} m")
     area = ground_areas(place)
     count = max(1, int(np.ceil(area.sum() / (0.25 * np.pi * size**2))))
     while True:

@@ -93,7 +93,7 @@ def plan_dome(
         ("side", side, 0.05, 5.0),
     ):
         if not low <= value <= high:
-            raise InputError(f"dome: {name} {value:g} must be from {low:g} to {high:g}")
+            raise InputError(f"dome: {name} must be between {low:g} and {high:g}, not {value:g}")
     rings = np.sort(as_float(elevations))
     if len(rings) < 2 or rings[0] < np.radians(15.0) or rings[-1] > np.radians(88.0):
         raise InputError(

@@ -56,15 +56,15 @@ class Craft:
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= 50:
-            raise InputError(f"{self.count} drones: must be 1 to 50")
+            raise InputError(f"the number of drones must be between 1 and 50, not {self.count}")
         if not 0.0 < self.speed <= 15.0:
-            raise InputError(f"speed {self.speed:g} m/s: must be above 0 and at most 15")
+            raise InputError(f"speed must be above 0 and at most 15 m/s, not {self.speed:g} m/s")
         for name in ("acceleration", "photo", "endurance"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} {value:g}: must be above 0")
+                raise InputError(f"{name} must be above 0, not {value:g}")
         if not (np.isfinite(self.change) and self.change >= 0.0):
-            raise InputError(f"battery change {self.change:g} s must not be below 0")
+            raise InputError(f"battery change must be 0 or more, not {self.change:g} s")
 
     def time(self, length: float) -> float:
         """Return the duration of a leg from rest to rest, s."""
@@ -531,7 +531,7 @@ def camera_target(
     """
     for name, value in (("minutes", minutes), ("targets", targets), ("clear share", clear)):
         if not (np.isfinite(value) and value > 0.0):
-            raise InputError(f"{name} {value:g}: must be above 0")
+            raise InputError(f"{name} must be above 0, not {value:g}")
     begin = np.datetime64(f"{year}-01-01").astype("datetime64[s]").astype(np.float64)
     # Every 29 minutes of a year, which samples all hours of the day equally.
     moments = begin + np.arange(0.0, 365.0 * 86400.0, 29.0 * 60.0)

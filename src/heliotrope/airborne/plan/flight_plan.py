@@ -75,12 +75,16 @@ class PlanSettings:
     def __post_init__(self) -> None:
         if not 0.0 < self.spread <= np.radians(45.0):
             raise InputError(
-                f"spread {np.degrees(self.spread):g}°: must be above 0° and at most 45°"
+                f"spread must be above 0° and at most 45°, not {np.degrees(self.spread):g}°"
             )
         if not 0.0 < self.view < np.pi:
-            raise InputError(f"view {np.degrees(self.view):g}°: must be above 0° and below 180°")
+            raise InputError(
+                f"view must be above 0° and below 180°, not {np.degrees(self.view):g}°"
+            )
         if not 0.0 < self.hours_a_day <= 24.0:
-            raise InputError(f"{self.hours_a_day:g} hours a day: must be above 0 and at most 24")
+            raise InputError(
+                f"the hours a day must be above 0 and at most 24, not {self.hours_a_day:g}"
+            )
 
 
 @dataclass(frozen=True)

@@ -71,14 +71,14 @@ class Sampling:
         for name, unit in units.items():
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} {value:g}{unit}: must be above 0")
+                raise InputError(f"{name} must be above 0, not {value:g}{unit}")
         if not 0.0 <= self.pointing <= 0.1:
             raise InputError(
-                f"pointing error {1e3 * self.pointing:g} mrad: must be 0 to 100 mrad; roughly "
-                "align mirrors with larger errors first"
+                f"pointing error must be between 0 and 100 mrad, not {1e3 * self.pointing:g} "
+                "mrad; roughly align mirrors with larger errors first"
             )
         if not abs(self.focal) > 0.0:
-            raise InputError("focal length 0 m: use another value, or infinity for flat facets")
+            raise InputError("the focal length must not be 0 m; use infinity for flat facets")
         if np.shape(self.led_offset) != (3,) or not np.isfinite(self.led_offset).all():
             raise InputError("led_offset: use three numbers (right, down, forward) in metres")
 

@@ -82,11 +82,11 @@ class Mission:
 
     def __post_init__(self) -> None:
         if not len(self.latitude_deg):
-            raise InputError(f"flight {self.name}: no waypoints; use one or more")
+            raise InputError(f"flight {self.name}: no waypoints; add at least one")
         if (np.abs(self.height) > 500.0).any():
             worst = float(self.height[int(np.argmax(np.abs(self.height)))])
             raise InputError(
-                f"flight {self.name}: a waypoint {worst:.1f} m above take-off; drones accept at "
+                f"flight {self.name}: a waypoint is {worst:.1f} m above take-off; drones accept at "
                 "most 500 m"
             )
 

@@ -96,11 +96,11 @@ class Conditions:
         for name in (*lights, "clouds", "speed", "exposure"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise InputError(f"conditions: {name} {value} must be 0 or more")
+                raise InputError(f"conditions: {name} must be 0 or more, not {value}")
         if not (self.electrons > 0.0 and 1 <= self.quality <= 100):
             raise InputError(
-                f"conditions: {self.electrons} electrons must be above 0 and quality "
-                f"{self.quality} from 1 to 100"
+                "conditions: electrons must be above 0 and quality between 1 and 100, not "
+                f"{self.electrons} and {self.quality}"
             )
 
 
@@ -357,7 +357,7 @@ def _curve() -> npt.NDArray[np.uint8]:
 
 def _expose(image: Light, conditions: Conditions, seed: int) -> Picture:
     if seed < 0:
-        raise InputError(f"render: seed {seed} must be 0 or more")
+        raise InputError(f"render: seed must be 0 or more, not {seed}")
     rng = np.random.Generator(np.random.SFC64(seed))
     flat = image.reshape(-1)
     out = np.empty(flat.size, np.uint8)

@@ -87,7 +87,7 @@ class Errors:
         for name in ("kinematics", "canting", "map_error", "hover"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"errors: {name} {value} must be 0 or more")
+                raise InputError(f"errors: {name} must be 0 or more, not {value}")
 
 
 #: Those of a real flight: survey, kinematics and maps as HelioPoint states them, the rest is ours.

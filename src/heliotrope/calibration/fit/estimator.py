@@ -184,7 +184,9 @@ class FieldFit(Value, Framed):
             heliostat = self.heliostats.index(heliostat)
         count = np.size(self.scale)
         if not 0 <= heliostat < count:
-            raise InputError(f"heliostat {heliostat}: {count} were fitted; pass an index or a name")
+            raise InputError(
+                f"heliostat {heliostat}: the fit has {count} heliostats; pass an index or a name"
+            )
         return self.of_one(heliostat) if np.ndim(self.scale) else self
 
     def only(self, row: int) -> "FieldFit":
@@ -375,7 +377,7 @@ def _check_options(loss: str, max_iterations: int) -> None:
     if loss not in _LOSSES:
         raise UnknownNameError("loss", str(loss), _LOSSES)
     if not max_iterations >= 1:
-        raise InputError(f"max_iterations: {max_iterations}; must be at least 1")
+        raise InputError(f"max_iterations must be at least 1, not {max_iterations}")
 
 
 def names_of(model: str | Sequence[str], mechanism: Mechanism) -> tuple[str, ...]:
@@ -426,7 +428,7 @@ def mask_of(selection: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArra
 def _priors(
     mechanism: Mechanism, names: tuple[str, ...], priors: Mapping[str, npt.ArrayLike]
 ) -> FloatArray:
-    require("priors", priors, Mapping, "standard deviations by name of the parameter")
+    require("priors", priors, Mapping, "standard deviations by parameter name")
     for name in priors:
         mechanism.parameter(name)
     for name in names:
@@ -439,7 +441,7 @@ def _priors(
     for name in names:
         value = as_numbers(priors.get(name, mechanism.parameter(name).prior), f"prior of {name}")
         if not (np.isfinite(value) & (value > 0)).all():
-            raise InputError(f"prior of {name}: {value} must be above 0 and finite")
+            raise InputError(f"prior of {name} must be above 0 and finite, not {value}")
         if value.shape not in ((), (len(mechanism),)):
             raise InputError(
                 f"prior of {name}: shape {value.shape}; pass one number or {len(mechanism)} numbers"

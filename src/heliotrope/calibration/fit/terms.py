@@ -252,7 +252,7 @@ def _check(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> None:
         if term.joint not in driven:
             raise UnknownNameError(f"driven joint (of term {term.name})", term.joint, driven)
         if not 0.0 < term.prior < np.inf:
-            raise InputError(f"term {term.name}: prior {term.prior}; it must be a number above 0")
+            raise InputError(f"term {term.name}: prior must be a number above 0, not {term.prior}")
 
 
 def _places(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> list[int]:

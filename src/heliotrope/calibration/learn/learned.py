@@ -164,7 +164,8 @@ class Learned(Value, Framed):
             return self.heliostats.index(heliostat)
         if not 0 <= heliostat < len(self.members):
             raise InputError(
-                f"heliostat {heliostat}: there are {len(self.members)}, from 0; give a row or name"
+                f"heliostat {heliostat}: there are {len(self.members)} heliostats, counted from 0; "
+                "pass an index or a name"
             )
         return heliostat
 
@@ -342,7 +343,7 @@ def predict(learned: Learned, sightings: Sightings) -> Prediction:
     sightings
         M sightings of these heliostats, at any time.
     """
-    require("learned", learned, Learned, "what learn or calibrate returns")
+    require("learned", learned, Learned, "the result of learn or calibrate")
     sightings = Members(learned.mechanism, learned.heliostats).rows_of(sightings)
     values, spread = learned.parameters_at(sightings.heliostat, sightings.time)
     return predict_with(learned, sightings, values, spread)

@@ -45,7 +45,7 @@ def generalised_esd(
     """
     for name, value in (("alpha", alpha), ("share", share)):
         if not 0.0 < value < 1.0:
-            raise InputError(f"{name} {value}: it must lie between 0 and 1")
+            raise InputError(f"{name} must be between 0 and 1, not {value}")
     rest = np.ascontiguousarray(residual, dtype=np.float64)
     n = len(rest)
     mask = np.zeros(n, dtype=np.bool_)

@@ -53,7 +53,7 @@ class Timing:
         for field in fields(self):
             value = getattr(self, field.name)
             if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"{field.name} {value} s must be 0 s or more")
+                raise InputError(f"{field.name} must be 0 or more, not {value} s")
         if self.slot < 0.1:
             raise InputError(f"a slot of {self.slot:g} s: settle, exposure and clear are too short")
 
@@ -170,9 +170,9 @@ def plan_campaign(
     if not fleets or not sum(len(f) for f in fleets) or not targets:
         raise InputError("campaign: specify heliostats and at least one target")
     if count is not None and count < 1:
-        raise InputError(f"count {count}: must be 1 or more measurements")
+        raise InputError(f"count must be 1 measurement or more, not {count}")
     if not 0.0 <= worth < 1.0:
-        raise InputError(f"worth {worth:g}: must be a fraction from 0 to below 1")
+        raise InputError(f"worth must be 0 or more and below 1, not {worth:g}")
     if not (np.isfinite([start, stop, every]).all() and every > 0.0):
         raise InputError(
             f"campaign: {start} to {stop} s every {every} s; all must be finite numbers"
@@ -214,7 +214,8 @@ def _cells(
     number = int(np.floor((stop - start) / slot + 1e-9))
     if not 1 <= number <= 2_000_000:
         raise InputError(
-            f"campaign: {stop - start:.0f} s hold {number} slots of {slot:g} s; give 1 to 2,000,000"
+            f"campaign: {stop - start:.0f} s contain {number} slots of {slot:g} s; choose a period "
+            "of 1 to 2,000,000 slots"
         )
     edges = start + slot * np.arange(number + 1)
     high = solar.position(edges, schedule.site).elevation >= schedule.limits.min_elevation

@@ -93,19 +93,18 @@ class CommissionTerms:
     def __post_init__(self) -> None:
         for name in ("sigma", "every"):
             if not 0.0 < getattr(self, name) < np.inf:
-                raise InputError(f"commission: {name} {getattr(self, name)} must be above 0")
+                raise InputError(f"commission: {name} must be above 0, not {getattr(self, name)}")
         for name in ("goal", "settle", "interval", "look", "repeat"):
             if not 0.0 <= getattr(self, name) < np.inf:
-                raise InputError(f"commission: {name} {getattr(self, name)} must be 0 or more")
+                raise InputError(f"commission: {name} must be 0 or more, not {getattr(self, name)}")
         if not 0.0 < self.clear <= 1.0:
-            raise InputError(f"commission: clear {self.clear} must be above 0 and at most 1")
+            raise InputError(f"commission: clear must be above 0 and at most 1, not {self.clear}")
         if not 0.0 <= self.worth < 1.0:
-            raise InputError(
-                f"commission: worth {self.worth}: must be a fraction from 0 to below 1"
-            )
+            raise InputError(f"commission: worth must be 0 or more and below 1, not {self.worth}")
         if self.shots < 1:
             raise InputError(
-                f"commission: {self.shots} photographs per heliostat; must be 1 or more"
+                "commission: the number of photographs per heliostat must be 1 or more, not "
+                f"{self.shots}"
             )
 
     @property
@@ -321,7 +320,7 @@ def _cells(
 ) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
     """Days of sun, and their intervals, each (begin, end)."""
     if not (np.isfinite([start, stop]).all() and 0.0 < stop - start <= 366.0 * 86400.0):
-        raise InputError(f"commission: {start} to {stop} s; the period must be at most a year")
+        raise InputError(f"commission: the period must be at most a year, not {start} to {stop} s")
     edges = np.append(np.arange(start, stop, 60.0), stop)
     up = solar.position(edges, site).elevation >= terms.limits.min_elevation
     if not (up[:-1] & up[1:]).any():

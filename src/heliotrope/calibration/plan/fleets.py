@@ -61,12 +61,14 @@ class Fleet:
 
     def __post_init__(self) -> None:
         if len(self.mechanism.shape) != 1:
-            raise InputError(f"mechanisms of shape {self.mechanism.shape}; must have one axis (N,)")
+            raise InputError(
+                f"mechanisms must have one axis (N,), not the shape {self.mechanism.shape}"
+            )
         count, p = len(self.mechanism), len(self.names)
         for name in ("information", "form"):
             shape = getattr(self, name).shape
             if shape != (count, p, p):
-                raise InputError(f"fleet: {name} of shape {shape}; it must be {(count, p, p)}")
+                raise InputError(f"fleet: {name} has the shape {shape}; expected {(count, p, p)}")
         aim = np.broadcast_to(as_vectors(self.aim, "aim"), (count, 3))
         object.__setattr__(self, "aim", aim)
 

@@ -79,11 +79,11 @@ class JointTerms:
             )
         for name in ("known", "step", "sigma", "brightest"):
             if not getattr(self, name) > 0.0:
-                raise InputError(f"joint visits: {name} {getattr(self, name)} must be above 0")
+                raise InputError(f"joint visits: {name} must be above 0, not {getattr(self, name)}")
         if not self.beside >= 0.0 or self.tries < 1:
             raise InputError(
-                f"joint visits: {self.beside} s beside the photographs, {self.tries} tries; must "
-                "be 0 s or more, and 1 or more tries"
+                "joint visits: the time beside the photographs must be 0 or more and the number "
+                f"of tries 1 or more, not {self.beside} s and {self.tries}"
             )
 
     @classmethod

@@ -51,7 +51,9 @@ class SightingLimits:
         for field in fields(self):
             value = getattr(self, field.name)
             if not 0.0 <= value < 0.5 * np.pi:
-                raise InputError(f"{field.name}: {np.degrees(value):g}° must lie in 0° to 90°")
+                raise InputError(
+                    f"{field.name} must be between 0° and 90°, not {np.degrees(value):g}°"
+                )
 
 
 @dataclass(frozen=True)
@@ -206,7 +208,9 @@ def candidate_sightings(
     if not targets:
         raise InputError("planning: there is no target; a camera-target sighting needs one")
     if len(mechanism.shape) != 1:
-        raise InputError(f"mechanisms of shape {mechanism.shape}; must have one batch axis (N,)")
+        raise InputError(
+            f"mechanisms must have one batch axis (N,), not the shape {mechanism.shape}"
+        )
     bounds = limits or SightingLimits()
     moments = np.atleast_1d(solar.unix_seconds(times))
     above = solar.position(moments, site)
@@ -398,9 +402,11 @@ def plan_sightings(
     possible increase (Nemhauser et al. 1978); with exchange the tests find 98 % or more.
     """
     if criterion not in ("d", "v"):
-        raise InputError(f"criterion {criterion!r}: use d (determinant) or v (beam variance)")
+        raise InputError(
+            f"unknown criterion {criterion!r}; use d (determinant) or v (beam variance)"
+        )
     if count < 1:
-        raise InputError(f"count {count}: must be 1 or more sightings")
+        raise InputError(f"count must be 1 sighting or more, not {count}")
     if not len(candidates):
         raise InputError(
             "planning: no candidate, because sun, end stops or limits allow no sighting at these "

@@ -56,7 +56,9 @@ class ReceiverTerms:
     def __post_init__(self) -> None:
         for name in ("sigma", "pace"):
             if not 0.0 < getattr(self, name) < np.inf:
-                raise InputError(f"receiver visits: {name} {getattr(self, name)} must be above 0")
+                raise InputError(
+                    f"receiver visits: {name} must be above 0, not {getattr(self, name)}"
+                )
 
     @classmethod
     def of(cls, plant: Plant, sigma: float) -> "ReceiverTerms | None":

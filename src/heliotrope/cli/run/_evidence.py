@@ -50,7 +50,10 @@ class Evidence:
         if self.heads is not None and not self.heads.is_dir():
             raise InputError(f"run: --heads {self.heads}: no such folder; create it")
         if not _LEAST <= self.hours <= _MOST:
-            raise InputError(f"run: --heads-every {self.hours:g} h must be {_LEAST:g} to {_MOST:g}")
+            raise InputError(
+                f"run: --heads-every must be between {_LEAST:g} and {_MOST:g} h, not "
+                f"{self.hours:g} h"
+            )
 
     @property
     def receiver(self) -> Receiver | None:

@@ -191,7 +191,7 @@ def check_console(shown: Shown) -> None:
 
 def _missing(error: ImportError) -> InputError:
     return InputError(
-        f"run: {error.name} is not installed; run pip install 'heliotrope[console]', or give "
+        f"run: {error.name} is not installed; run pip install 'heliotrope[console]', or use "
         "--no-console"
     )
 

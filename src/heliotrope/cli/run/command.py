@@ -335,7 +335,7 @@ def run(
             import sqlalchemy  # noqa: F401 - where it is absent, no field begins in vain
 
             if configure or check:
-                raise InputError("run: --configure and --check need a real plant; give --clusters")
+                raise InputError("run: --configure and --check need a real plant; use --clusters")
             design = design_of(field, heliostats, prototype=prototype)
             begins = start_of("run", start, design)
             up = begin is not Begin.STOW and not prototype

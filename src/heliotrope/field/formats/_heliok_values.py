@@ -34,7 +34,7 @@ class Values:
         self.path = document.path or "HelioK document"
         root = document.root
         if root.tag != "HelioK":
-            raise self.error(root, f"the root element is <{root.tag}>; it should be <HelioK>")
+            raise self.error(root, f"the root element is <{root.tag}>; expected <HelioK>")
         self.length = self._unit(root, "unitLength", LENGTHS)
         self.angle = self._unit(root, "unitAngle", ANGLES)
 

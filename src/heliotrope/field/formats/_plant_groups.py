@@ -180,7 +180,7 @@ class _Reader:
             missing += [f"drives.{joint}" for joint in names if joint not in group.drives]
         for joint in group.drives:
             if joint not in names:
-                raise self.fail(f"{joint!r} is no driven joint; they are {names}", "drives")
+                raise self.fail(f"{joint!r} is not a driven joint; use one of {names}", "drives")
         self.check_missing(missing, f"kind {group.kind} needs")
         if group.drives:
             arguments["drives"] = tuple(self.drive(joint) for joint in names)
@@ -210,7 +210,9 @@ class _Reader:
         for angle in DRIVE_ANGLES:
             units = [u for u in ANGLE_UNITS if f"{angle}_{u}" in values]
             if len(units) > 1:
-                raise self.fail(f"{angle} is given in {' and '.join(units)}; keep one", where)
+                raise self.fail(
+                    f"{angle} is specified in {' and '.join(units)}; keep one of them", where
+                )
             if units:
                 values[angle] = values.pop(f"{angle}_{units[0]}") * ANGLE_UNITS[units[0]]
         for key in ("min_count", "max_count", "scale", "worm_ratio"):
@@ -296,17 +298,18 @@ class _Reader:
         table = self.group.machine
         if table is None:
             if any(column.startswith("machine.") for column in self.table.numbers):
-                raise self.fail("the table of heliostats has columns machine.…; add it", "machine")
+                raise self.fail("the columns machine.… need this table; add it", "machine")
             return ()
         joints = [mechanism.joints[d] for d in mechanism.driven]
         if sorted(table.axes) != sorted(joints):
             listed = ", ".join(table.axes) or "none"
             raise self.fail(
-                f"axes of {listed}; specify those of {' and '.join(joints)}", "machine.axes"
+                f"axes are specified for {listed}; specify those of {' and '.join(joints)}",
+                "machine.axes",
             )
         first = table.leaves_stow_first or joints[0]
         if first not in joints:
-            raise self.fail(f"{first!r} is no driven joint; they are {joints}", "machine")
+            raise self.fail(f"{first!r} is not a driven joint; use one of {joints}", "machine")
         if len(joints) != 2:
             raise self.fail(
                 "local controllers drive two joints, but this kind has one; remove the table",
@@ -390,7 +393,7 @@ class _Reader:
             and not known & {key, key.replace("_deg", "_steps")}
             and not np.isfinite(drive.table[:, place]).all()
         ]
-        self.check_missing(missing, "its drive does not give", where)
+        self.check_missing(missing, "its drive does not define", where)
 
     def end(
         self, drive: Drive, where: str, steps: int | None, deg: float | None, stop: int

@@ -68,7 +68,7 @@ def read_facets(reader: _Numbers, size: tuple[FloatArray, FloatArray], site: Sit
             center, full, tilt = (np.stack(places[k::3], axis=1) for k in range(3))
             return Facets.of(center, 0.5 * full, 1e-3 * tilt)
     elif reader.columns("mirror."):
-        raise reader.fail("the table of heliostats has columns mirror.…; add it", "mirror")
+        raise reader.fail("the columns mirror.… need this table; add it", "mirror")
     if not whole:
         return None
     array = reader.array("facets", whole)
@@ -86,26 +86,28 @@ def _check_keys(reader: _Numbers, table: MirrorTable) -> None:
     }
     specified = [name for name, value in kinds.items() if value]
     if len(specified) > 1:
-        raise reader.fail(f"facets are given as {' and '.join(specified)}; keep one", "mirror")
+        raise reader.fail(
+            f"facets are specified as {' and '.join(specified)}; keep one of them", "mirror"
+        )
     used = (table.canting, table.canting_focal_m, table.canting_time, table.canting_sun)
     canting = any(value is not None for value in used) or table.gap_m
     if not table.facets and (canting or reader.columns("mirror.canting_focal_m")):
         raise reader.fail(
-            "canting and gap_m are of equal facets; add facets = [columns, rows], or give the "
-            "tilt_mrad of each facet",
+            "canting and gap_m apply only to equal facets; add facets = [columns, rows], or "
+            "specify the tilt_mrad of each facet",
             "mirror",
         )
     for key in ("slope_error", "focal"):
         both = [name for name in type(table).model_fields if key in name and "canting" not in name]
         named = [name for name in both if getattr(table, name) is not None]
         if len(named) > 1:
-            raise reader.fail(f"{' and '.join(named)}; keep one", "mirror")
+            raise reader.fail(f"{' and '.join(named)} are both set; keep one of them", "mirror")
     known = {"canting_focal_m", "focal_m", "slope_error_mrad", "slope_error_rad", "reflectivity"}
     for column in reader.columns("mirror."):
         key = column.removeprefix("mirror.")
         if key not in known and not key.startswith(("facet.", "facet_focal_m.", "facet_slope")):
             raise reader.fail(
-                f"column {column} is no number of the mirror; those of the table are "
+                f"column {column} is not a mirror property; the table may contain "
                 f"{', '.join(sorted(known))}, and facet.K.KEY.I",
                 "mirror",
             )
@@ -116,7 +118,9 @@ def _canting(reader: _Numbers, table: MirrorTable, site: Site) -> Canting:
     sun = None
     if table.canting_time is not None:
         if table.canting_sun is not None:
-            raise reader.fail("canting_time and canting_sun; keep one", "mirror")
+            raise reader.fail(
+                "canting_time and canting_sun are both set; keep one of them", "mirror"
+            )
         sun = vector(parse_time(table.canting_time), site)
     elif table.canting_sun is not None:
         sun = np.array(table.canting_sun)
@@ -212,7 +216,7 @@ def _maps(
     folder = reader.path.parent / reader.group.mirror.slope_maps
     if not folder.is_dir():
         raise reader.fail(
-            f"{folder}: no such folder; give one with NAME.npz, NAME.csv or NAME.h5 of "
+            f"{folder}: no such folder; specify a folder with NAME.npz, NAME.csv or NAME.h5 for "
             "the heliostats",
             "mirror.slope_maps",
         )
@@ -223,8 +227,8 @@ def _maps(
         maps.append(measured_slopes(folder, name, facets.take(np.array([i])), curve))
     if all(slopes is None for slopes in maps):
         raise reader.fail(
-            f"{folder}: it has no slope map of any heliostat of the group; name the files after "
-            f"heliostats, {names[0]}.npz",
+            f"{folder} contains no slope map for any heliostat of the group; name the files after "
+            f"heliostats, such as {names[0]}.npz",
             "mirror.slope_maps",
         )
     return tuple(maps)

@@ -47,14 +47,19 @@ def build_receiver(table: ReceiverTable, folder: Path) -> Receiver:
 def _mesh(table: ReceiverTable, folder: Path) -> TriangleMesh | None:
     where = f"receiver {table.name}"
     if table.inner_height_m is not None and (table.kind != "cavity" or table.mesh):
-        raise InputError(f"{where}: inner_height_m is of a cavity's cylindrical wall; remove it")
+        raise InputError(
+            f"{where}: inner_height_m applies only to a cavity's cylindrical wall; remove it"
+        )
     if table.kind not in ("cavity", "mesh"):
         if table.mesh:
             raise InputError(f"{where}: kind {table.kind} takes no mesh; remove it")
         return None
     if table.mesh:
         if table.radius_m or table.opening_angle_rad:
-            raise InputError(f"{where}: mesh and radius_m or opening_angle_rad; keep one")
+            raise InputError(
+                f"{where}: mesh cannot be combined with radius_m or opening_angle_rad; keep one of "
+                "them"
+            )
         return read_mesh(folder / table.mesh)
     if table.kind == "mesh" or not table.radius_m or table.height_m is None:
         wall = ", or radius_m and height_m" if table.kind == "cavity" else ""

@@ -72,7 +72,7 @@ def _turn(table: Any, changes: Mapping[str, str]) -> None:
     new = _numbers(table, "facing_deg", changes.get("facing_deg", f"{facing!r}"), 1)[0]
     lean = _numbers(table, "tilt_deg", changes.get("tilt_deg", f"{tilt!r}"), 1)[0]
     if abs(lean) >= 90.0:
-        raise InputError(f"{table['name']}: tilt_deg={lean:g}: must be between -90° and 90°")
+        raise InputError(f"{table['name']}: tilt_deg must be between -90° and 90°, not {lean:g}°")
     R_enu_new, R_enu_old = _axes(new, lean), _axes(facing, tilt)
     middle, R = _center(table), R_enu_new @ R_enu_old.T
     if "corners_m" not in table and "normal" not in table and abs(lean) > 1e-9:

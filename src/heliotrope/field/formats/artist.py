@@ -90,7 +90,7 @@ def write_scenario(
                 _mechanism(root, known[name], kinematics_properties(mechanism))
                 lost[name] = without_place(mechanism)
     except (OSError, RuntimeError, KeyError) as error:
-        raise FormatError(file, f"{str(error)[:80]}; it should be {_WHAT}") from None
+        raise FormatError(file, f"{str(error)[:80]}; expected {_WHAT}") from None
     write_file(path, lambda stream: stream.write(held.getvalue()))
     return lost
 

@@ -108,11 +108,13 @@ def read_deflectometry(
         with h5py.File(file, "r") as root:
             names = [name for name in root if str(name).startswith("facet")]
             if len(names) != count:
-                raise FormatError(file, f"a map of {len(names)} facets, but the mirror has {count}")
+                raise FormatError(
+                    file, f"the map has {len(names)} facets, but the mirror has {count}"
+                )
             clouds = [_cloud(file, root, f"facet{k + 1}") for k in range(count)]
     except (OSError, RuntimeError, KeyError) as error:
         raise FormatError(
-            file, f"no readable HDF5 ({str(error)[:80]}); it should be {_WHAT}"
+            file, f"not a readable HDF5 file ({str(error)[:80]}); expected {_WHAT}"
         ) from None
     fewest = min(len(points) for points, _ in clouds)
     cells = int(np.clip(np.sqrt(fewest / _POINTS), 1, _CELLS))

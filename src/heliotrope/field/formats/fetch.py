@@ -114,11 +114,11 @@ class FetchSettings:
 
     def __post_init__(self) -> None:
         if not 1 <= self.workers <= 32:
-            raise InputError(f"workers {self.workers}: must be 1 to 32")
+            raise InputError(f"workers must be between 1 and 32, not {self.workers}")
         if not self.timeout > 0.0 or not self.backoff >= 0.0 or self.retries < 0:
             raise InputError(
-                f"timeout {self.timeout} s must be above 0, backoff {self.backoff} s and retries "
-                f"{self.retries} not below"
+                f"timeout must be above 0 s, and backoff and retries 0 or more, not {self.timeout} "
+                f"s, {self.backoff} s and {self.retries}"
             )
 
 

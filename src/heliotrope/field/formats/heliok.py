@@ -232,8 +232,8 @@ def _model(values: Values, element: XmlElement, name: str) -> Model:
     if np.linalg.norm(np.cross(normal, last.direction)) < ALONG_LIMIT:
         raise values.error(
             tracking,
-            f"HeliostatKit {name}: the normal lies along the {parts[-1]} axis, which "
-            "then cannot turn it",
+            f"HeliostatKit {name}: the normal is parallel to the {parts[-1]} axis, so rotation "
+            "about this axis would not change it",
         )
     return Model(
         name=name,
@@ -269,8 +269,8 @@ def _facet(values: Values, element: XmlElement, normal: FloatArray) -> Surface:
     if away > FACET_LIMIT_DEG:
         raise values.error(
             element,
-            f"<Facet> rotation: its normal stands {away:.0f}° from that of <Tracking>, "
-            f"which is more than {FACET_LIMIT_DEG:g}°; turn the facet",
+            f"<Facet> rotation: the facet's normal is {away:.0f}° from the <Tracking> normal, "
+            f"above the limit of {FACET_LIMIT_DEG:g}°; correct the rotation",
         )
     return _surface(values, values.child(element, "ShapeKit"), center, axes)
 
@@ -287,7 +287,9 @@ def _surface(values: Values, kit: XmlElement, origin: FloatArray, axes: FloatArr
         middle = np.array([x.mean(), y.mean(), 0.0])
     if width <= 0.0 or height <= 0.0:
         raise values.error(
-            aperture, f"<ApertureRectangular> {width:g} m × {height:g} m: both must be above 0"
+            aperture,
+            f"<ApertureRectangular>: width and height must both be above 0, not {width:g} m × "
+            f"{height:g} m",
         )
     return Surface(origin + axes @ middle, axes, width, height)
 
@@ -353,7 +355,7 @@ def heliostats(document: Document) -> list[PlacedModel]:
             raise values.error(kit.element, "a heliostat node has no name; name it")
         if name in by_name:
             raise values.error(
-                kit.element, f"heliostat {name}: the name occurs twice; names are unique"
+                kit.element, f"heliostat {name}: the name occurs twice; each name must be unique"
             )
         ref = values.text(kit.element, "ref")
         if ref not in known:
@@ -444,10 +446,7 @@ def to_plant(document: Document, site: Site) -> Plant:
         if not model.facets:
             raise FormatError(
                 path,
-                (
-                    f"HeliostatKit {model.name}: no <Facet>, so the mirror has no size; add a "
-                    "<Facet>"
-                ),
+                f"HeliostatKit {model.name}: no <Facet>, so the mirror has no size; add a <Facet>",
             )
         upright = int(np.argmax(np.abs(model.primary.direction)))
         key = (upright, len(model.facets), len(model.axes))

@@ -119,7 +119,8 @@ def _read_files(place: Path, centroid: Centroid) -> "pd.DataFrame":
     files = sorted(place.glob(f"*/Calibration/{name}")) or sorted(place.glob(f"*/{name}"))
     if not files:
         raise FormatError(
-            place, "there is neither measurements.csv nor ID/Calibration/*.json; fetch some"
+            place,
+            ("found neither measurements.csv nor ID/Calibration/*.json; fetch measurements first"),
         )
     rows = []
     for file in files:
@@ -153,7 +154,7 @@ def _keep_good(
     time = _seconds(frame["timestamp"].astype(str))
     reasons: list[tuple[Any, str]] = [
         (frame["heliostat"].astype(str).to_numpy() == "", "no heliostat is named"),
-        (~np.isfinite(counts).all(axis=1), "a motor position is missing or no number"),
+        (~np.isfinite(counts).all(axis=1), "a motor position is missing or not a number"),
         (~np.isfinite(azimuth) | ~np.isfinite(elevation), "the sun's angles are missing"),
         (~((elevation > -5.0) & (elevation <= 90.0)), "the sun's elevation is not above −5°"),
         (time >= END_OF_TIMES, "the year is out of range: correct the time"),

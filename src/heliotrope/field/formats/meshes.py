@@ -67,10 +67,10 @@ def _read_obj(file: Path) -> TriangleMesh:
         except ValueError:
             expected = "three coordinates in m" if kind == "v" else "three vertex numbers or more"
             raise FormatError(
-                file, f"{line.strip()[:40]!r}: give {expected}", f"line {number}"
+                file, f"{line.strip()[:40]!r}: expected {expected}", f"line {number}"
             ) from None
     if not faces:
-        raise FormatError(file, "it has no face; a mesh needs lines v x y z and f i j k")
+        raise FormatError(file, "the mesh has no faces; it needs lines v x y z and f i j k")
     return TriangleMesh(np.array(vertices).reshape(-1, 3), np.array(faces))
 
 
@@ -80,8 +80,8 @@ def _read_stl(file: Path) -> TriangleMesh:
     if len(data) != _HEADER + _TRIANGLE * count or not count:
         raise FormatError(
             file,
-            f"{len(data):,} bytes for {count:,} triangles; it is no complete binary STL: save it "
-            "as binary STL or as OBJ",
+            f"{len(data):,} bytes for {count:,} triangles are not a complete binary STL; save the "
+            "mesh as binary STL or as OBJ",
         )
     kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
     corners = np.frombuffer(data, kind, offset=_HEADER)["corners"].reshape(-1, 3)

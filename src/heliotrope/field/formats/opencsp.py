@@ -150,7 +150,7 @@ def _read(path: str | Path, what: str, columns: tuple[str, ...]) -> Rows:
     rows = read_rows(Path(path), what, columns)
     rows.need(columns)
     if not len(rows):
-        raise FormatError(path, f"there is no row below the header; {what} has some")
+        raise FormatError(path, f"there are no rows below the header; expected {what}")
     return rows
 
 

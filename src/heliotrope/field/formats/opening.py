@@ -128,7 +128,7 @@ def _refuse_unused(place: Path, **arguments: object) -> None:
         if value is not None:
             raise FormatError(
                 place,
-                (f"{name} is specified, but files of this format contain their own; leave it out"),
+                (f"{name} is specified, but files of this format contain their own; omit it"),
             )
 
 

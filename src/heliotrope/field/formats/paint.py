@@ -475,8 +475,8 @@ def written(heliostats: Heliostats, name: str) -> Mechanism:
     """
     if heliostats.mechanism.kind != "two_jacks":
         raise InputError(
-            f"heliostat {name}: kind {heliostats.mechanism.kind}; PAINT supports only two_jacks; "
-            "use write_plant, which supports every kind"
+            f"heliostat {name}: its kind is {heliostats.mechanism.kind}, but PAINT supports only "
+            "two_jacks; use write_plant, which supports every kind"
         )
     return heliostats.calibrated[heliostats.index(name)]
 

@@ -54,9 +54,9 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
 def checked_slopes(file: Path, slope: FloatArray, facets: int) -> FloatArray:
     """Return a slope map whose holes are filled; errors as in `read_slopes`."""
     if slope.ndim != 4 or slope.shape[3] != 2 or not slope.size:
-        raise FormatError(file, f"slopes of shape {slope.shape}; they must be (F, H, W, 2)")
+        raise FormatError(file, f"slopes must have the shape (F, H, W, 2), not {slope.shape}")
     if len(slope) != facets:
-        raise FormatError(file, f"a map of {len(slope)} facets, but the mirror has {facets}")
+        raise FormatError(file, f"the map has {len(slope)} facets, but the mirror has {facets}")
     largest = float(np.nanmax(np.abs(slope), initial=0.0))
     if largest > LARGEST:
         raise FormatError(
@@ -97,7 +97,7 @@ def write_slopes(path: str | Path, slope: FloatArray) -> None:
 def _read_npz(file: Path) -> FloatArray:
     slope = read_arrays(file, "a slope map: an .npz file written by NumPy", ["slope"])["slope"]
     if slope.dtype.kind not in "fiu":
-        raise FormatError(file, f"slopes are {slope.dtype}; they must be numbers")
+        raise FormatError(file, f"slopes must be numbers, not {slope.dtype}")
     return as_float(slope)
 
 
@@ -115,12 +115,14 @@ def _read_csv(file: Path) -> FloatArray:
             rows.places[i],
         )
     if not len(index):
-        raise FormatError(file, "no rows; give one for each cell of the map")
+        raise FormatError(file, "the table has no rows; it needs one row for each cell of the map")
     whole = index.astype(np.intp)
     shape = np.asarray(whole.max(axis=0)) + 1
     if int(np.prod(shape)) > 10 * len(whole):
         raise FormatError(
-            file, f"{len(whole)} rows for {' × '.join(map(str, shape))} cells; give the whole map"
+            file,
+            f"{len(whole)} rows for {' × '.join(map(str, shape))} cells; the table must "
+            "contain the whole map",
         )
     slope = np.full((*shape, 2), np.nan)
     slope[whole[:, 0], whole[:, 1], whole[:, 2]] = 1e-3 * values

@@ -87,7 +87,7 @@ _UNIT = re.compile(r"\s*(?:[\[(<]\s*(.*?)\s*[\])>]|[_/](mm|cm|km|m|ft|deg|rad))\
 #: Pattern of a cell that begins like a number.
 _NUMBERED = re.compile(r"[-+]?\d")
 _EXAMPLE = (
-    "give id,x,y,z (m east, north, up), id,latitude,longitude,altitude (degrees, m), or the "
+    "use id,x,y,z (m east, north, up), id,latitude,longitude,altitude (degrees, m), or the "
     "columns of SolarPILOT"
 )
 _NULL = "null"

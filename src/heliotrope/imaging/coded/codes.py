@@ -20,7 +20,7 @@ def photographs_for(mirrors: int, along: int | None = None) -> int:
     the same axis; the row of ones stays unused.
     """
     if mirrors < 1:
-        raise InputError(f"codes: {mirrors} mirrors; must be 1 or more")
+        raise InputError(f"codes: the number of mirrors must be 1 or more, not {mirrors}")
     rows = 2 * mirrors if along is None else mirrors
     return max(_FEWEST, 1 << rows.bit_length())
 

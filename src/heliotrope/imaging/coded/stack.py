@@ -59,7 +59,7 @@ class Stack:
             if array is not None and np.shape(array) != expected:
                 raise InputError(f"stack: {name} has shape {np.shape(array)}; expected {expected}")
         if not (np.isfinite(self.step) and self.step > 0.0):
-            raise InputError(f"stack: step {self.step} m must be above 0")
+            raise InputError(f"stack: step must be above 0, not {self.step} m")
         if not np.isfinite(self.values[:, self.seen]).all():
             raise InputError("stack: brightness is not finite at a seen pixel; mask such pixels")
         if self.exposures is not None and not (np.asarray(self.exposures) > 0.0).all():

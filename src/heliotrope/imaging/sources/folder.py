@@ -50,7 +50,7 @@ class FolderSource(Source):
     def __post_init__(self) -> None:
         self.name = self.name or str(self.path)
         if not 0.0 < self.poll < math.inf:
-            raise InputError(f"source {self.name}: poll {self.poll} s must be above 0")
+            raise InputError(f"source {self.name}: poll must be above 0, not {self.poll} s")
 
     def _begin(self) -> None:
         self._listed()

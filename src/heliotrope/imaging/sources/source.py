@@ -44,7 +44,7 @@ class Source(ABC):
 
     def __iter__(self) -> Iterator[Frame]:
         if self.limit is not None and self.limit < 1:
-            raise InputError(f"source {self.name}: limit {self.limit} frames must be 1 or more")
+            raise InputError(f"source {self.name}: limit must be 1 frame or more, not {self.limit}")
         return islice(self._frames(), self.limit)
 
     @abstractmethod

@@ -246,13 +246,13 @@ class EmptyTarget:
         names = tuple(target.name for target in picture.face.targets)
         if self.targets and set(self.targets) != set(names):
             raise InputError(
-                f"the model is of {', '.join(self.targets)}, the frame shows {', '.join(names)}; "
-                "use the model of this target"
+                f"the model is of {', '.join(self.targets)}, but the frame shows "
+                f"{', '.join(names)}; use the model of this target"
             )
         if picture.shape != self.reflectance.shape:
             raise InputError(
-                f"the model has {self.reflectance.shape} px, the frame {picture.shape} px; learn a "
-                "new model of this target"
+                f"the model has {self.reflectance.shape} px, but the frame has {picture.shape} px; "
+                "learn a new model of this target"
             )
 
 

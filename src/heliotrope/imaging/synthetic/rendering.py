@@ -321,7 +321,7 @@ def _add_ghost(level: Image, lens: LensEffects) -> None:
 def _expose(sensor: Sensor, level: Image, seed: int) -> tuple[Pixels, float]:
     """Return the pixels, and the fraction of clipped readings."""
     if seed < 0:
-        raise InputError(f"render: seed {seed} must be 0 or more")
+        raise InputError(f"render: seed must be 0 or more, not {seed}")
     # NumPy's fastest generator; the noise needs no cryptographic strength.
     rng = np.random.Generator(np.random.SFC64(seed))
     noise = rng.standard_normal(level.size, dtype=np.float32)

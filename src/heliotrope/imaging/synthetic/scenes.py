@@ -52,7 +52,7 @@ class Paint:
         if min(self.panels) < 1 or self.stains < 0 or not self.seam_width >= 0.0:
             raise InputError("paint: panels must be 1 or more, stains and seam_width 0 or more")
         if not 0.0 <= self.wear <= 0.3:
-            raise InputError(f"paint: wear {self.wear} must be from 0 to 0.3")
+            raise InputError(f"paint: wear must be between 0 and 0.3, not {self.wear}")
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Surroundings:
         if not (np.isfinite(self.sky) and self.sky >= 0.0) or self.clutter < 0:
             raise InputError("surroundings: sky (W/m²) and clutter must be 0 or more")
         if not 0.0 <= self.texture <= 0.3:
-            raise InputError(f"surroundings: texture {self.texture} must be from 0 to 0.3")
+            raise InputError(f"surroundings: texture must be between 0 and 0.3, not {self.texture}")
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,8 @@ class LensEffects:
     def __post_init__(self) -> None:
         if not 0.0 <= self.defocus <= 50.0 or not np.hypot(*self.shake) <= 100.0:
             raise InputError(
-                f"lens: defocus {self.defocus} px, shake {self.shake} px; must be 0 to 50 and at "
-                "most 100"
+                f"lens: defocus must be 0 to 50 px and shake at most 100 px, not {self.defocus} px "
+                f"and {self.shake} px"
             )
         _share("lens: veil", self.veil)
         if not (self.ghost >= 0.0 and self.ghost_radius > 0.0 and np.isfinite(self.ghost_at).all()):
@@ -213,13 +213,13 @@ class Sensor:
         for name in ("electrons", "sensitivity", "exposure", "gain"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"sensor: {name} {value} must be above 0 and finite")
+                raise InputError(f"sensor: {name} must be above 0 and finite, not {value}")
         if not (np.isfinite(self.read_noise) and self.read_noise >= 0.0):
-            raise InputError(f"sensor: read_noise {self.read_noise} e- must be 0 or more")
+            raise InputError(f"sensor: read_noise must be 0 or more, not {self.read_noise} e-")
         if not 0.0 <= self.offset < 1.0:
-            raise InputError(f"sensor: offset {self.offset} must be from 0 to below 1")
+            raise InputError(f"sensor: offset must be 0 or more and below 1, not {self.offset}")
         if self.bits not in (8, 12):
-            raise InputError(f"sensor: {self.bits} bits; must be 8 or 12")
+            raise InputError(f"sensor: bits must be 8 or 12, not {self.bits}")
 
     @property
     def scale(self) -> float:
@@ -250,7 +250,9 @@ class Thrown:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.strength) and self.strength >= 0.0):
-            raise InputError(f"beam on {self.target}: strength {self.strength} must be 0 or more")
+            raise InputError(
+                f"beam on {self.target}: strength must be 0 or more, not {self.strength}"
+            )
 
 
 @dataclass(frozen=True)
@@ -303,10 +305,10 @@ class Scene:
                 raise UnknownNameError("target", beam.target, names)
         object.__setattr__(self, "beams", thrown)
         if not (np.isfinite(self.ambient) and self.ambient >= 0.0):
-            raise InputError(f"scene: ambient {self.ambient} W/m² must be 0 or more")
+            raise InputError(f"scene: ambient must be 0 or more, not {self.ambient} W/m²")
         _share("scene: cloud", self.cloud)
         if not np.isfinite(self.gradient).all():
-            raise InputError(f"scene: gradient {self.gradient} 1/m must be finite")
+            raise InputError(f"scene: gradient must be finite, not {self.gradient} 1/m")
 
 
 def exposed(scene: Scene, peak: float = 0.8) -> Scene:
@@ -322,7 +324,9 @@ def exposed(scene: Scene, peak: float = 0.8) -> Scene:
     """
     sensor = scene.sensor
     if not peak > sensor.offset:
-        raise InputError(f"scene: peak {peak} must be above the sensor's offset {sensor.offset}")
+        raise InputError(
+            f"scene: peak ({peak}) must be above the sensor's offset ({sensor.offset})"
+        )
     flux = max((b.beam.peak * b.strength * scene.cloud for b in scene.beams), default=0.0)
     light = scene.paint.reflectance * (scene.ambient + flux)
     if not light > 0.0:
@@ -394,7 +398,7 @@ def example_camera(
         Name of the camera.
     """
     if not (distance > 0.0 and fill > 0.0):
-        raise InputError(f"camera: distance {distance} m and fill {fill} must be above 0")
+        raise InputError(f"camera: distance and fill must be above 0, not {distance} m and {fill}")
     width, height = size
     right, up = target.axes
     towards = np.cos(below) * (np.cos(side) * target.normal + np.sin(side) * right)
@@ -415,4 +419,4 @@ def example_camera(
 
 def _share(what: str, value: float) -> None:
     if not 0.0 <= value <= 1.0:
-        raise InputError(f"{what} {value} must be from 0 to 1")
+        raise InputError(f"{what} must be between 0 and 1, not {value}")

@@ -137,7 +137,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _point(self, name: str, value: object) -> Pixel:
         if name not in self._state.names:
-            raise InputError(f"point {name!r} was not asked for")
+            raise InputError(f"point {name!r} was not requested")
         width, height = self._state.size
         if not (
             isinstance(value, list)

@@ -64,7 +64,7 @@ class Wish:
             raise InputError(f"a {self.kind} needs its size in metres (--size)")
         for what, value in (("size", self.size), ("stroke", self.stroke)):
             if value is not None and not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{what} {value} m; must be above 0")
+                raise InputError(f"{what} must be above 0, not {value} m")
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def teach(
         target.
     """
     if not (np.isfinite(sigma) and sigma > 0.0):
-        raise InputError(f"sigma {sigma} px; must be above 0")
+        raise InputError(f"sigma must be above 0, not {sigma} px")
     surface = plant.target(target)
     named = _check_points(surface, frame, given)
     for name in set(wishes or {}) - set(named):
@@ -329,7 +329,7 @@ def _check_points(
     for k, name in enumerate(names):
         for other in names[:k]:
             if np.hypot(*np.subtract(pixels[name], pixels[other])) < 3.0:
-                raise InputError(f"points {other} and {name} are at the same place, {pixels[name]}")
+                raise InputError(f"points {other} and {name} are in the same place, {pixels[name]}")
     return {name: known[name] for name in names}
 
 

@@ -23,6 +23,8 @@ from heliotrope.links.messages import NEVER, NODE, ClusterStatus
 #: Age from which a row is stale, s: three missed polls.
 STALE = 3.0
 
+#: States in which a heliostat does not operate until an operator has attended to it.
+OUT_OF_ORDER = (states.FAULT, states.UNCONFIGURED)
 #: States in which a heliostat moves only to turn away and to go to stow.
 _HELD = (states.LOCKED, states.FAULT)
 #: Goals that differ by more steps than this belong to another motion.

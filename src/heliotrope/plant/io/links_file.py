@@ -404,7 +404,7 @@ def _check(found: LinksFile) -> None:
         if name not in FED:
             raise FormatError(
                 path,
-                f"there is no such reading; give one of {', '.join(sorted(FED))}",
+                f"there is no such reading; use one of {', '.join(sorted(FED))}",
                 f"sensors.{name}",
             )
     seen = [name for name, how in document.sensors.items() if how == CAMERA]
@@ -418,8 +418,8 @@ def _check(found: LinksFile) -> None:
     if bool(seen) != bool(document.receiver_light):
         raise FormatError(
             path,
-            f'{FLUX_READING} = "camera" and receiver_light, the reference of that camera, must '
-            "be set together; record a reference with heliotrope camera receiver",
+            f'{FLUX_READING} = "camera" and receiver_light, the reference of that camera, must be '
+            "set together; record a reference with heliotrope camera receiver",
             "receiver_light",
         )
     seen_by = document.witness

@@ -35,6 +35,7 @@ from heliotrope.optics.scene import Scene
 from heliotrope.optics.surfaces import surface_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
+from heliotrope.plant.field.state import OUT_OF_ORDER
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.flux_check import Beyond, FluxCheck
 from heliotrope.plant.operations.logbook import Logbook
@@ -62,8 +63,6 @@ BRIGHT = 1.15
 WARY = 600.0
 #: The safe spread follows when the age of the last good aims exceeds this multiple of the deadline.
 SAFE = 5.0
-#: States from which a heliostat cannot join without an operator.
-_OUT = (states.LOCKED, states.FAULT, states.UNCONFIGURED)
 
 Mask = npt.NDArray[np.bool_]
 
@@ -368,7 +367,11 @@ class Aiming:
     def _movers(self, now: float) -> Mask:
         """Return a mask of the heliostats that may be assigned other aims now, (N,)."""
         field = self._plant.field
-        free = self._automatic.movable() & field.live(now) & ~field.among(_OUT, now)
+        free = (
+            self._automatic.movable()
+            & field.live(now)
+            & ~field.among((states.LOCKED, *OUT_OF_ORDER), now)
+        )
         free &= ~self._by_person & (self._blocked_until < now)
         free[[field.place(name) for name in self._automatic.visiting]] = False
         return np.asarray(free)

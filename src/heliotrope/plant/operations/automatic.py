@@ -136,20 +136,21 @@ class AutomaticSettings:
                 f"or more"
             )
         if self.losses < 0:
-            raise InputError(f"automatic control: losses is {self.losses}; it must be 0 or more")
+            raise InputError(f"automatic control: losses must be 0 or more, not {self.losses}")
         if not 0.0 <= self.losses_share <= 1.0:
             raise InputError(
-                f"automatic control: losses_share is {self.losses_share:g}; it must be 0 to 1"
+                "automatic control: losses_share must be between 0 and 1, not "
+                f"{self.losses_share:g}"
             )
         if not 0.0 <= self.foresee < math.inf:
             raise InputError(
-                f"automatic control: a prediction every {self.foresee} s; the interval must be 0 "
-                f"(none) or more"
+                "automatic control: the interval of predictions must be 0 (none) or more, not "
+                f"{self.foresee} s"
             )
         if not self.events > 0.0:
             raise InputError(
-                f"automatic control: events are kept for {self.events} days; the time must be "
-                f"above 0"
+                f"automatic control: events must be kept for more than 0 days, not {self.events} "
+                "days"
             )
 
 

@@ -9,9 +9,9 @@ from collections.abc import Awaitable, Callable, Mapping
 
 import numpy as np
 
-from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.field.state import OUT_OF_ORDER
 from heliotrope.plant.operations.views import STALE_STATE, FieldFrame, Summary, SunView
 from heliotrope.store.records import PlantFigures, Records, StoreError
 
@@ -19,8 +19,6 @@ from heliotrope.store.records import PlantFigures, Records, StoreError
 EVERY = 60.0
 #: Significant digits stored of a figure.
 _DIGITS = 5
-#: States in which a heliostat does not operate until an operator has attended to it.
-_OUT_OF_ORDER = (states.FAULT, states.UNCONFIGURED)
 #: Unit of each kind of figure; readings have the units of the safety table.
 UNITS = {
     "power": "W",
@@ -51,7 +49,7 @@ def figures(
         Predicted power into each receiver, W.
     """
     stale = frame.state == STALE_STATE
-    faulty = ~stale & np.isin(frame.state, _OUT_OF_ORDER)
+    faulty = ~stale & np.isin(frame.state, OUT_OF_ORDER)
     known = frame.error[np.isfinite(frame.error)]
     found = {
         "available": float((~stale & ~faulty & ~frame.held).sum()),

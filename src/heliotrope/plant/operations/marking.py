@@ -388,8 +388,8 @@ class Marking:
         except OSError as error:
             raise InputError(
                 f"target {target.name}: {self._file} cannot be written "
-                f"({error.strerror or error}), so nothing was changed; give the plant's program "
-                f"write access, or use heliotrope camera teach and restart the program"
+                f"({error.strerror or error}), so nothing was changed; grant the plant's program "
+                "write access, or use heliotrope camera teach and restart the program"
             ) from None
 
 

@@ -223,7 +223,7 @@ class Authority:
     ) -> None:
         if not 0.0 < lifetime <= 3600.0:
             raise InputError(
-                f"authority: a lifetime of {lifetime} s; it must be above 0 and at most 3600 s"
+                f"authority: the lifetime must be above 0 and at most 3600 s, not {lifetime} s"
             )
         self.lifetime = lifetime
         self._clock = clock

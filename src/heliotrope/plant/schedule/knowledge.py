@@ -284,8 +284,8 @@ class FieldKnowledge:
     ) -> None:
         if sorted(names) != sorted(design.names):
             raise InputError(
-                f"schedule: {len(names)} names for {len(design)} heliostats; give each name of "
-                "the design once"
+                f"schedule: {len(names)} names for {len(design)} heliostats; list each name of the "
+                "design once"
             )
         self.row = {name: i for i, name in enumerate(names)}
         self._settings, self._begin, count = settings, begin, len(names)

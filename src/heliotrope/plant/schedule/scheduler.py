@@ -265,7 +265,7 @@ class Scheduler:
         if not design.targets or not len(design):
             raise InputError(
                 f"schedule: {len(design.targets)} targets and {len(design)} heliostats; nothing "
-                "can be calibrated with a camera: give at least one of each"
+                "can be calibrated with a camera, so add at least one of each"
             )
         self.reason = ""
         self.running: dict[str, Assignment] = {}
@@ -395,8 +395,8 @@ class Scheduler:
         if states is not None:
             if np.shape(states.state) != ready.shape:
                 raise InputError(
-                    f"schedule: states of shape {np.shape(states.state)}; give one for each of "
-                    f"{len(ready)} heliostats"
+                    f"schedule: states have the shape {np.shape(states.state)}; pass one for each "
+                    f"of {len(ready)} heliostats"
                 )
             ready &= np.isin(states.state, lcu_states.AVAILABLE)
         return self._without(ready, (*away, *self.attempts.waiting(now)))
@@ -547,5 +547,5 @@ class Scheduler:
 
 def _unix(time: datetime) -> float:
     if time.tzinfo is None:
-        raise TimeError(f"schedule: time {time} has no time zone; give UTC")
+        raise TimeError(f"schedule: time {time} has no time zone; pass UTC")
     return time.timestamp()

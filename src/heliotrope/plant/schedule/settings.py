@@ -83,17 +83,19 @@ class Settings:
     def __post_init__(self) -> None:
         if self.shots < 1 or not self.interval >= 0.0 or not self.settle >= 0.0:
             raise InputError(
-                f"schedule: {self.shots} shots {self.interval} s apart and {self.settle} s beside; "
-                "give 1 or more, and 0 s or more"
+                "schedule: shots must be 1 or more, and interval and settle 0 or more, not "
+                f"{self.shots}, {self.interval} s and {self.settle} s"
             )
         for name in ("sigma", "goal", "most_age", "retry", "glare", "most_wind"):
             if not 0.0 < getattr(self, name) < np.inf:
-                raise InputError(f"schedule: {name} {getattr(self, name)} must be above 0")
+                raise InputError(f"schedule: {name} must be above 0, not {getattr(self, name)}")
         for name in ("worth", "most_hidden"):
             if not 0.0 <= getattr(self, name) < 1.0:
-                raise InputError(f"schedule: {name} {getattr(self, name)} must be 0 to below 1")
+                raise InputError(
+                    f"schedule: {name} must be 0 or more and below 1, not {getattr(self, name)}"
+                )
         if self.look is not None and not self.look > 0.0:
-            raise InputError(f"schedule: look {self.look} s; give above 0, or None")
+            raise InputError(f"schedule: look must be above 0, or None, not {self.look} s")
 
     @property
     def visit(self) -> float:

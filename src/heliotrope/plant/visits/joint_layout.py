@@ -70,7 +70,7 @@ def arranged(
     known, wrong = beams_of(plant, target, sure, settings)
     wrong |= blocked
     for name in list(known)[settings.most :]:
-        wrong[name] = f"{settings.most} heliostats are on {target.name} already"
+        wrong[name] = f"{settings.most} heliostats are already on {target.name}"
         del known[name]
     places, dazzling = _darkened(target, known, settings)
     too_bright = f"the light on {target.name} would exceed {settings.brightest:g} suns"
@@ -244,7 +244,7 @@ def newcomers(
         plant, target, errors_on(plant, target, heliostats, settings, model), settings
     )
     for name in list(sent)[settings.first :]:
-        wrong[name] = f"{settings.first} heliostats are on {target.name} already"
+        wrong[name] = f"{settings.first} heliostats are already on {target.name}"
         del sent[name]
     suns, too_bright = settings.brightest, f"the light on {target.name} might exceed"
     while len(sent) > 1 and _brightest(target, sent, _first_places(target, sent)) > suns:

@@ -57,8 +57,8 @@ class CycleSettings:
     def __post_init__(self) -> None:
         if self.shots < 1 or self.least < 1 or not self.interval >= 0.0:
             raise InputError(
-                f"calibration cycle: {self.shots} shots {self.interval} s apart, at least "
-                f"{self.least} sightings; give 1 or more, 0 s or more, 1 or more"
+                "calibration cycle: shots must be 1 or more, interval 0 or more and sightings 1 "
+                f"or more, not {self.shots}, {self.interval} s and {self.least}"
             )
 
     @property
@@ -106,6 +106,6 @@ class Centring:
     def __post_init__(self) -> None:
         if not (0.0 < self.pitch <= 2.0 and self.most >= 0 and 0.0 < self.near <= 0.5):
             raise InputError(
-                f"centring: pitch {self.pitch}, {self.most} aims, near {self.near}; give above 0 "
-                "to 2, 0 or more, and above 0 to 0.5"
+                "centring: pitch must be above 0 and at most 2, aims 0 or more, and near above 0 "
+                f"and at most 0.5, not {self.pitch}, {self.most} and {self.near}"
             )

@@ -76,7 +76,9 @@ class BusFaults:
         for name in ("loss", "corruption", "burst", "duplication", "late", "delay"):
             value = getattr(self, name)
             if not 0.0 <= value <= 1.0:
-                raise InputError(f"bus faults: the probability of {name} is {value}; give 0 to 1")
+                raise InputError(
+                    f"bus faults: the probability of {name} must be between 0 and 1, not {value}"
+                )
 
     @property
     def any(self) -> bool:
@@ -200,7 +202,7 @@ class TwinBus:
             If the bus is closed.
         """
         if not timeout > 0.0:
-            raise InputError(f"bus: a timeout of {timeout} s; it must be above 0")
+            raise InputError(f"bus: the timeout must be above 0, not {timeout} s")
         async with self._turns.turn(urgent=urgent):
             if self._may(expires) is not SendOutcome.SENT:
                 return b""

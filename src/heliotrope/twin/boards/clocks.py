@@ -36,7 +36,7 @@ class SimulatedTime:
 
     def __init__(self, clock: Clock, error: float = 0.05) -> None:
         if not error >= 0.0:
-            raise InputError(f"simulated time: a bound of {error} s; it must not be negative")
+            raise InputError(f"simulated time: the error bound must be 0 or more, not {error} s")
         self._clock = clock
         self._begin = clock.monotonic()
         self._gps = gps_seconds(clock.utc())
@@ -89,7 +89,9 @@ class DriftingClock:
 
     def __init__(self, source: Callable[[], float], start: datetime, drift: float = 0.0) -> None:
         if not abs(drift) < 0.5:
-            raise InputError(f"drifting clock: a drift of {drift}; give less than 0.5, as 50e-6")
+            raise InputError(
+                f"drifting clock: the drift must be below 0.5, such as 50e-6, not {drift}"
+            )
         self._inner = VirtualClock(source, start, rate=1.0 + drift)
 
     def monotonic(self) -> float:

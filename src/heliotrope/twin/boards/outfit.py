@@ -100,7 +100,7 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
         If there are not 1 to 32 heliostats.
     """
     if not 1 <= count <= MOST:
-        raise InputError(f"{count} heliostats on a bus; give 1 to {MOST}")
+        raise InputError(f"a bus must have 1 to {MOST} heliostats, not {count}")
     chance = random.Random(seed)
     fits = []
     machines = spread_machines(MACHINE, [f"H{i + 1:02d}" for i in range(count)])

@@ -47,8 +47,8 @@ class Drives:
         self._play = np.array(np.broadcast_to(np.asarray(play, dtype=np.float64), counts.shape))
         if not (self._play >= 0.0).all() or not 0.0 <= miss <= 1.0:
             raise InputError(
-                f"drives: play of {self._play.min()} steps, probability {miss} of losing one; "
-                "give 0 or more, and 0 to 1"
+                "drives: play must be 0 or more and the probability of losing a step 0 to 1, not "
+                f"{self._play.min()} steps and {miss}"
             )
         self._miss = miss
         self.turned: Integers = counts.copy()

@@ -137,7 +137,7 @@ class Field:
         if len(mechanism.shape) != 1 or len(mechanism.driven) != 2:
             raise InputError(
                 f"field: mechanisms of shape {mechanism.shape} with {len(mechanism.driven)} "
-                "drives; give an array of one dimension, with two drives each"
+                "drives; pass a one-dimensional array, with two drives each"
             )
         count = mechanism.shape[0]
         self.mechanism = mechanism
@@ -562,7 +562,9 @@ class Field:
             If the fault number is unknown.
         """
         if not NO_FAULT < number <= LATCHED:
-            raise InputError(f"field: fault {number}; give 1 to {LATCHED}, as lcu.names has them")
+            raise InputError(
+                f"field: a fault must be 1 to {LATCHED}, as in lcu.names, not {number}"
+            )
         rows = rows[self.state[rows] >= 0]
         self.edition += 1
         self._present[rows] = True

@@ -114,7 +114,7 @@ class WorldOptions:
     def __post_init__(self) -> None:
         if not self.centroid >= 0.0:
             raise InputError(
-                f"simulated plant: centroid variance {self.centroid} m²; give 0 or more"
+                f"simulated plant: centroid variance must be 0 or more, not {self.centroid} m²"
             )
 
 
@@ -411,7 +411,7 @@ def machines_of(design: Plant) -> list[Machine]:
     for name, machine in zip(design.names, machines, strict=True):
         if machine.standby is None:
             raise InputError(
-                f"simulated plant: heliostat {name} has no standby point; give standby_m in the "
+                f"simulated plant: heliostat {name} has no standby point; set standby_m in the "
                 "machine table of its group"
             )
     return machines

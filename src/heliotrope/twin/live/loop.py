@@ -86,7 +86,9 @@ class PacedLoop(asyncio.SelectorEventLoop):
     ) -> None:
         if not 0.0 < speed <= 1000.0:
             self._closed = True  # BaseEventLoop.__del__ reads it
-            raise InputError(f"speed {speed}: give above 0 to 1000 simulated seconds per second")
+            raise InputError(
+                f"speed must be above 0 and at most 1000 simulated seconds per second, not {speed}"
+            )
         self._pace = _Pace(speed, start, wall)
         super().__init__(self._pace)
 

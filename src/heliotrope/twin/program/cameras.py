@@ -49,7 +49,9 @@ class TwinCameras:
                 names.add(visits.receiver)
             seen = tuple(surface for name, surface in surfaces.items() if name in names)
             if seen and camera.position is None:
-                raise InputError(f"camera {camera.name}: no position; give it in the plant file")
+                raise InputError(
+                    f"camera {camera.name} has no position; specify it in the plant file"
+                )
             if seen:
                 self._scenes[camera.name] = Scene(camera, seen)
 

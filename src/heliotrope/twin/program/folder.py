@@ -74,7 +74,10 @@ def write_folder(
     """
     for name in (PLANT, LINKS, KEYS):
         if (folder / name).exists():
-            raise InputError(f"{folder / name}: it exists; give another folder, or delete it")
+            raise InputError(
+                f"{folder / name}: this file already exists; choose another folder, or delete the "
+                "file"
+            )
     homes, sensors = clusters_of(design), set(WeatherStation.names)
     if design.receivers:
         sensors.add(FLUX_READING)
@@ -114,7 +117,7 @@ def read_folder(folder: Path) -> TwinFolder:
     found = urlsplit(file.document.twin)
     if file.document.tcp is None or not found.hostname or not found.port:
         raise FormatError(
-            folder / LINKS, "it is not of a simulated field; give a new folder", "twin"
+            folder / LINKS, "this is not a folder of a simulated field; choose a new folder", "twin"
         )
     host, _, port = file.document.tcp.listen.rpartition(":")
     keys = {name: ring.newest for name, ring in file.keys.items()}

@@ -155,7 +155,7 @@ def drawn(
         if kind not in known:
             raise InputError(f"fault {kind!r} is not known; known: {', '.join(known)}")
     if not pause > 0.0:
-        raise InputError(f"a pause of {pause} s between faults; it must be above 0")
+        raise InputError(f"the pause between faults must be above 0, not {pause} s")
     chance = random.Random(f"faults {seed}")
     possible = {} if not OWN_FAULTS.isdisjoint(worlds) else dict(KINDS)
     for world in worlds:

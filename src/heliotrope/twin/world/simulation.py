@@ -175,8 +175,8 @@ class RunPlan:
         checked(self.worlds)
         if not 0.0 < self.seconds <= 3600.0 * MOST_HOURS:
             raise InputError(
-                f"simulation of {self.seconds / 3600.0:g} h; give above 0 and at most "
-                f"{MOST_HOURS:g} h, as long as the sun is up"
+                f"the simulation must last more than 0 and at most {MOST_HOURS:g} h, as long as "
+                f"the sun is up, not {self.seconds / 3600.0:g} h"
             )
         if not 1 <= self.heliostats <= 32:
             raise InputError(f"simulation of {self.heliostats} heliostats; a cluster has 1 to 32")

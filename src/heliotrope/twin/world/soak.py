@@ -100,7 +100,7 @@ def run_many(
         If the progress file is not one of such runs.
     """
     if processes < 1:
-        raise InputError(f"soak with {processes} processes; give 1 or more")
+        raise InputError(f"a soak needs 1 process or more, not {processes}")
     result = SoakResult()
     known = {}
     if progress is not None and progress.exists():
