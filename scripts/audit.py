@@ -23,6 +23,9 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 #: The program that looks up vulnerabilities, and how long it may take, s.
 PIP_AUDIT, _PATIENCE = "pip-audit==2.10.1", 300.0
+#: What is said where the service cannot be reached.
+_UNKNOWN = "known vulnerabilities could not be looked up"
+_ELSEWHERE = "run make audit where pypi.org can be reached"
 #: Tools of the environment itself, which no package of ours requires.
 TOOLS = frozenset({"pip", "setuptools", "wheel", "uv", "heliotrope"})
 #: Words of licences whose packages a program under MIT may use and ship.
@@ -206,10 +209,9 @@ def look_up() -> int:
         )
         report = json.loads(done.stdout)
     except (OSError, ValueError, subprocess.TimeoutExpired) as error:
-        why = (
-            error if not isinstance(error, ValueError) else (done.stderr.splitlines() or ["?"])[-1]
-        )
-        print(f"known vulnerabilities could not be looked up: {why}")
+        said = done.stderr.split("\n") if isinstance(error, ValueError) else [str(error)]
+        why = next((line.strip() for line in reversed(said) if line.strip()), "no answer")
+        print(f"{_UNKNOWN} ({why[:200]}); {_ELSEWHERE}")
         return 0
     vulnerable, text = judge_report(report)
     print("\n".join([*vulnerable, text]))
@@ -230,6 +232,8 @@ def judge_report(report: dict[str, Any]) -> tuple[list[str], str]:
         for flaw in one["vulns"]
     ]
     missing = len(every) - len(known)
+    if not known:
+        return [], f"{_UNKNOWN} (the service knew none of {missing} packages); {_ELSEWHERE}"
     rest = f"; {missing} could not be looked up, so nothing is known of them" if missing else ""
     text = f"{len(known)} of {len(every)} packages looked up, {len(lines)} vulnerabilities{rest}"
     return lines, text

@@ -511,7 +511,35 @@ def test_a_vulnerability_is_named_and_a_package_that_nobody_knows_is_no_good_new
     )
     lines, text = judge_report({"dependencies": [unknown, unknown]})
     assert not lines
-    assert text.startswith("0 of 2 packages looked up, 0 vulnerabilities; 2 could not be looked up")
+    assert text == (
+        "known vulnerabilities could not be looked up (the service knew none of 2 packages); "
+        "run make audit where pypi.org can be reached"
+    )
+    _, text = judge_report({"dependencies": [good, unknown]})
+    assert text.startswith("1 of 2 packages looked up, 0 vulnerabilities; 1 could not be looked up")
+
+
+@pytest.mark.parametrize(
+    ("errors", "why"),
+    [
+        (
+            "Traceback\n  in a library\nConnectionError: pypi.org is unknown\n\n",
+            "pypi.org is unknown",
+        ),
+        ("", "no answer"),
+    ],
+)
+def test_without_the_service_the_audit_says_so_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], errors: str, why: str
+) -> None:
+    audit = runpy.run_path(str(ROOT / "scripts" / "audit.py"))
+    failed = subprocess.CompletedProcess([], 1, stdout="", stderr=errors)
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: failed)
+    assert audit["look_up"]() == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("known vulnerabilities could not be looked up (")
+    assert why in line
+    assert line.endswith("; run make audit where pypi.org can be reached")
 
 
 def test_the_audit_can_fail() -> None:

@@ -741,7 +741,10 @@ def test_first_start_makes_one_account(tmp_path_factory: pytest.TempPathFactory)
         ({"port": 70_000}, "for a free port, not 70000"),
         ({"host": "0.0.0.0"}, "without TLS passwords"),
         ({"certificate": "a.pem"}, "both files"),
-        ({"session_s": 0.0}, "session_s"),
+        ({"period": 0.0}, "period"),
+        ({"session_s": 0.0}, "a session must be 0.25 to 168 hours, not 0"),
+        ({"idle_s": -1.0}, "the idle lock must be 0 to 600 minutes, not"),
+        ({"sign_ins": 2}, "the limit on sign-ins must be 3 to 100 an hour, not 2"),
     ],
 )
 def test_settings_that_are_refused(options: dict[str, object], text: str) -> None:

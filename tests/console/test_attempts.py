@@ -12,6 +12,7 @@ from heliotrope.console._attempts import AN_HOUR, SPAN, SignInFailures
 from heliotrope.console.headers import address_of
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.errors import InputError
+from heliotrope.store.records import StoreError
 from support.live_console import PASSWORD, LiveConsole
 
 HOME, AWAY, PROXY = "192.0.2.1", "192.0.2.2", "192.0.2.9"
@@ -58,6 +59,15 @@ def test_no_hour_has_more_than_twelve_guesses(clock: Clock) -> None:
     assert len(times) > AN_HOUR
     for begin in times:
         assert sum(begin <= at < begin + SPAN for at in times) <= AN_HOUR
+
+
+@pytest.mark.parametrize("most", [3, 40])
+def test_the_number_of_guesses_in_an_hour_is_a_setting(clock: Clock, most: int) -> None:
+    attempts = SignInFailures(clock, an_hour=most)
+    times = guess(attempts, clock, lambda _: ("ada", HOME))
+    hours = [sum(begin <= at < begin + SPAN for at in times) for begin in times]
+    assert max(hours) <= most
+    assert most > 3 or max(hours) == most
 
 
 def test_delays_grow_slowly(clock: Clock) -> None:
@@ -191,3 +201,19 @@ def test_a_colleague_signs_in_while_one_is_locked_out(console: LiveConsole) -> N
         assert client.post("session", json=right).status_code == 429  # still too early
     attempts = console.server.app.state.console.attempts
     console.call(lambda: attempts.good("viewer", "127.0.0.1"))
+
+
+def test_a_store_that_fails_counts_as_no_guess(
+    console: LiveConsole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(name: str) -> None:
+        raise StoreError("store: cannot be read (gone)")
+
+    given = {"name": "viewer", "password": PASSWORD}
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        with monkeypatch.context() as patch:
+            patch.setattr(console.keeper.people, "account", gone)
+            answers = [client.post("session", json=given) for _ in range(13)]
+            assert {answer.status_code for answer in answers} == {503}
+            assert "cannot be read (gone)" in answers[0].json()["detail"]
+        assert client.post("session", json=given).status_code == 200

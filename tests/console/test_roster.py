@@ -94,13 +94,47 @@ def test_it_is_no_older_than_allowed_and_never_older_than_a_change() -> None:
     run(work)
 
 
+def test_those_who_were_known_go_on_without_the_store() -> None:
+    async def work(store: Store, roster: Roster[str]) -> None:
+        assert await roster.find("token", "good") == "ada"
+        store.problem = HeliotropeError("the server is gone")
+        store.now += TRUSTED + 0.1
+        assert await roster.find("token", "good") == "ada"
+        with pytest.raises(HeliotropeError, match="the server is gone"):
+            await roster.find("token", "new")
+        # The same for a store that is silent, without a wait of its own for each request.
+        store.held = True
+        assert await roster.find("token", "good") == "ada"
+        store.now += 2.0
+        async with asyncio.timeout(0.9):
+            for _ in range(20):
+                assert await roster.find("token", "good") == "ada"
+        # Whoever may have lost their access here is not among them.
+        roster.forget()
+        store.held = False
+        with pytest.raises(HeliotropeError, match="the server is gone"):
+            await roster.find("token", "good")
+
+    run(work)
+
+
+def test_after_an_hour_without_the_store_nobody_is_known() -> None:
+    async def work(store: Store, roster: Roster[str]) -> None:
+        assert await roster.find("token", "good") == "ada"
+        store.problem = HeliotropeError("the server is gone")
+        store.now += LONG_TRUSTED + 1.0
+        with pytest.raises(HeliotropeError, match=r"cannot say who this is \(the server is gone\)"):
+            await roster.find("token", "good")
+
+    run(work)
+
+
 def test_an_emergency_needs_no_store() -> None:
     async def work(store: Store, roster: Roster[str]) -> None:
         assert await roster.find("token", "good") == "ada"
         store.problem = HeliotropeError("the disk is gone")
         store.now += TRUSTED + 0.1
-        with pytest.raises(HeliotropeError, match="the disk is gone"):
-            await roster.find("token", "good")
+        roster.forget()
         assert await roster.find_for_emergency("token", "good") == "ada"
         with pytest.raises(HeliotropeError, match=r"cannot say who this is \(the disk is gone\)"):
             await roster.find_for_emergency("token", "unknown")

@@ -1,85 +1,24 @@
 """Stores to test on: SQLite in a folder, and a real PostgreSQL server, one for all tests."""
 
-import getpass
 import itertools
-import os
-import pwd
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from urllib.parse import quote
 
 import numpy as np
 import pytest
 
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.store.keeper import Keeper
-from support.absence import absent
+from support.postgres import postgres_server
 
 _COUNT = itertools.count()
-
-
-def _programs() -> Path | None:
-    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda p: p.parts[-3])
-    if found:
-        return found[-1].parent
-    there = shutil.which("initdb")
-    return Path(there).parent if there else None
 
 
 @pytest.fixture(scope="session")
 def server() -> Iterator[str]:
     """The URL of a running PostgreSQL server, without a schema."""
-    programs = _programs()
-    if programs is None:
-        absent("PostgreSQL is not installed: no initdb in /usr/lib/postgresql or on the path")
-    folder = Path(tempfile.mkdtemp(prefix="pg"))
-    # The server refuses to run as root.
-    user = getpass.getuser()
-    as_other: dict[str, str] = {}
-    if os.geteuid() == 0:
-        known = {entry.pw_name for entry in pwd.getpwall()}
-        user = "postgres" if "postgres" in known else "nobody"
-        as_other = {"user": user}
-        shutil.chown(folder, user)
-
-    def run(*command: str) -> None:
-        done = subprocess.run(
-            [str(programs / command[0]), *command[1:]],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=False,
-            **as_other,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-
-    data = folder / "data"
-    try:
-        run(
-            "initdb",
-            "-D",
-            str(data),
-            "-A",
-            "trust",
-            "-U",
-            "plant",
-            "-E",
-            "UTF8",
-            "--locale=C",
-            "--no-sync",
-            "--no-instructions",
-        )
-        options = f"-c listen_addresses='' -c unix_socket_directories='{folder}' -c fsync=off"
-        run("pg_ctl", "-D", str(data), "-w", "-l", str(folder / "log"), "-o", options, "start")
-        try:
-            yield f"postgresql://plant@/postgres?host={quote(str(folder), safe='')}"
-        finally:
-            run("pg_ctl", "-D", str(data), "-w", "-m", "immediate", "stop")
-    finally:
-        shutil.rmtree(folder)
+    with postgres_server() as running:
+        yield running.url()
 
 
 @pytest.fixture

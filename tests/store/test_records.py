@@ -436,3 +436,24 @@ def test_beams_that_people_have_aimed_are_kept(tmp_path: Path) -> None:
         assert keeper.aimed_by_people() == ("P1A", "P2B")
         keeper.keep_aimed_by_people(())
         assert keeper.aimed_by_people() == ()
+
+
+def test_a_locked_table_holds_up_a_thread_for_a_while_and_no_record_is_lost(
+    schema: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import psycopg
+
+    monkeypatch.setattr("heliotrope.store.database._WAIT_MS", 200)
+    event = Event(1.0, "plant", "written after all")
+    with closing(Keeper(schema)) as keeper, psycopg.connect(schema) as other:
+        other.execute("LOCK TABLE event IN ACCESS EXCLUSIVE MODE")
+        with pytest.raises(StoreError, match="lock timeout"):
+            asyncio.run(keeper.read(lambda records: records.events()))
+        keeper.record_event(event)
+        with pytest.raises(StoreError, match="lock timeout"):
+            asyncio.run(keeper.confirm())
+        assert "lock timeout" in keeper.problem
+        other.rollback()
+        asyncio.run(keeper.confirm())
+        assert not keeper.problem
+        assert [one.text for one in keeper.events()] == [event.text]

@@ -35,6 +35,8 @@ LAG, LEASE, EMERGENCY, MEMORY, LINES = 0.2, 3.0, 1.0, 2000.0, 200
 PASSWORD, TOKENS = "a password of one's own", 40
 #: Length of an attack, pause between orders, and longest wait for one, s.
 SECONDS, PAUSE, LONGEST = 8.0, 2.0, 20.0
+#: Time for the plant to start, s: a busy machine compiles its kernels first.
+_START = 600.0
 
 
 @dataclass
@@ -104,17 +106,19 @@ def _free() -> int:
 
 
 @contextlib.contextmanager
-def plant(folder: Path, descriptors: int | None) -> Iterator[Target]:
-    """Run a plant during a block."""
+def plant(
+    folder: Path, descriptors: int | None, *options: str, heliostats: int = HELIOSTATS
+) -> Iterator[Target]:
+    """Run a plant during a block, with further options of ``heliotrope run``."""
     port, urgent, log, gauges = _free(), _free(), folder / "log.txt", folder / "gauges.txt"
 
     def few() -> None:
         if descriptors is not None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors, descriptors))
 
-    program = [sys.executable, str(GAUGES), str(gauges), str(HELIOSTATS)]
-    words = ["run", "--heliostats", str(HELIOSTATS), "--no-browser", "--port", str(port),
-             "--emergency-port", str(urgent), "--data", str(folder / "data")]  # fmt: skip
+    program = [sys.executable, str(GAUGES), str(gauges), str(heliostats)]
+    words = ["run", "--heliostats", str(heliostats), "--no-browser", "--port", str(port),
+             "--emergency-port", str(urgent), "--data", str(folder / "data"), *options]  # fmt: skip
     with log.open("wb") as out:
         process = subprocess.Popen(  # fixed arguments
             [*program, *words],
@@ -140,7 +144,7 @@ def plant(folder: Path, descriptors: int | None) -> Iterator[Target]:
 
 def _link(process: "subprocess.Popen[bytes]", log: Path) -> str:
     """Return the one-time link, once the console answers."""
-    until = time.monotonic() + 180.0
+    until = time.monotonic() + _START
     while time.monotonic() < until and process.poll() is None:
         if found := re.search(r"console: (http\S+)\n", log.read_text("utf-8")):
             return found[1]

@@ -1,10 +1,10 @@
 """Recent failed sign-ins: per name and address, per name, and per address.
 
 Each of the three counts delays the next attempt, for longer as failures accumulate. Only the first
-blocks guessing (`AN_HOUR` attempts); the other two merely slow it down, because an attacker could
-otherwise lock out a person, or everyone at one address. Guessing one name from ever new addresses
-is thus limited to some fourteen attempts an hour in total. A name that has signed in from an
-address before is not delayed there by the failures of others.
+blocks guessing (`AN_HOUR` attempts by default); the other two merely slow it down, because an
+attacker could otherwise lock out a person, or everyone at one address. Guessing one name from ever
+new addresses is thus limited to some fourteen attempts an hour in total. A name that has signed in
+from an address before is not delayed there by the failures of others.
 """
 
 from collections import Counter, OrderedDict, deque
@@ -36,6 +36,8 @@ class SignInFailures:
     largest
         Number of names, addresses and pairs of them that are kept; the longest unused are dropped
         first.
+    an_hour
+        Number of attempts for one name at one address in an hour.
     """
 
     def __init__(
@@ -43,7 +45,9 @@ class SignInFailures:
         monotonic: Callable[[], float],
         shared: Collection[str] = (),
         largest: int = 10_000,
+        an_hour: int = AN_HOUR,
     ) -> None:
+        self._an_hour = an_hour
         self._now, self._shared, self._largest = monotonic, frozenset(shared), largest
         self._pairs: OrderedDict[Pair, deque[float]] = OrderedDict()
         self._names: OrderedDict[str, deque[tuple[float, Pair]]] = OrderedDict()
@@ -54,7 +58,7 @@ class SignInFailures:
     def wait(self, name: str, address: str) -> float:
         """Return the time to wait before the next attempt, s; 0 if it may be made now."""
         now, pair = self._now(), (name, address)
-        until = _own_until(self._pairs.get(pair, ()), now)
+        until = _own_until(self._pairs.get(pair, ()), now, self._an_hour)
         if not self.known(name, address):
             until = max(
                 until,
@@ -88,7 +92,7 @@ class SignInFailures:
         Counting only after the slow password check would let many attempts through at once.
         """
         now, pair = self._now(), (name, address)
-        _kept(self._pairs, pair, AN_HOUR, self._largest).append(now)
+        _kept(self._pairs, pair, self._an_hour, self._largest).append(now)
         _kept(self._names, name, _KEPT, self._largest).append((now, pair))
         if address not in self._shared:
             _kept(self._addresses, address, _KEPT, self._largest).append((now, pair))
@@ -125,14 +129,14 @@ def _kept(kept: "OrderedDict[K, deque[V]]", key: K, most: int, largest: int) -> 
     return failures
 
 
-def _own_until(times: Collection[float], now: float) -> float:
+def _own_until(times: Collection[float], now: float, an_hour: int) -> float:
     """Return when a name may try again at an address, s."""
     recent = [at for at in times if now - at < SPAN]
     if not recent:
         return now
-    if len(recent) >= AN_HOUR:
+    if len(recent) >= an_hour:
         return recent[0] + SPAN
-    return recent[-1] + _OWN[len(recent) - 1]
+    return recent[-1] + _OWN[min(len(recent), len(_OWN)) - 1]
 
 
 def _shared_until(

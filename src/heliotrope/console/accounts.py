@@ -27,7 +27,7 @@ from heliotrope.store.people import Account
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 
-def _who(who: Caller) -> models.CallerState:
+def _who(console: Console, who: Caller) -> models.CallerState:
     return models.CallerState(
         name=who.person.name,
         role=who.person.role.name.lower(),
@@ -37,13 +37,16 @@ def _who(who: Caller) -> models.CallerState:
         owes=who.owes,
         factor=who.factor,
         no_password=who.no_password,
+        idle_minutes=console.settings.idle_s / 60.0,
+        session_hours=console.settings.session_s / 3600.0,
+        sign_ins_per_hour=console.settings.sign_ins,
     )
 
 
 @router.get("/session", response_model=models.CallerState, tags=["people"])
-async def session(who: Anyone) -> models.CallerState:
-    """Return the signed-in person."""
-    return _who(who)
+async def session(console: AppConsole, who: Anyone) -> models.CallerState:
+    """Return the signed-in person, and the console's limits on sessions and sign-ins."""
+    return _who(console, who)
 
 
 @router.post(
@@ -64,7 +67,7 @@ async def sign_in(
         raise HTTPException(403, "this page comes from another site; sign in at the console itself")
     account, secret, expires = await log_in(console, body.name, body.password, body.code, request)
     set_cookie(console, response, secret)
-    return _who(signed_in(console, account, secret, expires))
+    return _who(console, signed_in(console, account, secret, expires))
 
 
 @router.delete("/session", status_code=204, tags=["people"])

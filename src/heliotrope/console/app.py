@@ -64,7 +64,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
     """
     chosen = settings or ConsoleSettings()
     people, stream = RemotePeople(plant), Stream(plant, chosen.period, chosen.viewers)
-    attempts = SignInFailures(time.monotonic, chosen.proxies)
+    attempts = SignInFailures(time.monotonic, chosen.proxies, an_hour=chosen.sign_ins)
 
     async def read(used: list[str]) -> dict[Key, Session | ApiToken]:
         found = await plant.valid(used)

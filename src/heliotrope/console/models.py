@@ -84,6 +84,13 @@ class CallerState(BaseModel):
     )
     factor: bool = Field(False, description="Whether the account has a second factor")
     no_password: bool = Field(False, description="Whether the account has no password yet")
+    session_hours: float = Field(0.0, description="Length of a session, see --session")
+    idle_minutes: float = Field(
+        0.0, description="Time after which a command needs the password again; 0: never"
+    )
+    sign_ins_per_hour: int = Field(
+        0, description="Failed sign-ins of one name at one address, after which it must wait"
+    )
 
 
 class Confirmed(Strict):

@@ -6,10 +6,12 @@ persistent connection.
 
 import asyncio
 import time
+from concurrent.futures import TimeoutError as NotYetError
 from pathlib import Path
 from typing import Any
 
 from heliotrope.console.roster import Key
+from heliotrope.errors import HeliotropeError
 from heliotrope.local import EMERGENCY, INTERNAL, ORDINARY, CallError, LocalConnection
 from heliotrope.plant.interface import CALLS, remade
 from heliotrope.plant.operations.security import SecurityEvent
@@ -109,7 +111,14 @@ class RemotePeople:
     def _ask(self, call: str, **arguments: Any) -> Any:
         assert self._loop is not None
         asked = self._plant.ask(f"people.{call}", **arguments)
-        return asyncio.run_coroutine_threadsafe(asked, self._loop).result(_STORE)
+        done = asyncio.run_coroutine_threadsafe(asked, self._loop)
+        try:
+            return done.result(_STORE)
+        except NotYetError:
+            done.cancel()
+            raise HeliotropeError(
+                f"the plant's store has not answered for {_STORE:g} s; check the disk or database"
+            ) from None
 
     def account(self, name: str) -> Account | None:
         """Return an account, None if the name is unknown."""

@@ -8,6 +8,8 @@ from typing import Any
 
 from heliotrope.errors import InputError, UnknownNameError
 
+#: Limits: a session, hours; the idle lock, minutes; failed sign-ins an hour.
+_HOURS, _IDLE, _SIGN_INS = (0.25, 168.0), (0.0, 600.0), (3, 100)
 _FILES = ("certificate", "key", "people_by_proxy")
 
 
@@ -25,7 +27,10 @@ class ConsoleSettings:
     certificate, key
         TLS certificate and its key, PEM files; None: plain HTTP.
     session_s
-        Length of a session, s.
+        Length of a session, s; 15 min to 7 days.
+    sign_ins
+        Attempts to sign in that fail, for one name at one address, in an hour; 3 to 100. The next
+        attempt waits until the first of them is an hour ago.
     period
         Interval between messages of the live stream, s.
     viewers
@@ -49,8 +54,8 @@ class ConsoleSettings:
     Raises
     ------
     InputError
-        If a port is invalid, a key has no certificate, a time is not above 0, or an address other
-        than this computer's own lacks TLS.
+        If a port is invalid, a key has no certificate, a time or a number of attempts is beyond its
+        limits, or an address other than this computer's own lacks TLS.
     """
 
     host: str = "127.0.0.1"
@@ -59,6 +64,7 @@ class ConsoleSettings:
     certificate: Path | None = None
     key: Path | None = None
     session_s: float = 36_000.0
+    sign_ins: int = 12
     period: float = 1.0
     viewers: int = 200
     plain: bool = False
@@ -77,9 +83,17 @@ class ConsoleSettings:
                 )
         if (self.certificate is None) != (self.key is None):
             raise InputError("console: TLS needs both files, --certificate and --key")
-        for name in ("session_s", "period"):
-            if not getattr(self, name) > 0.0:
-                raise InputError(f"console: {name} must be above 0, not {getattr(self, name)} s")
+        if not self.period > 0.0:
+            raise InputError(f"console: period must be above 0, not {self.period} s")
+        for what, value, (least, most), unit in (
+            ("a session", self.session_s / 3600.0, _HOURS, "hours"),
+            ("the idle lock", self.idle_s / 60.0, _IDLE, "minutes"),
+            ("the limit on sign-ins", self.sign_ins, _SIGN_INS, "an hour"),
+        ):
+            if not least <= value <= most:
+                raise InputError(
+                    f"console: {what} must be {least:g} to {most:g} {unit}, not {value:g}"
+                )
         if self.second_factor:
             # The process for the EMERGENCY path does not use the store, and so starts sooner.
             from heliotrope.store.people import ROLES

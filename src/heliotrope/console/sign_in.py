@@ -13,6 +13,7 @@ from heliotrope.console.by_proxy import Introduced, check_account
 from heliotrope.console.hashing import CrowdError, GoneError
 from heliotrope.console.headers import cookie_of, network_of
 from heliotrope.console.settings import is_loopback
+from heliotrope.errors import HeliotropeError
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import BY_PROXY, Account
 
@@ -92,7 +93,6 @@ async def _begin(
     now, lifetime = console.now(), console.settings.session_s
     address = console.address(connection)
     secret = await console.ask(lambda: console.people.open_session(name, now, lifetime, address))
-    console.roster.forget()
     await console.note(SecurityEvent.SIGNED_IN, connection, name, detail)
     return secret, now + lifetime
 
@@ -162,6 +162,9 @@ async def checked(
     except (CrowdError, GoneError) as error:
         attempts.undo(*keys)
         raise _too_often(str(error), 1.0) from None
+    except HeliotropeError:
+        attempts.undo(*keys)  # the store did not answer, and nothing was guessed
+        raise
     if not good or account is None:
         await console.note(failure, request, name if account is not None else "")
         raise HTTPException(401, "name or password is wrong")

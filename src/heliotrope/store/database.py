@@ -66,6 +66,9 @@ class Database:
         if self.file is not None:
             _prepare(self._reader, "BEGIN", _READER)
             _prepare(self._writer, "BEGIN IMMEDIATE", _WRITER)
+        else:
+            _limit_waits(self._reader)
+            _limit_waits(self._writer)
         self._lock: int | None = None
         self._spare: Connection | None = None
         self.locked = False
@@ -259,9 +262,11 @@ class Database:
         self.locked = False
 
 
-_READER = ("PRAGMA busy_timeout=5000", "PRAGMA wal_autocheckpoint=0", "PRAGMA query_only=ON")
+#: Longest wait for a lock that another program holds, ms.
+_WAIT_MS = 5000
+_READER = (f"PRAGMA busy_timeout={_WAIT_MS}", "PRAGMA wal_autocheckpoint=0", "PRAGMA query_only=ON")
 _WRITER = (
-    "PRAGMA busy_timeout=5000",
+    f"PRAGMA busy_timeout={_WAIT_MS}",
     "PRAGMA journal_mode=WAL",
     "PRAGMA synchronous=FULL",
     "PRAGMA foreign_keys=ON",
@@ -280,6 +285,15 @@ def _prepare(engine: Engine, begin: str, pragmas: tuple[str, ...]) -> None:
     @event.listens_for(engine, "begin")
     def began(connection: Connection) -> None:
         connection.exec_driver_sql(begin)
+
+
+def _limit_waits(engine: Engine) -> None:
+    """Let no statement wait for a locked table without end; each takes a thread meanwhile."""
+
+    @event.listens_for(engine, "connect")
+    def connected(connection: Any, _: object) -> None:
+        connection.execute(f"SET lock_timeout = {_WAIT_MS}")
+        connection.commit()
 
 
 def _place(place: str | Path) -> tuple[URL, Path | None]:

@@ -9,6 +9,7 @@ import asyncio
 import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,6 +58,8 @@ _FACTS: dict[type[Fact], tuple[Table, Callable[[Connection, Table, list[rows.Row
 }
 #: With more names than this, a query reads all rows and filters them afterwards.
 _MANY = 500
+#: Number of threads that read.
+_READERS = 4
 #: Row of the table ``about`` with the limits of the safety table in force.
 _LIMITS = "safety limits"
 #: Name of the document about the active emergency.
@@ -105,6 +108,7 @@ class Keeper:
             self.database.close()
             raise
         self._mine = threading.Lock()
+        self._readers = ThreadPoolExecutor(_READERS, "store reader")
         self.writer = Writer(self.database, limit=limit, inline=inline)
         self.people = People(self.database, self.writer)
 
@@ -131,6 +135,7 @@ class Keeper:
         StoreError
             If something could not be written.
         """
+        self._readers.shutdown(wait=False, cancel_futures=True)
         try:
             self.writer.close()
         finally:
@@ -149,6 +154,10 @@ class Keeper:
             done.result()
         else:
             await asyncio.wrap_future(done)
+
+    async def read(self, work: "Callable[[Keeper], T]") -> T:
+        """Return the result of work that reads, done in one of the store's own threads."""
+        return await asyncio.get_running_loop().run_in_executor(self._readers, work, self)
 
     def _take_numbers(self, table: Table, count: int = 1) -> int:
         """Return the first of a range of new numbers."""

@@ -12,11 +12,11 @@ records are guaranteed to survive a crash.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from heliotrope.calibration.record import (
     CalibrationOutcome,
@@ -27,6 +27,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import HeliotropeError
 from heliotrope.safety import Alarm, Severity
 
+T = TypeVar("T")
 SEVERITIES = tuple(Severity)
 
 
@@ -607,6 +608,13 @@ class Records(Protocol):
         ------
         StoreError
             If an attempt to write failed; the records stay queued and are retried.
+        """
+        ...
+
+    async def read(self, work: "Callable[[Records], T]") -> T:
+        """Return the result of work that reads, done in a thread that the store alone uses.
+
+        A database that does not respond then holds up nothing but reads.
         """
         ...
 

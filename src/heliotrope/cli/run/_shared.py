@@ -99,6 +99,8 @@ class Shown:
     second_factor: str = ""
     emergency_port: int | None = None
     idle_s: float = 1800.0
+    session_s: float = 36_000.0
+    sign_ins: int = 12
     notice: Path | None = None
     console: bool = True
     browser: bool = True
@@ -151,6 +153,8 @@ class Shown:
             second_factor=self.second_factor,
             emergency_port=self.emergency_port,
             idle_s=self.idle_s,
+            session_s=self.session_s,
+            sign_ins=self.sign_ins,
             notice="" if self.notice is None else read_text(self.notice, "a notice", _NOTICE),
         )
 

@@ -220,6 +220,21 @@ def run(
             rich_help_panel=_CONSOLE,
         ),
     ] = 30.0,
+    session: Annotated[
+        float,
+        typer.Option(
+            min=0.25, max=168.0, help="Length of a session, hours.", rich_help_panel=_CONSOLE
+        ),
+    ] = 10.0,
+    sign_ins: Annotated[
+        int,
+        typer.Option(
+            min=3,
+            max=100,
+            help="Failed sign-ins in an hour, for one name at one address, after which it waits.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = 12,
     notice: Annotated[
         Path | None,
         typer.Option(
@@ -348,6 +363,8 @@ def run(
             second_factor=second_factor,
             emergency_port=emergency_port,
             idle_s=60.0 * idle_lock,
+            session_s=3600.0 * session,
+            sign_ins=sign_ins,
             notice=notice,
             console=not no_console,
             browser=not no_browser,
@@ -357,9 +374,7 @@ def run(
             every=every,
             plant=PlantSettings(stow_rate=stow_rate),
             evidence=Evidence(syslog, syslog_authority, heads, heads_every),
-            photographs=PictureSettings(
-                min(30.0, photographs_days), photographs_days, 1e9 * photographs_gb
-            ),
+            photographs=PictureSettings(*_kept(photographs_days, photographs_gb)),
         )
         if twin is not None:
             twin.wait()
@@ -373,6 +388,11 @@ def run(
         folder = field if field.is_dir() else field.parent
         choice = PlantChoice(folder, clusters, idle is not False, configure, check)
         run_plant(open_plant(field), choice, shown)
+
+
+def _kept(days: float, gigabytes: float) -> tuple[float, float, float]:
+    """Return for how many days all photographs are kept, then one a day, and their bytes."""
+    return min(30.0, days), days, 1e9 * gigabytes
 
 
 def _measured(heliostats: int) -> int:

@@ -65,6 +65,11 @@
   async function look() {
     const who = await api("GET", "session");
     find("due").textContent = who.owes in DUE ? t(DUE[who.owes]) : "";
+    find("limits").textContent = [
+      t("A session ends after {hours} h.", { hours: who.session_hours }),
+      ...who.idle_minutes ? [t("After {minutes} min without a command, the next one needs your password.", { minutes: who.idle_minutes })] : [],
+      t("After {count} failed sign-ins in an hour, the next one waits.", { count: who.sign_ins_per_hour }),
+    ].join(" ");
     find("password").hidden = who.owes === "factor";
     find("old").hidden = find("password").elements.old.disabled = who.no_password;
     find("factor").hidden = who.owes === "password";

@@ -347,7 +347,7 @@ class Operations:
         if self._records is None:
             raise InputError(f"{what}: this plant keeps no records; run it with a data folder")
         await self._records.confirm()
-        return await asyncio.to_thread(read, self._records)
+        return await self._records.read(read)
 
     async def _figures(self) -> dict[str, float]:
         try:

@@ -5,7 +5,6 @@ route as calibrations: at rest, where the old and the new beam are clear, and co
 The next fit replaces them. Earlier versions come from the store.
 """
 
-import asyncio
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from math import ceil
@@ -254,7 +253,7 @@ class TypedParameters:
     async def _history(self, heliostat: str) -> list[HeliostatCalibration]:
         if self._records is None:
             return []
-        return await asyncio.to_thread(self._records.calibration_history, heliostat)
+        return await self._records.read(lambda records: records.calibration_history(heliostat))
 
     def _file(self, heliostat: str) -> dict[str, float]:
         group, row = self._plant.design.find(heliostat)
