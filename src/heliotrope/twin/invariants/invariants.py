@@ -8,53 +8,53 @@ duplicate is a frame that was received before.
 ========  ============================================================================
 number    check
 ========  ============================================================================
-1         In a state that needs the sun, the last sun is not older than the lease.
+1         In a state that needs the sun, the last sun vector is not older than the lease.
 2         A heliostat that is cut off from plant or cluster, or ordered off, is off the
-          receiver in 30 s and at stow in 5 min.
-3         TRACKING and SEARCHING, and every way out of STOWED and FAULT, begin with a genuine
-          command at that instant.
+          receiver within 30 s and at stow within 5 min.
+3         TRACKING and SEARCHING, and every transition out of STOWED and FAULT, begin with a
+          genuine command at that instant.
 4         DEFOCUS and STOW act at once, whoever sends them; nothing else acts without authority,
-          and of two plants with the same keys one is obeyed at a time.
+          and of two plants with the same keys, only one is obeyed at a time.
 5         Duplicate, late, replayed and expired commands change nothing.
 6         A damaged frame changes nothing.
-7         After a boot the state is a safe one, the journal holds the old or the new record, and
+7         After a boot the state is safe, the journal contains the old or the new record, and
           the step counts are right to within their stated uncertainty.
-8         Steps keep to range, rate and acceleration; counted steps are those that were ordered.
-9         As 1, and the plant's lease too, while a clock or counter has jumped; no sun is sent by a
-          time that has jumped before a person has acknowledged it.
-10        Azimuth moves first from stow and last to stow; the beam goes by the foot of the way, and
-          crosses the receiver only once it has come to its standby point.
-11        Every command on the bus was accepted and reported once; no value is reported younger
-          or other than it is, by boards, clusters or the plant. Where nothing fails
-          (`world.tour`) it is done in time.
-12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
-          it within 10 s and it is off within 30 s.
-13        In no state does a beam that was not ordered there stay on the receiver, or any beam
-          in a keep-out volume, for 30 s; the beams that turn away part.
-14        After a loss of more mirrors than automatic control may raise again, or of all, only a
-          person brings one back.
-15        A mirror proven to be done is off the receiver, or at stow.
-16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own; while
-          the sun is low, what automatic control was given is at stow. Alarms have causes, and
-          causes have alarms; each command ends, and says why it failed.
-17        What a person has ordered or locked stands until its owner, or an engineer by name, has
-          ended it: the emergency holds, and the locked mirror stands still.
+8         Steps stay within range, rate and acceleration; counted steps equal ordered steps.
+9         As 1, and also for the plant's lease, after a jump of a clock or counter; no sun vector
+          is sent for a time that has jumped until an operator has acknowledged the jump.
+10        Azimuth moves first from stow and last to stow; the beam passes the foot of the safe
+          path, and crosses the receiver only after it has reached its standby point.
+11        Every command on the bus was accepted and reported once; boards, clusters and the plant
+          report every value as it is, with its true age. If nothing fails (`world.tour`), each
+          command is carried out in time.
+12        A beam in a state in which it lights anything is where it was sent; otherwise an alarm
+          names the heliostat within 10 s, and the beam is off within 30 s.
+13        In no state does a beam stay on the receiver for 30 s without an order, or in a keep-out
+          volume at all for 30 s; beams that turn away diverge.
+14        After a loss of all heliostats, or of more than automatic control may raise again, only
+          an operator brings them back.
+15        A heliostat confirmed as done is off the receiver, or at stow.
+16        In undisturbed periods, orders are carried out; a stored sighting shows the heliostat's
+          own beam; while the sun is low, heliostats under automatic control are at stow. Alarms
+          have causes, and causes have alarms; each command ends, and a failed one says why.
+17        An operator's order or lock stands until its owner, or an engineer by name, has ended
+          it: the emergency stays in force, and the locked heliostat stands still.
 ========  ============================================================================
 
-Besides being safe, life must go on:
+Besides being safe, the plant must keep working:
 
 ========  ============================================================================
-L1        What a visit or a person took is given back: no mirror stays LOCKED, or its beam on
-          a target, without an owner that the page shows.
-L2        Each ticket ends, and DONE is true; each retry has an end; no alarm has the plant's
-          own act as its cause.
-L3        When the last cause is gone and a person has resumed, every healthy mirror that
-          automatic control has tracks the receiver again.
-L4        What holds for safety outlives a restart of the plant's program.
+L1        Every heliostat that a visit or an operator took is released: none stays LOCKED, or
+          leaves its beam on a target, without an owner that the page shows.
+L2        Each ticket ends, and DONE is true; retries end; no alarm is caused by the plant's own
+          action.
+L3        When the last cause is gone and an operator has resumed, every healthy heliostat under
+          automatic control tracks the receiver again.
+L4        Emergencies and locks survive a restart of the plant program.
 ========  ============================================================================
 
 `twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits`, `.day`, `.alarms` and
-`.tickets` 16, `twin.invariants.persons` 17, and `twin.invariants.answers` 11.
+`.tickets` check 16, `twin.invariants.persons` checks 17, and `twin.invariants.answers` checks 11.
 """
 
 from collections import Counter, deque
@@ -401,7 +401,7 @@ class Observer(Judge):
         elif sent.who in (messages.AUTHORITY, messages.KEY):
             self._authorised(sent, now)
         elif sent.who == messages.ANYONE:
-            # Who is to stow need not defocus first.
+            # A heliostat that is to stow need not defocus first.
             over = ("DEFOCUS", "STOW") if sent.name == "STOW" else (sent.name,)
             self._emergencies = [
                 emergency for emergency in self._emergencies if emergency[0] not in over
@@ -409,11 +409,11 @@ class Observer(Judge):
 
     def _authorised(self, sent: Sent, now: float) -> None:
         """Check that a command on the bus was ordered with authority, in time, and reported."""
-        pushed = sent.who == messages.KEY and sent.name != "ZERO"  # a person declares counts
+        pushed = sent.who == messages.KEY and sent.name != "ZERO"  # an operator declares the counts
         name = "PARAMETERS" if pushed else sent.name
         addresses = [a.address for a in self.accounts if sent.addresses(a.address)]
         orders = self.orders.covering(name, addresses, now)
-        if name == "STANDBY":  # a pushed standby point goes out as the command does
+        if name == "STANDBY":  # a standby point set as a parameter is sent like the command
             orders = [*orders, *self.orders.covering("PARAMETERS", addresses, now)]
         where = f"{sent.name} to {sent.to}"
         allowed = [order for order in orders if order.authorised]
@@ -432,7 +432,7 @@ class Observer(Judge):
         account = self.accounts[place]
         sent = self.frames.of(data)
         if how == "damaged" and sent is not None:
-            how = "whole"  # the noise hit nothing
+            how = "whole"  # the noise hit no frame
         account.in_hand, account.how = sent, how
         account.forged = None
         if account.board.node is None:
@@ -464,7 +464,7 @@ class Observer(Judge):
             return 5
         node = account.board.node
         if sent.name == "SESSION" and node is not None and node.controller.gate is not None:
-            # A late SESSION of a cluster that has restarted since is news to the board.
+            # A late SESSION of a cluster that has restarted since is new to the board.
             return 5 if sent.values[0] < node.controller.gate.replay.epoch else 0
         return 5 if sent.index <= account.taken else 0
 
@@ -476,7 +476,7 @@ class Observer(Judge):
     def answered(self, data: bytes, how: str, now: float) -> None:
         """Record a reply that the master has received."""
         frames = wire.Reader().feed(data)
-        # If a late answer came first, only the last frame is current.
+        # If a late reply came first, only the last frame is current.
         for frame in frames[-1:] if how == "late" else frames:
             account = self._by_address.get(frame.sender)
             values = frame.values() if frame.name == "STATUS" else None
@@ -709,8 +709,8 @@ class Observer(Judge):
             age = int(row["heard_ms"]) / 1000.0
             claimed = now - age
             last = account.statuses[-1][0] if account.statuses else float("-inf")
-            # The age counts from when it was written: it waits for a connection until the next
-            # status is made, and may then be in transit for its lifetime.
+            # The age counts from when the status was written. A status waits for a connection until
+            # the next status is made, and may then be in transit for its lifetime.
             slack = 2.0 * STATUS_LIFE + AGE_ROUNDING
             saw = f"its state is reported as {age:.2f} s old and is {now - last:.2f} s old"
             self.check(11, claimed <= last + slack, now, name, saw)
@@ -758,7 +758,7 @@ class Observer(Judge):
         assert board.node is not None
         motion = board.node.controller.motion
         if not motion.known:
-            return  # it turns away by steps that it counts from anywhere
+            return  # it turns away by steps counted from an arbitrary origin
         for i in (0, 1):
             ordered = board.axes[i].emitted - board.slip[i]
             counted = motion.place(i)
@@ -770,7 +770,7 @@ class Observer(Judge):
         board, name = account.board, account.name
         account.served(now, leased)
         assert board.node is not None
-        # Unknown counts tell nothing of the pose: there the true beam counts, with its error.
+        # Unknown counts say nothing about the pose, so the true beam is judged, with its error.
         known = board.node.controller.motion.known
         on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
         sure = not account.unsure
@@ -783,7 +783,8 @@ class Observer(Judge):
             state = states.STATES[board.state]
             if passed > DEFOCUS_WITHIN:
                 saw = f"{state} {passed:.1f} s after {why}, limit {DEFOCUS_WITHIN:g} s"
-                # What no file names must not stay at standby either: nobody can take it from there.
+                # A heliostat that no file names must not stay at standby either, as nobody can move
+                # it away.
                 up = ON_THE_WAY if why == UNLISTED else NEED_SUN
                 self.check(2, board.state not in up, now, name, saw)
                 miss = board.miss(sun, RECEIVER, believed=known)
@@ -811,7 +812,7 @@ class Observer(Judge):
             self.check(10, miss > OFF, now, name, saw)
 
 
-#: Columns of a row that are reported as STATUS has them.
+#: Columns of a record that are reported exactly as in STATUS.
 _TOLD = ("state", "flags", "fault", "armature_crc", "boots")
 
 

@@ -8,9 +8,9 @@ whoever holds the command authority. The time limits are the observer's own.
 
 from heliotrope.twin.invariants.invariants import Judge
 
-#: A line on which nothing fails is connected within this, s.
+#: A line without a fault is connected within this, s.
 REJOINS_WITHIN = 20.0
-#: Greatest age of the last lease on a line that carries, s: the plant renews it every second.
+#: Maximum age of the last lease on a working line, s; the plant renews it every second.
 LEASE_EVERY = 3.0
 
 

@@ -21,16 +21,16 @@ from heliotrope.safety import Act
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.invariants.invariants import WORDS, Judge
 
-#: A new program goes on with what holds within this, and an order shows within this, s.
+#: Time within which a new program continues orders in force, and within which an order is shown, s.
 RECALLED_WITHIN, SHOWN_WITHIN = 2.0, 1.0
-#: No mirror is up this long after an order, s: 30 s, and the time between two judgements.
+#: No heliostat is up this long after an order, s: 30 s plus the time between two judgements.
 DOWN_WITHIN = 31.0
-#: A command that left before a lock is over by then, s: its life, and late on the bus.
+#: Time after which a command sent before a lock has ended, s: its lifetime plus delay on the bus.
 UNDER_WAY = 15.0
-#: A locked mirror moves if its motors turn by more than this, steps: drivers that rest let a
-#: coarse motor turn to its nearest full step.
+#: A locked heliostat counts as moving if its motors turn by more than this, steps: idle drivers let
+#: a coarse motor turn to its nearest full step.
 STANDS = 32
-#: States in which a mirror follows or seeks the sun.
+#: States in which a heliostat tracks, or is on its way to tracking.
 _UP = (states.APPROACHING, states.TRACKING, states.SEARCHING)
 
 

@@ -22,26 +22,27 @@ from heliotrope.safety import Act
 from heliotrope.twin.invariants.invariants import Judge, Observer
 from heliotrope.twin.records import RecordsDisk
 
-#: A status waits up to a second, may be in transit for another, and ages are rounded: a value may
-#: be shown this much younger than it is, s.
+#: A value may be shown as this much younger than it is, s: a status waits up to a second, may be in
+#: transit for another second, and ages are rounded.
 YOUNGER = 2.2
-#: A record that may follow its command is there within this, s; the plant's own order waits for
-#: its turn no longer than this, s: with a mirror every two seconds the field has joined before.
+#: A record that may follow its command is stored within the first time, s. The plant's own order
+#: waits for its turn no longer than the second time, s: the field joins sooner, even at one
+#: heliostat every two seconds.
 RECORD_WITHIN, TURN_WITHIN = 2.0, 60.0
-#: An order to turn away that is repeated within this is the same one, s.
+#: An order to turn away that is repeated within this time is the same order, s.
 MOMENT = 0.3
-#: How long a cluster may accept a void token: until the last lease with it has arrived and has
-#: expired, s.
+#: Time for which a cluster may accept a void token: until the last lease with that token has
+#: arrived and expired, s.
 VOID_WITHIN = 4.2
-#: Leases that go to different clusters within this time are of one moment, s.
+#: Leases sent to different clusters within this time count as simultaneous, s.
 _AT_ONCE = 0.5
-#: What a refusal says for one reason and for no other.
+#: Words that a refusal contains for one reason and for no other.
 ROLE_REASON, NOBODY_REASON = "but the command needs ", "nobody has it"
 OTHER_REASON = "was not sent; take command first"
 #: Longest time from posting a command to join to its execution, beyond its lifetime: in transit and
 #: late on the bus; and the interval between looks at the boards, s.
 LATE, LOOKS = 1.8, 0.5
-#: States that a proof may call done.
+#: States in which a heliostat may be confirmed as done.
 _OFF = (
     states.DEFOCUSED,
     states.STOWING,
@@ -60,7 +61,7 @@ _OPERATORS = (
     "SEARCH",
 )  # fmt: skip
 _JOINING = ("TRACK", "REFOCUS", "SEARCH")
-#: Commands that move a heliostat or hold it, and those that leave it to whoever has it.
+#: Commands that move or hold a heliostat, and commands after which its owner keeps it.
 _MOTIONS = ("APPROACH", "IDLE", "LOCK", *_JOINING)
 _SETTINGS = ("LOCK_AIM", "ROUGH")
 
@@ -444,9 +445,9 @@ class PlantObserver(Judge):
             return
         if plant.authority.visited():
             self._visited_at = now
-        # A beam that goes back to its aim on the receiver waits for its turn to join.
+        # A heliostat that returns its beam to the receiver waits for its turn to join.
         waits = {ticket.identity for ticket in plant.orders if not ticket.sent}
-        # That it does is the plant's word, and believed for as long as turns may take.
+        # The plant says that it waits, and is believed for as long as turns may take.
         for identity in self._own.keys() & waits:
             since = self._own[identity][0]
             saw = f"record {identity} has waited for its turn for {now - since:.0f} s"
@@ -498,7 +499,7 @@ class PlantObserver(Judge):
         for identity, (_, at) in list(self._own.items()):
             if now - max(at, self._hung_at) > RECORD_WITHIN:
                 del self._own[identity]
-                # A command that waited too long for the disk is given up; its record says so.
+                # A command that waited too long for the disk is not sent; its record says so.
                 given_up = "not sent" in self._disk.records[identity].result
                 saw = f"record {identity} belongs to nothing that was sent, and does not say so"
                 self.check(11, given_up, now, "plant", saw)
