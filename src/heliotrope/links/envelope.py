@@ -159,7 +159,7 @@ class Conversation:
         return header + message + _mac(key, header + message)
 
     def _opens(self, body: bytes, mac: bytes) -> bool:
-        """Return whether an envelope is sealed with one of the keys; note the newest key used."""
+        """Return whether an envelope is sealed with one of the keys; record the newest one used."""
         keys = self._keys()
         for key in keys:
             if hmac.compare_digest(mac, _mac(key, body)):
@@ -207,7 +207,7 @@ class Conversation:
         return (body[_HEADER.size :], expires), first
 
     def _unproved(self, kind: int, session: int, stamp: int, count: int, now: float) -> bool:
-        """Handle an envelope of unknown age: it does not show that its sender received from us."""
+        """Handle an envelope of unknown age, which does not show that its sender heard from us."""
         if kind == _DATA:
             self._statistics.refused += 1
             return False

@@ -143,7 +143,7 @@ class MemoryLine:
         self.cut(first_to_second=False, second_to_first=False)
 
     def drop(self) -> None:
-        """Break the connection as a reset does: both ends notice; envelopes in transit are lost."""
+        """Break the connection like a reset: both ends notice, and data in transit is lost."""
         self.generation += 1
         for lane in self.lanes:
             lane.clear()

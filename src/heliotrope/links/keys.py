@@ -353,7 +353,10 @@ def carried_files(folder: Path, clusters: Sequence[str]) -> list[Path]:
 
 
 def carry(folder: Path, keys: Mapping[str, bytes]) -> list[Path]:
-    """Write a file for each cluster with its new key, to be carried to it; return the files."""
+    """Write each cluster's new key into a file that is carried to the cluster.
+
+    Return the files.
+    """
     files = carried_files(folder, list(keys))
     for path, key in zip(files, keys.values(), strict=True):
         write_private(path, tomli_w.dumps({"plant": key.hex()}), new=True)

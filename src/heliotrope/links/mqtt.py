@@ -249,7 +249,7 @@ class _MqttCarrier:
 
 
 def _asked_of_broker(longest: int) -> Properties:
-    """Return the requests to the broker on connection: no packet larger than an envelope allows."""
+    """Return the connection requests to the broker, which limit packets to an envelope's size."""
     properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
     properties.MaximumPacketSize = longest + _ROOM
     return properties

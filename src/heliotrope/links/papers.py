@@ -122,7 +122,7 @@ class Papers:
         self._renewals[name] = _Renewal(files, take)
 
     def watch_end(self, path: Path) -> None:
-        """Monitor the expiry of a certificate, or of the first to expire in a file with several."""
+        """Monitor the expiry of the certificate in a file; if it has several, the earliest."""
         self._certificates.append(_Certificate(path))
 
     def lines(self) -> list[str]:

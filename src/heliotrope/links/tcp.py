@@ -321,7 +321,7 @@ class _Newcomers:
         self._pipes: dict[_Pipe, None] = {}
 
     def enter(self, pipe: _Pipe) -> None:
-        """Admit a connection; beyond the limits close the oldest of the busiest address."""
+        """Admit a connection; beyond the limits, close the busiest address's oldest connection."""
         self._pipes[pipe] = None
         counts = Counter(other.address for other in self._pipes)
         busiest = pipe.address
