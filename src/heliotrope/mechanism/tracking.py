@@ -383,7 +383,7 @@ def _tables(mechanism: Steered | Armature, drives: Drive | None) -> tuple[Armatu
         )
     if isinstance(mechanism, Armature):
         armature = mechanism
-        # A single axis has no second angle; a mirror that is missing says nothing.
+        # A single-axis tracker has no second axis; an empty array shows nothing.
         single = armature.axis_2.size > 0 and not armature.axis_2.any()
         own = np.stack([direct().table] * (1 if single else 2))
     else:
