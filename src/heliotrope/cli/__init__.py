@@ -61,7 +61,7 @@ def _root(
         typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
     ] = False,
 ) -> None:
-    """Operate the heliostat field of a solar power tower."""
+    """Run the heliostat field of a solar power tower."""
 
 
 field_app.command()(layout)

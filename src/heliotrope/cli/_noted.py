@@ -25,7 +25,7 @@ def this_person() -> str:
 
 
 def note_use(place: str, kind: str, detail: str) -> None:
-    """Record in a store what this user did with it; report a failure to do so.
+    """Record a user's action in a plant's store; report if the record cannot be written.
 
     Parameters
     ----------

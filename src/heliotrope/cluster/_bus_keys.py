@@ -117,7 +117,7 @@ class BusKeys:
             return NO_KEY if newest else None
         keys = list(self._keys)
         if newest not in keys and old not in keys:
-            return self._keys[keys[-1]]  # the one that signs now
+            return self._keys[keys[-1]]  # the key that signs now
         if newest != keys[0] or (len(keys) == 1 and old):
             return self._keys[keys[0]]
         return None

@@ -107,7 +107,7 @@ class Exchange:
         await self.transmit(self.sender.session_to(address, self.token(token), number, sign))
 
     async def transmit(self, frame: bytes, *, life: float = 0.5, urgent: bool = False) -> bool:
-        """Send a frame that expects no reply within ``life`` s; return whether it was sent."""
+        """Send a frame within ``life`` s, expecting no reply; return whether it was sent."""
         expires = self.clock.monotonic() + life
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
         return outcome is SendOutcome.SENT
@@ -226,7 +226,7 @@ class Exchange:
 
     def _spoilt(self, node: ClusterNode, data: bytes, now: float) -> None:
         node.spoilt(data)
-        # The silence of a node that is switched off proves nothing about the bus; damaged bytes
+        # The silence of a node that is switched off says nothing about the bus; damaged bytes
         # always do.
         if data or now - node.heard_at <= _WINDOW:
             self._bad += 1

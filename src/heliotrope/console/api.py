@@ -229,7 +229,7 @@ async def live(socket: WebSocket) -> None:
 
 
 async def _show(console: Console, socket: WebSocket) -> None:
-    """Send the live stream until its viewer leaves or may no longer see it, or the console ends."""
+    """Send the live stream until its viewer leaves or loses access, or the console ends."""
 
     async def follow() -> None:
         # A viewer that has left is detected below, because a closed socket cannot be written to.

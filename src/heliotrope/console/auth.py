@@ -151,9 +151,8 @@ class Console:
     async def ask(self, work: Callable[[], T]) -> T:
         """Return the result of work in the store.
 
-        The work runs in a thread because the store's disk may be slow.
-
-        These threads have no other work, so a thread that hangs does not block anything else.
+        The work runs in a thread because the store's disk may be slow. These threads have no other
+        work, so a thread that hangs does not block anything else.
         """
         return await asyncio.get_running_loop().run_in_executor(self.threads, work)
 

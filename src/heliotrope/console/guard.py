@@ -157,7 +157,7 @@ class Guard:
 
 
 def _urgent(console: Console, scope: Scope) -> str:
-    """Return the origin of the EMERGENCY path as the page reaches it."""
+    """Return the origin of the EMERGENCY path, as a page sees it."""
     host = parts_of(f"//{Headers(scope=scope).get('host', '')}").hostname or ""
     if not console.emergency_port or not host_known(console.settings, host):
         return ""

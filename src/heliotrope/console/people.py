@@ -10,7 +10,7 @@ FIRST = "engineer"
 
 
 def first_start(people: People, now: float) -> str | None:
-    """Create the first account if there is none, and give it a password if it has none.
+    """Create the first account if no account exists; set its password if none is set.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such mo
         blocks: int
 
         def read(self, offset: int, size: int) -> bytes:
-            """Return bytes from an address."""
+            """Return ``size`` bytes from ``offset``."""
 
         def write(self, offset: int, data: bytes) -> None:
             """Write ``data``: clear the bits that are 0 in it."""
@@ -331,7 +331,7 @@ class Journal:
     ) -> None:
         """Write a record if the next steps would make flash wrong by more than ``stride``.
 
-        To be called before steps are emitted.
+        Call this before steps are emitted.
 
         Parameters
         ----------
@@ -375,7 +375,7 @@ class Journal:
         return self._write(primary, secondary, True)
 
     def zero(self, primary: int, secondary: int, doubts: int = 0) -> None:
-        """Declare the present counts without doubt; with doubts of ``MOST``, they are unknown."""
+        """Declare the present counts, with no doubt left; ``MOST`` doubts mean unknown counts."""
         self.doubts = doubts
         self._append(primary, secondary, True)
 

@@ -76,7 +76,7 @@ class Stage(Enum):
 
 @dataclass(frozen=True)
 class Lease:
-    """A sign that the plant is present and commands under this token (0: no commands).
+    """Shows that the plant is present, and permits commands under its token (0: no commands).
 
     The cluster may continue for ``lifetime`` s after the arrival of the lease, and for another
     ``autonomy`` s. The lease's expiry on the link limits its time in transit. ``run`` identifies
@@ -92,7 +92,7 @@ class Lease:
 
 @dataclass(frozen=True)
 class Command:
-    """A bus command, by its name and values, for named heliostats, or for all if () is sent.
+    """A bus command, by its name and values, for named heliostats, () for all.
 
     ``identity`` is repeated in every `Progress`. ``lifetime`` in s counts from the arrival at the
     cluster; the command arrives before its link expiry, or not at all.

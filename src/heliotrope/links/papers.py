@@ -22,7 +22,7 @@ LOOKED = 2.0
 #: An alarm is active during the last days of a certificate, and is raised again each day.
 DAYS = 30
 _DAY = 86_400.0
-#: What changes when a file does: time, inode, size and mode; None: the file is missing.
+#: Values that change when a file does: time, inode, size and mode; None if the file is missing.
 _State = tuple[int, ...] | None
 
 

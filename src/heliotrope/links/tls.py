@@ -6,7 +6,7 @@ from pathlib import Path
 
 from heliotrope.errors import InputError
 
-#: A context, or a function that returns the present context; None: no TLS.
+#: A context, or a function that returns the present context; None if there is no TLS.
 TlsSource = ssl.SSLContext | Callable[[], ssl.SSLContext] | None
 
 

@@ -49,7 +49,7 @@ def value_of(answer: Frame) -> Any:
 
 
 class LocalConnection:
-    """A persistent connection that is reopened whenever it has ended.
+    """A persistent connection, which is reopened whenever it ends.
 
     Parameters
     ----------

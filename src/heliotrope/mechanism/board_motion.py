@@ -98,10 +98,8 @@ def end_down_the_path(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the points at which DEFOCUS ends on the safe paths of heliostats.
 
-    The rule is that of `lcu.motion.Motion._turn`.
-
-    A heliostat moves back down its path until an axis has turned through its defocus angle or the
-    beam reaches the ground.
+    The rule is the same as in `lcu.motion.Motion._turn`. A heliostat moves back down its path until
+    an axis has turned through its defocus angle or the beam reaches the ground.
 
     Parameters
     ----------
@@ -136,9 +134,8 @@ def end_down_the_path(
 def offsets(pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArray) -> FloatArray:
     """Return the rotations of the axes where DEFOCUS does not follow the path.
 
-    The rule is that of `lcu.motion.Motion._turn`.
-
-    From an aim, the axes turn away from standby. A heliostat that is held turns away from its aim.
+    The rule is the same as in `lcu.motion.Motion._turn`. From an aim, the axes turn away from
+    standby. A heliostat that is held turns away from its aim.
 
     Parameters
     ----------

@@ -323,9 +323,6 @@ def _over_the_top(
 ) -> npt.NDArray[np.bool_]:
     """Return whether each branch is beyond the keyhole as seen from the home, (T, N, 2).
 
-    a₁·R(a₂, θ)n = p + q cos θ + r sin θ, with the axes a₁ and a₂ and the normal n, is largest at
-    the keyhole.
-
     With a₁, a₂ the axes and n the normal, a₁·R(a₂, θ)n = p + q cos θ + r sin θ is largest at the
     keyhole.
     """

@@ -11,7 +11,7 @@ from heliotrope.geometry import FloatArray, reflect
 from heliotrope.optics import Neighbours, centroid_shift, equal_facets
 from heliotrope.twin.boards.board import Board
 
-#: Light further from a target's centre than this many half diagonals is left out.
+#: Light farther from a target's centre than this many half diagonals is omitted.
 NEAR = 2.0
 #: Cosine of incidence below which the light of a mirror is too weak to draw.
 GRAZING = 0.05
@@ -70,7 +70,7 @@ class TrueMirror:
         return point + effect.shift @ target.axes, 1.0 - effect.hidden
 
     def on(self, target: Target, sun: FloatArray) -> FloatArray:
-        """Return where the reflected ray meets a target's plane, ENU, m, (3,); NaN if it misses."""
+        """Return where the reflected ray meets a target's plane, ENU, m, (3,); NaN if nowhere."""
         if not float(self.normal @ sun) > GRAZING:
             return np.full(3, np.nan)
         return target.intersect(self.vertex, reflect(sun, self.normal))

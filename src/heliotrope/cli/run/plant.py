@@ -169,7 +169,7 @@ def _settings(
 def _check(
     design: Plant, settings: AssemblySettings, outside: "_Outside", cameras: RealCameras | None
 ) -> None:
-    """Build the whole plant without starting it, and print its contents."""
+    """Assemble the whole plant without starting it, and print a summary of its parts."""
     sensors = outside.sensors(cameras, design)
     ports = Ports(outside.all_links, outside.clock, Forgetful(), cameras, sensors)
     PlantAssembly(design, ports, settings)

@@ -121,7 +121,10 @@ def _screw(axis, point, n, m, factor, dn, dm):
 def chain_derivative(
     what, index, sub, drives, driven, counts, frames, screw_axes, screw_points, n, m, dn, dm
 ):
-    """Derivative of normal and vertex with respect to one parameter (what, index, sub)."""
+    """Compute the derivatives of normal and vertex with respect to a parameter.
+
+    The parameter is (what, index, sub).
+    """
     if what == MOVES_JOINT:
         _screw(screw_axes[index], screw_points[index], n, m, 1.0, dn, dm)
     elif what == MOVES_DRIVE:
@@ -159,7 +162,7 @@ def pose_block(
     start,
     stop,
 ):
-    """Normals and vertices at counts (M, D) of the mechanisms with indices ``rows`` (M,)."""
+    """Compute normals and vertices at counts (M, D) of the mechanisms ``rows`` (M,)."""
     joints = axes.shape[1]
     frames = np.empty((joints + 1, 3, 3))
     screw_axes, screw_points = np.empty((joints, 3)), np.empty((joints, 3))
@@ -209,7 +212,7 @@ def jacobian_block(
     start,
     stop,
 ):
-    """Poses with derivatives with respect to parameters and counts.
+    """Compute poses with derivatives with respect to parameters and counts.
 
     ``codes`` (P, 3) are the codes of the parameters.
     """
@@ -264,7 +267,7 @@ def jacobian_block(
 def armature_block(
     position, orientation, axes, origins, angles, driven, vertex, normal, out, start, stop
 ):
-    """Armatures (N, 18): axes, points, vertex and normal in ENU at zero joint angles."""
+    """Compute armatures (N, 18): axes, points, vertex and normal in ENU at zero joint angles."""
     joints = axes.shape[1]
     frames = np.empty((joints + 1, 3, 3))
     screw_axes, screw_points = np.empty((joints, 3)), np.empty((joints, 3))

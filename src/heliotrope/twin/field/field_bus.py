@@ -1,4 +1,4 @@
-"""A bus whose stations are rows of a vectorised field; each frame takes microseconds.
+"""A bus whose stations are heliostats of a vectorised field; a frame takes microseconds.
 
 One `FieldBus` is the bus of one cluster. It replies to QUERY_STATUS and QUERY_STEPS, receives SUN,
 and passes commands on to the `Field`. It has no noise, and checks frames only if it is given the

@@ -1,4 +1,4 @@
-"""The observer of alarms: each alarm has a true cause, is raised for it, and ends with it.
+"""The observer of alarms: each alarm must have a true cause, and must end when its cause ends.
 
 An alarm exempts the heliostats that it names from the work checks (`twin.invariants.quiet`), so an
 alarm without a cause would hide any fault. The observer has a table of the alarms that simulated

@@ -48,7 +48,7 @@ LATE, EARLY, CYCLE_MOST = 1.0, 0.3, 1.5
 
 @dataclass
 class _Board:
-    """One board: its account and its replies.
+    """One board: the observer's record of its heliostat, and the board's replies.
 
     Attributes
     ----------

@@ -150,7 +150,7 @@ class _Mirror:
 
     @property
     def elsewhere_idle(self) -> bool:
-        """Whether it is IDLE and holds still, in any position."""
+        """Whether the heliostat is IDLE and holds still, in any position."""
         return self.state == states.IDLE and (self.elsewhere or not self.approached)
 
 
@@ -433,7 +433,7 @@ class BeamObserver(Judge):
             self._proofs(plant, sun, now)
 
     def _stays_off(self, mirror: _Mirror, now: float) -> None:
-        """Check that no beam rises on a wrong sun direction or another heliostat's parameters."""
+        """Check that no heliostat tracks on a wrong sun direction or another's parameters."""
         node, own = mirror.node, mirror.board.outfit.items["armature"]
         foreign = node is not None and node.journal.items.get("armature") != own
         by = "a sun that is contradicted" if self.contradicted else "another mirror's parameters"

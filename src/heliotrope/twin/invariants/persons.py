@@ -144,9 +144,7 @@ class PersonsObserver(Judge):
         """Record that the plant's store was restored from a backup, with the orders of that time.
 
         The present locks stay in force. Until operators have confirmed the contents of the store
-        (`confirmed`), it is not compared with them.
-
-        The locks of now go on, until operators have confirmed what the store has (`confirmed`).
+        (`confirmed`), the store is not compared with them.
         """
         self.orders = {owner: (act, now) for owner, (act, _) in words.orders.items()}
         self._confirmed = False

@@ -54,8 +54,8 @@ _OFF = (
 _OWN = ("plant", "safety table")
 #: Ends of the names under which automatic control commands.
 _UNTOLD = (AUTOMATIC.name, "out of service")
-#: Commands that an operator may give, and those that bring beams to the receiver: tables of the
-#: observer's own, so that an error in the plant's is found.
+#: Commands that an operator may give, and commands that bring beams to the receiver. These are the
+#: observer's own tables, so that an error in the plant's tables is found.
 _OPERATORS = (
     "APPROACH", "IDLE", "TRACK", "REFOCUS", "LOCK", "UNLOCK", "AIM", "STANDBY", "LOCK_AIM",
     "SEARCH",
@@ -308,7 +308,7 @@ class PlantObserver(Judge):
         self.obeyed(owner, act.name, now)
 
     def obeyed(self, who: str, what: str, now: float, identity: str = "") -> None:
-        """Note a command that the plant must accept from anyone, and whose record may follow later.
+        """Record a command that the plant must accept from anyone, and may write down later.
 
         A repetition within a moment is the same command, with the same identity.
         """

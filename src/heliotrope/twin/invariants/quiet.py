@@ -1,4 +1,4 @@
-"""The observer of work: in an undisturbed period, what was ordered is done.
+"""The observer of work: in an undisturbed period, orders must be carried out.
 
 A field that does less than ordered, or does it later, violates no safety invariant. If nothing has
 failed near a heliostat for a while, and no alarm names it, this observer expects that SUN and
@@ -389,7 +389,7 @@ class QuietObserver(Judge):
         if order is None:
             return
         ordinary = order.name in ORDERS
-        # A mirror that turned away without following the sun stows by itself, whoever commands.
+        # A heliostat that turned away without following the sun stows by itself, despite commands.
         void = ordinary and order.name != "APPROACH" and mirror.state == states.STOWING
         void |= ordinary and now - self._token_at < GRANTED
         if void or (ordinary and self._told_off(mirror) >= order.at):
@@ -440,7 +440,7 @@ class QuietObserver(Judge):
 
     def _proven(self, mirror: _Mirror, plant: PlantController, sun: FloatArray, now: float) -> None:
         """Check that an emergency order that was carried out is also confirmed as done."""
-        order = plant.sentinel.order if plant.sentinel.on else None  # withdrawn: nobody proves it
+        order = plant.sentinel.order if plant.sentinel.on else None  # not if withdrawn
         if order is None or not self._is_own(mirror):
             mirror.off_since = None
             return

@@ -1,4 +1,4 @@
-"""The observer of results: what visits produce, compared with the photographs that were taken.
+"""The observer of results: the results of visits, compared with the photographs taken.
 
 The camera reports each photograph to the observer, which reads the step counts of the true
 heliostat at that moment. A sighting that the plant stores must have the time, the point and the

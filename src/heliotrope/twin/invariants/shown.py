@@ -215,8 +215,6 @@ class ShownObserver(Judge):
         """Return the least and the greatest step counts, each (2,), that a row may show.
 
         Steps count once they are sent to the motors, which is before they are made.
-
-        Steps count once they are ordered of the motors, ahead of being made.
         """
         some = [c for when, c in self._counts[name] if when >= at - COUNTED]
         if self._boards[name].node is None or len(some) < 2 or any(self._boards[name].slip):
@@ -349,8 +347,6 @@ def _expected(operations: Operations, name: str, present: FloatArray, sun: Float
     """Return the error of a normal expected from its covariance, at the receiver, rad.
 
     Of the two poses, the pose nearer to the present counts (2,) is used.
-
-    Of the two poses, it is the one nearer to the present counts (2,).
     """
     beliefs = operations.plant.beliefs
     record = beliefs.record(name)

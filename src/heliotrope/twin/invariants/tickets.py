@@ -1,4 +1,4 @@
-"""The observer of tickets: whoever gives a command is told in time what becomes of it.
+"""The observer of tickets: the outcome of each command must be reported in time.
 
 A ticket states for each heliostat how far its command has progressed. While the plant program runs,
 a heliostat must have acknowledged the command, or the ticket must have ended for it, within a time

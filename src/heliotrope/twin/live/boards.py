@@ -104,7 +104,7 @@ class BoardField:
         return np.stack([n for _, n in pairs]), np.stack([v for v, _ in pairs])
 
     def errors(self, sun: FloatArray, aims: FloatArray) -> FloatArray:
-        """Return the error of each normal at its aim, rad, (N,); NaN if it is not tracking.
+        """Return the error of each normal at its aim, rad, (N,); NaN for a heliostat not tracking.
 
         ``aims`` has shape (N, 3), m.
         """

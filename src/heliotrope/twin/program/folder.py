@@ -109,7 +109,7 @@ def read_folder(folder: Path) -> TwinFolder:
     Raises
     ------
     FormatError
-        If the files are not those of a simulated field.
+        If the files do not belong to a simulated field.
     """
     file = read_links(folder / LINKS)
     found = urlsplit(file.document.twin)

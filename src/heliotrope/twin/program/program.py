@@ -212,7 +212,7 @@ class TwinProgram:
         self._begun = True
 
     def _clock(self, clock: Clock, paced: PacedLoop | None) -> dict[str, Any]:
-        """Return the state of the clock: monotonic time, s, UTC, speed; and whether it is up."""
+        """Return the clock's state: monotonic time (s), UTC, speed, and whether the field is up."""
         now = clock.monotonic()
         return {
             "now": now,

@@ -467,7 +467,7 @@ class Operator:
             each.on_safe(VIEWER, ticket, what, self._clock.monotonic())
 
     def clear(self, plant: PlantController) -> set[str]:
-        """Withdraw an emergency order and acknowledge latched conditions; return those accepted.
+        """Withdraw an emergency order, acknowledge latched conditions, and return what is accepted.
 
         The order of another operator remains until the next call.
         """

@@ -24,8 +24,8 @@ from heliotrope.twin.cameras import ExactCamera, FieldSnapshot
 T = TypeVar("T")
 #: What a photograph may show instead of the heliostat's beam.
 LIES = ("still", "passing", "before")
-#: What may spoil the photographs of a stack, the rate of this relative to that of lies, the size of
-#: a lamp, m, and the longest time between photographs of a stack, s.
+#: What may spoil the photographs of a stack, how often relative to false photographs, the size of a
+#: lamp, m, and the longest time between photographs of a stack, s.
 SPOILS, _STACKS_SPOILT, _LAMP, _GAP = ("lamp", "cloud"), 0.1, 0.3, 20.0
 #: Variance of a centroid in the plane of the target, m².
 _CENTROID = 1e-4

@@ -173,7 +173,7 @@ class Pod:
             loop.kill(self.name)
 
     def edit(self, file: Mapping[str, str], group: asyncio.TaskGroup) -> None:
-        """Restart the program with another file if its errors differ from ``file``."""
+        """Restart the program with another file, if ``file`` differs from the present one."""
         if file == self.file:
             return
         self.file = dict(file)
