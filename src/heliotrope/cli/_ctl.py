@@ -372,7 +372,7 @@ def why(
     heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
     as_json: Json = False,
 ) -> None:
-    """Explain why a heliostat tracks or does not, what happens next, and what you can do."""
+    """Explain why a heliostat does or does not track, what happens next, and what you can do."""
     from urllib.parse import quote
 
     with _client(context) as client:

@@ -148,7 +148,7 @@ class ClusterConfig:
 
 
 def spread_phase(index: int, count: int) -> float:
-    """Return the phase of one of many clusters in a process, so that their work is spread.
+    """Return the phase of one of many clusters in a process, so that the work is spread.
 
     Parameters
     ----------

@@ -353,7 +353,7 @@ def encode(frame: Frame) -> bytes:
 
 
 def sealed(frame: Frame) -> bytes:
-    """Return the bus bytes of a frame that is known to be valid."""
+    """Return the bytes, as sent on the bus, of a frame that is known to be valid."""
     data = frame.body() + frame.mac
     return stuff(data + struct.pack("<I", crc32(data))) + b"\0"
 

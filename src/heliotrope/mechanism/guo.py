@@ -497,7 +497,7 @@ def to_malan(parameters: GuoParameters) -> dict[str, FloatArray]:
 
 
 def from_malan(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
-    """Return Guo's parameters from any of Malan's (rad); missing parameters are 0.
+    """Return Guo's parameters from any of Malan's parameters (rad); missing values are 0.
 
     Raises
     ------

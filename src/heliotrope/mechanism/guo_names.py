@@ -33,7 +33,7 @@ _ONE_NORMAL, _ONE_POINT = 1e-9, 1e-6
 
 
 def in_his_names(parameters: GuoParameters) -> dict[str, FloatArray]:
-    """Return the parameters by their `NAMES`, in degrees and m, in the ranges of `regularise`."""
+    """Return the parameters by `NAMES`, in degrees and m, within the ranges of `regularise`."""
     p = regularise(parameters)
     return {
         name: getattr(p, ours) if unit == "m" else as_float(np.degrees(getattr(p, ours)))

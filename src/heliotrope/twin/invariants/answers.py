@@ -128,7 +128,7 @@ class AnswerObserver(Judge):
     # -- the bus ---------------------------------------------------------------------------
 
     def heard(self, how: str, now: float) -> None:
-        """Record how bytes are about to reach a board, since a late frame may follow a reply."""
+        """Record whether bytes reach a board whole, since a late frame may follow a reply."""
         if how != "whole":
             self._late_at = now
 

@@ -308,7 +308,7 @@ class PlantObserver(Judge):
         self.obeyed(owner, act.name, now)
 
     def obeyed(self, who: str, what: str, now: float, identity: str = "") -> None:
-        """Record a command that the plant must accept from anyone, and may write down later.
+        """Record a command that the plant must accept from anyone, and may record later.
 
         A repetition within a moment is the same command, with the same identity.
         """

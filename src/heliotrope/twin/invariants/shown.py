@@ -155,7 +155,7 @@ class ShownObserver(Judge):
         self._detail(operations, view, quiet, now)
 
     def _events(self, operations: Operations, now: float) -> None:
-        """Check that each operator action is an event, exactly once, and that no other event is."""
+        """Check that each operator action produces exactly one event, and nothing else does."""
         for row in operations.logbook.events(100):
             key = (row.at, row.who, row.text)
             if row.who not in self._persons or key in self._judged:

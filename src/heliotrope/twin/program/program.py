@@ -281,7 +281,7 @@ class _Go:
 
 
 async def _wall(seconds: float) -> None:
-    """Wait for a wall-clock time, independently of the loop's own slowed time."""
+    """Wait for a wall-clock duration, because the loop's own time may be slowed down."""
     await asyncio.to_thread(time.sleep, seconds)
 
 

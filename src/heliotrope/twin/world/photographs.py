@@ -151,7 +151,7 @@ class LyingCamera:
         return _Spoilt("cloud", place, chance.uniform(0.2, 0.95), 0.0, chance.choice(_RUNS))
 
     async def beside(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation."""
+        """Run a computation at once and return its result."""
         return work()
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:

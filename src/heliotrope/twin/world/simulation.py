@@ -593,7 +593,7 @@ class Simulation:
             await asyncio.sleep(2.0)
 
     def edit_plant_file(self, fault: Fault) -> None:
-        """Write another stow position into the plant file, either nearby or on the receiver.
+        """Write another stow position into the plant file: nearby, or lighting the receiver.
 
         The plant must not send the second kind, because the stowed heliostat's beam would be on the
         receiver.
@@ -609,7 +609,7 @@ class Simulation:
         self._stows = {fit.name: packed("stow", (int(stow[0]), int(stow[1])))}
 
     def _read_plant_file(self) -> None:
-        """Require the plant file's stow positions, which the next program finds corrected."""
+        """Require the plant file's stow positions; the next program finds the file corrected."""
         for fit in self._fits:
             self._wanted.set(fit.name, {"stow": self._stows.get(fit.name, fit.items["stow"])})
         self._stows = {}

@@ -174,7 +174,10 @@ class Work:
         return self.logbook
 
     def begins(self, plant: PlantController) -> Operations:
-        """Return the operations of a new program; its parameters are meant for the controllers."""
+        """Return the operations of a new program.
+
+        Local controllers should store the program's parameters.
+        """
         assert self.logbook is not None
         centring = SEARCH if self.centred else None
         cycle = CalibrationCycle(plant, self.camera, VISIT, centring)
